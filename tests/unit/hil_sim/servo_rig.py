@@ -20,7 +20,7 @@ class Rig:
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock
         self.told: list[tuple[str, float]] = []
-        self.servo = Servo(1, t=clock(), emit=lambda _, name, t, __: self.told.append((name, t)), **options)
+        self.servo = Servo(1, t=clock(), emit=lambda entry: self.told.append((entry.name, entry.t)), **options)
 
     def write(self, address: int, value: int, size: int | None = None) -> None:
         size = size or SIZES[address]

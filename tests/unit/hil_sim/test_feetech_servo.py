@@ -17,7 +17,7 @@ class Rig:
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock
         self.told: list[str] = []
-        self.servo = Servo(1, t=clock(), emit=lambda _, name, __, ___: self.told.append(name), **options)
+        self.servo = Servo(1, t=clock(), emit=lambda entry: self.told.append(entry.name), **options)
 
     def write(self, address: int, value: int) -> None:
         self.servo.write(address, BY_ADDRESS[address].encode(value), self.clock())

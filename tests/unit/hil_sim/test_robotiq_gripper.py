@@ -17,7 +17,7 @@ class Hand:
         self.clock = clock
         self.gripper = Gripper(t=clock.now)
         self.did: list[str] = []
-        self.gripper.emit = lambda _gripper, name, _t, _detail: self.did.append(name)
+        self.gripper.emit = lambda entry: self.did.append(entry.name)
 
     def tell(self, *values: int, s: float = 2 * CYCLE_S) -> None:
         assert self.gripper.write(COMMAND, values, self.clock.now)
@@ -190,7 +190,7 @@ def test_a_low_supply_is_a_fault_that_a_reset_does_not_end(hand: Hand) -> None:
 
 def test_a_brown_out_loses_registers_and_activation(hand: Hand) -> None:
     hand.tell(0x0900, 255, 0x00FF, s=0.5)
-    hand.gripper.lose_power(hand.clock.now)
+    hand.gripper.brown_out(hand.clock.now)
     stood = hand.status[3]
     hand.wait(5.0)
     assert hand.status == (0, 0, 0, stood)

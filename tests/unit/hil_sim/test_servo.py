@@ -90,7 +90,7 @@ def test_a_factory_reset_spares_what_it_is_told_to(clock: Any) -> None:
         servo.factory_reset(option, 0.0)
         servo.advance(1.0)
         assert (servo.device_id, servo.baud) == expected
-        assert servo.table.get("moving_threshold") == 10
+        assert servo.memory.get("moving_threshold") == 10
 
 
 def test_changing_the_mode_resets_gains_profile_and_goals(rig: Rig) -> None:
@@ -111,7 +111,7 @@ def test_indirect_data_is_its_target(rig: Rig, refused: Any) -> None:
         rig.write(578 + 2 * k, GOAL + k)
     rig.servo.write(634, (2100).to_bytes(4, "little"), rig.clock())
     assert rig.read(GOAL) == 2100
-    assert rig.servo.table.touched(634, 4) == ("goal_position",)
+    assert rig.servo.memory.touched(634, 4) == ("goal_position",)
 
 
 def test_reg_write_waits_for_action(rig: Rig, refused: Any) -> None:
@@ -141,7 +141,7 @@ def test_a_profile_is_kept_and_shown_while_it_moves(rig: Rig) -> None:
     rig.write(ACCELERATION, 10)
     rig.write(GOAL, 4000)
     began, fastest = rig.clock(), 0
-    while rig.servo.drive.moving(rig.clock()):
+    while rig.servo.shaft.moving(rig.clock()):
         assert rig.read(122) == 1
         assert rig.read(123) & 0x33 == 0x32
         fastest = max(fastest, rig.read(128))
@@ -161,10 +161,10 @@ def test_speed_and_acceleration_are_in_the_manuals_units(rig: Rig) -> None:
     rig.write(ACCELERATION, 10)
     rig.write(GOAL_VELOCITY, 100)
     rig.pass_s(0.1)
-    assert rig.servo.drive.speed(rig.clock()) * tau / 4096 == pytest.approx(10 * 214.577 / 3600 * tau * 0.1)
+    assert rig.servo.shaft.speed(rig.clock()) * tau / 4096 == pytest.approx(10 * 214.577 / 3600 * tau * 0.1)
     rig.pass_s(10.0)
     assert rig.read(128) == 100
-    assert rig.servo.drive.speed(rig.clock()) / 4096 * 60 == pytest.approx(22.9)
+    assert rig.servo.shaft.speed(rig.clock()) / 4096 * 60 == pytest.approx(22.9)
 
 
 def test_a_time_based_profile_takes_its_time(rig: Rig) -> None:
@@ -209,7 +209,7 @@ def test_pwm_mode_turns_in_proportion(rig: Rig) -> None:
     rig.write(TORQUE, 1)
     rig.write(GOAL_PWM, 885)
     rig.pass_s(2.0)
-    assert rig.servo.drive.speed(rig.clock()) / 4096 * 60 == pytest.approx(XL430_W250.no_load_rpm)
+    assert rig.servo.shaft.speed(rig.clock()) / 4096 * 60 == pytest.approx(XL430_W250.no_load_rpm)
 
 
 def test_reverse_mode_mirrors_about_the_centre(clock: Any) -> None:

@@ -102,11 +102,11 @@ def test_heat_shuts_it_down_and_a_wrong_voltage_only_alerts(rig: Rig) -> None:
 
 
 def test_a_frozen_sensor_shows_one_place_while_the_shaft_moves(rig: Rig) -> None:
-    rig.servo.freeze_sensor(True, rig.clock(), tick=True)
+    rig.servo.freeze(True, rig.clock(), tick=True)
     tick = rig.read(120)
     moving(rig, watchdog=0)
     rig.pass_s(1.0)
     assert (rig.read(132), rig.read(128), rig.read(122), rig.read(120)) == (2048, 0, 1, tick)
     assert rig.servo.counts(rig.clock()) > 2400
-    rig.servo.freeze_sensor(False, rig.clock())
+    rig.servo.freeze(False, rig.clock())
     assert rig.read(132) > 2400

@@ -1,36 +1,30 @@
 """A simulated Dynamixel bus: servos behind one serial line, with a log and scripted faults."""
 
-import time
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from functools import cached_property
+from typing import TYPE_CHECKING
 
-from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog
-from trade_hil_sim.serial._device_bus import DeviceLine
+from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.serial._packets import BROADCAST, Writing
+from trade_hil_sim.serial._servo_bus import ServoBus
 
 from ._dispatch import Dispatch
-from ._journal import Journal
+from ._memory import MOTION
 from ._models import MODELS
-from ._protocol import BROADCAST, Packet, PacketReader
+from ._protocol import Instruction, Packet, PacketReader
 from ._servo import Servo
-from ._table import BAUDS, CENTRE, RAD_PER_COUNT
+from ._table import BAUDS
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import Joint, SerialBus
+    from trade_drivers.robotfile import Joint
 
 __all__ = ["DynamixelBus"]
 
-PAUSE_S: Final = 0.1
-"""A packet whose next byte has not come after this long is given up."""
 
-
-class DynamixelBus(DeviceLine[Servo]):
+class DynamixelBus(ServoBus[Servo, Packet]):
     """Servos on one serial line; a client opens `port` as it would a real adapter.
 
     Args:
-        servos: on the bus; two of one id answer on top of each other.
+        devices: servos on the bus; two of one id answer on top of each other.
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
@@ -38,125 +32,47 @@ class DynamixelBus(DeviceLine[Servo]):
         clock: the servos' clock, in seconds. The line itself keeps real time.
     """
 
-    def __init__(
-        self,
-        servos: Iterable[Servo],
-        port: Path,
-        *,
-        name: str = "bus",
-        log: ByteLog | None = None,
-        paced: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__(servos, port, name=name, log=log, paced=paced, clock=clock)
-        self._journal = Journal(self.log, name, self._devices)
-        self._dispatch = Dispatch(self._faults.silences, self._journal.refused)
-        self._reader = PacketReader()
-        self._deaf_to: int | None = None
-        for servo in self._devices:
-            servo.emit = self._journal.event
+    models, bauds, motion = MODELS, BAUDS, MOTION
+
+    @cached_property
+    def _dispatch(self) -> Dispatch:
+        return Dispatch(self._faults.silences)
 
     @classmethod
-    def from_robot(
-        cls, bus: "SerialBus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
-    ) -> "DynamixelBus":
-        """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
+    def _new_servo(cls, joint: "Joint", baud: int, position_counts: int, t: float) -> Servo:
+        return Servo(
+            joint.id,
+            MODELS[joint.model],
+            position_counts=position_counts,
+            baud=baud,
+            joint=joint.name,
+            reversed_=joint.reversed,
+            offset_rad=joint.offset_rad,
+            t=t,
+        )
 
-        Args:
-            bus: the bus's record.
-            joints: the joints on it.
-            port: path the client will open instead of the record's.
-            log: where to record.
-            paced: take as long as the real wire.
-
-        Raises:
-            SimulationError: a model or baud rate that is not simulated.
-        """
-        clock = time.monotonic
-        servos = [_servo_for(bus, joint, clock()) for joint in joints]
-        return cls(servos, port, name=bus.name, log=log, paced=paced, clock=clock)
-
-    def _do_to(self, device: Servo, command: faults.Command, t: float) -> None:
-        _do_to(device, command, t)
-
-    def _heal(self, device: Servo, t: float) -> None:
-        device.absent = False
-        device.freeze_sensor(False, t)
-        device.jam(False, t)
-        device.table.set("model_number", device.model.number)
-
-    def _silent_for(self, s: float) -> None:
-        if s > PAUSE_S:
-            self._reader.reset()
-
-    def _take(self, data: bytes, t: float) -> None:
-        hearing = self._hearing(t)
-        for packet in self._reader.feed(data) if hearing else ():
-            self._carry_out([servo for servo in hearing if servo.hears], packet, t)
-
-    def _hearing(self, t: float) -> list[Servo]:
-        """Servos set to the baud rate the client speaks at; to others it is noise."""
-        baud = self._line.client_baud
-        hearing = [servo for servo in self._devices if baud is None or servo.baud == baud]
-        if hearing:
-            self._deaf_to = None
-        elif baud != self._deaf_to:
-            self._deaf_to = baud
-            self._journal.wrong_baud(t, baud)
-            self._reader.reset()
-        return hearing
+    def _new_reader(self) -> PacketReader:
+        return PacketReader()
 
     def _carry_out(self, servos: list[Servo], packet: Packet, t: float) -> None:
-        now = self._clock()
-        self._journal.instruction(packet, t)
         if packet.intact:
             for servo in servos:
-                servo.heard(now)
-        for answer in self._dispatch.answers(servos, packet, now):
+                servo.heard(t)
+        for answer in self._dispatch.answers(servos, packet, t):
             device_id = answer.ids[0] if len(answer.ids) == 1 else BROADCAST
             self._answer(answer.data, answer.ids, packet.name, after_s=answer.delay_s, device_id=device_id)
 
+    def _note(self, packet: Packet, t: float) -> None:
+        if not packet.intact:
+            name = f"damaged {packet.name}"
+            self.log.add(Entry(t, self.name, "instruction", name, packet.device_id, hex=packet.params.hex()))
+        elif packet.instruction == Instruction.ACTION:
+            self._note_action(packet, t)
+        else:
+            super()._note(packet, t)
 
-def _servo_for(bus: "SerialBus", joint: "Joint", t: float) -> Servo:
-    model = MODELS.get(joint.model)
-    if model is None:
-        known = ", ".join(sorted(MODELS))
-        raise SimulationError(f'joint."{joint.name}".model: {joint.model!r} is not simulated; there is {known}')
-    if bus.baud not in BAUDS:
-        known = ", ".join(str(baud) for baud in BAUDS)
-        raise SimulationError(f"bus.{bus.name}.baud: {bus.baud} is no rate of a {model.name}; there is {known}")
-    angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
-    sign = -1 if joint.reversed else 1
-    counts = CENTRE + round(sign * (angle_rad - joint.offset_rad) / RAD_PER_COUNT)
-    return Servo(
-        joint.id,
-        model,
-        position_counts=counts,
-        baud=bus.baud,
-        joint=joint.name,
-        reversed_=joint.reversed,
-        offset_rad=joint.offset_rad,
-        t=t,
-    )
-
-
-def _do_to(servo: Servo, command: faults.Command, t: float) -> None:
-    match command:
-        case faults.Absent():
-            servo.absent = command.on
-        case faults.Freeze():
-            servo.freeze_sensor(command.on, t, tick=command.tick)
-        case faults.Jam():
-            servo.jam(command.on, t)
-        case faults.WrongModel():
-            servo.table.set("model_number", command.number)
-        case faults.BrownOut():
-            servo.reboot(t, "brown_out")
-        case faults.HardwareFault():
-            servo.fail(command.bits, t)
-        case faults.Supply():
-            servo.set_supply(t, voltage_v=command.voltage_v, temperature_c=command.temperature_c)
-        case faults.Place():
-            servo.place(command.counts, t)
-        case _:
-            raise SimulationError(f"{command} is not for one device")
+    def _note_action(self, packet: Packet, t: float) -> None:
+        kept = [(servo, servo.registered) for servo in self._addressed(packet.device_id)]
+        registers = self._touched((servo, Writing(servo.device_id, *write)) for servo, write in kept if write)
+        moves = bool(MOTION & set(registers))
+        self.log.add(Entry(t, self.name, "instruction", "action", packet.device_id, registers=registers, moves=moves))

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from trade_hil_sim.serial._device_bus import interleaved
+from trade_hil_sim.serial._packets import BROADCAST, Reading, Writing
 
 from ._memory import Refusal
-from ._protocol import BROADCAST, ErrorCode, Instruction, JoinedStatus, Packet, status
-from ._requests import JOINED, Reading, Writing, readings, writings
+from ._protocol import ErrorCode, Instruction, JoinedStatus, Packet, status
 from ._servo import Servo
 
 __all__ = ["Answer", "Dispatch"]
 
+JOINED: Final = frozenset({Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ})
 READING: Final = frozenset({Instruction.PING, Instruction.READ, Instruction.SYNC_READ, Instruction.BULK_READ}) | JOINED
 GROUP_READS: Final = frozenset({Instruction.SYNC_READ, Instruction.BULK_READ})
 GROUP_WRITES: Final = frozenset({Instruction.SYNC_WRITE, Instruction.BULK_WRITE})
@@ -35,12 +36,10 @@ class Dispatch:
 
     Args:
         silent: whether a device's answer is suppressed by a fault: device id, instruction name.
-        refused: told of every instruction a servo does not carry out: servo, time, reason.
     """
 
-    def __init__(self, silent: Callable[[int, str], bool], refused: Callable[[Servo, float, str], None]) -> None:
+    def __init__(self, silent: Callable[[int, str], bool]) -> None:
         self._silent = silent
-        self._refused = refused
 
     def answers(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
         """Carry out one packet on the servos that hear it; return what comes back, in order."""
@@ -80,7 +79,7 @@ class Dispatch:
             params = act(servo)
         except Refusal as refusal:
             code = refusal.code
-            self._refused(servo, t, f"error {code.value}: {refusal}")
+            servo.note("refused", t, f"error {code.value}: {refusal}")
         needed = _level_needed(packet)
         if level < needed or self._silent(device_id, packet.name):
             return None
@@ -88,13 +87,13 @@ class Dispatch:
 
     def _obey_shadow(self, servo: Servo, packet: Packet, t: float) -> None:
         if packet.intact and packet.instruction == Instruction.WRITE:
-            self._write(servo, writings(packet), t, by_shadow_id=True)
+            self._write(servo, packet.writings(), t, by_shadow_id=True)
 
     # to some
 
     def _group_read(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
         found: list[Answer] = []
-        for wish in readings(packet) or []:
+        for wish in packet.readings():
             alone = Packet(wish.device_id, packet.instruction, b"")
             twins = [servo for servo in servos if servo.device_id == wish.device_id]
             answers = [self._answer(servo, alone, t, _reader(wish, t)) for servo in twins]
@@ -103,7 +102,7 @@ class Dispatch:
 
     def _joined(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
         """One answer made by all; a device that is silent leaves those behind it without their cue."""
-        wishes = readings(packet) or []
+        wishes = packet.readings()
         joined = JoinedStatus(sum(wish.length for wish in wishes), len(wishes))
         ids: list[int] = []
         delay_s = 0.0
@@ -120,25 +119,25 @@ class Dispatch:
         try:
             data = servo.read(wish.address, wish.length, t)
         except Refusal as refusal:
-            self._refused(servo, t, f"error {refusal.code.value}: {refusal}")
+            servo.note("refused", t, f"error {refusal.code.value}: {refusal}")
             joined.add(wish.device_id, servo.error_field(refusal.code), bytes(wish.length))
         else:
             joined.add(wish.device_id, servo.error_field(), data)
 
     def _group_write(self, servos: Sequence[Servo], packet: Packet, t: float) -> None:
-        for wish in writings(packet) or []:
+        for wish in packet.writings():
             for servo in servos:
                 if servo.device_id == wish.device_id:
                     self._write(servo, [wish], t)
             for servo in _shadows(servos, wish.device_id):
                 self._write(servo, [wish], t, by_shadow_id=True)
 
-    def _write(self, servo: Servo, wishes: Iterable[Writing] | None, t: float, *, by_shadow_id: bool = False) -> None:
-        for wish in wishes or []:
+    def _write(self, servo: Servo, wishes: Iterable[Writing], t: float, *, by_shadow_id: bool = False) -> None:
+        for wish in wishes:
             try:
                 servo.write(wish.address, wish.data, t, by_shadow_id=by_shadow_id)
             except Refusal as refusal:
-                self._refused(servo, t, f"error {refusal.code.value}: {refusal}")
+                servo.note("refused", t, f"error {refusal.code.value}: {refusal}")
 
 
 def _level_needed(packet: Packet) -> int:
@@ -177,13 +176,13 @@ def _carry_out(servo: Servo, packet: Packet, t: float) -> bytes:
             identity = servo.read(0, 7, t)
             return identity[:2] + identity[6:]
         case Instruction.READ:
-            wish = _sensible(readings(packet))[0]
+            wish = _sensible(packet.readings())[0]
             return servo.read(wish.address, wish.length, t) if packet.device_id != BROADCAST else b""
         case Instruction.WRITE:
-            wish = _sensible(writings(packet))[0]
+            wish = _sensible(packet.writings())[0]
             servo.write(wish.address, wish.data, t)
         case Instruction.REG_WRITE:
-            wish = _sensible(writings(packet))[0]
+            wish = _sensible(packet.writings())[0]
             servo.reg_write(wish.address, wish.data)
         case _:
             _carry_out_rare(servo, packet, t)
@@ -207,7 +206,7 @@ def _carry_out_rare(servo: Servo, packet: Packet, t: float) -> None:
             raise Refusal(ErrorCode.INSTRUCTION, f"instruction {packet.name} is not one of mine")
 
 
-def _sensible(wishes: list[_Wish] | None) -> list[_Wish]:
-    if wishes is None:
+def _sensible(wishes: list[_Wish]) -> list[_Wish]:
+    if not wishes:
         raise Refusal(ErrorCode.DATA_LENGTH, "parameters too short or too long")
     return wishes

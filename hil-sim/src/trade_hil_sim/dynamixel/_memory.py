@@ -1,14 +1,32 @@
-"""The control table as memory: what may be read and written where, with indirect addresses followed.
+"""The control table as memory: what may be read and written where and when, with indirect addresses followed.
 
-Knows nothing of motion or time; rules that depend on other registers are the servo's.
+Knows nothing of motion or time. Source: ROBOTIS e-Manual, descriptions of the models' control tables.
 """
 
-from collections.abc import Iterable
+from typing import Final
+
+from trade_hil_sim.serial._registers import Memory
 
 from ._protocol import ErrorCode
-from ._table import RAM_BEGINS, Model, Register
+from ._table import EXTENDED_RANGE, RAM_BEGINS, Mode, Model, Register
 
-__all__ = ["ControlTable", "Refusal"]
+__all__ = ["GOALS", "MOTION", "WATCHDOG_EXPIRED", "ControlTable", "HardwareError", "Refusal", "check", "seed_goals"]
+
+GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_position"})
+MOTION: Final = GOALS | {"torque_enable"}
+"""A write to any of these could set something moving, or let go of it."""
+WATCHDOG_EXPIRED: Final = 255
+"""What register 98 shows after its time has run out."""
+
+
+class HardwareError:
+    """Bits of Hardware Error Status, register 70, and of Shutdown, register 63."""
+
+    VOLTAGE: Final = 0x01
+    OVERHEATING: Final = 0x04
+    ENCODER: Final = 0x08
+    SHOCK: Final = 0x10
+    OVERLOAD: Final = 0x20
 
 
 class Refusal(Exception):
@@ -20,33 +38,13 @@ class Refusal(Exception):
         self.reason = reason
 
 
-class ControlTable:
+class ControlTable(Memory[Register]):
     """The memory of one servo, EEPROM and RAM, at its factory defaults."""
 
     def __init__(self, model: Model) -> None:
+        super().__init__(model.by_name, model.ends)
         self.model = model
-        self._bytes = bytearray(model.ends)
-        self._at: list[Register | None] = [None] * model.ends
-        for register in model.registers:
-            self._at[register.address : register.address + register.size] = [register] * register.size
-            self.set(register.name, register.default)
-
-    def get(self, name: str) -> int:
-        """A register's value in device units."""
-        register = self.model.by_name[name]
-        raw = self._bytes[register.address : register.address + register.size]
-        return int.from_bytes(raw, "little", signed=register.signed)
-
-    def set(self, name: str, value: int) -> None:
-        """Put a value into a register, whatever its access; surplus bits are cut off."""
-        register = self.model.by_name[name]
-        raw = (value & (1 << 8 * register.size) - 1).to_bytes(register.size, "little")
-        self._bytes[register.address : register.address + register.size] = raw
-
-    def restore(self, registers: Iterable[Register]) -> None:
-        """Set registers to their factory defaults."""
-        for register in registers:
-            self.set(register.name, register.default)
+        self.restore(model.registers)
 
     def forget_ram(self) -> None:
         """What happens to the memory at power loss: EEPROM stays, RAM does not."""
@@ -75,12 +73,6 @@ class ControlTable:
         bytes_at = {self._target(address + k): byte for k, byte in enumerate(data)}
         return [(register, _value(register, bytes_at)) for register in self._whole(bytes_at)]
 
-    def touched(self, address: int, length: int) -> tuple[str, ...]:
-        """Names of the registers in a range, through indirect addresses, in order and once each."""
-        inside = range(address, min(address + length, self.model.ends))
-        found = (self._at[self._target(at)] for at in inside)
-        return tuple(dict.fromkeys(register.name for register in found if register is not None))
-
     def _target(self, address: int) -> int:
         for bank in self.model.indirect:
             if bank.data_at <= address < bank.data_at + bank.count:
@@ -104,10 +96,55 @@ class ControlTable:
 
 
 def _value(register: Register, bytes_at: dict[int, int]) -> int:
-    raw = bytes(bytes_at[register.address + k] for k in range(register.size))
-    value = int.from_bytes(raw, "little", signed=register.signed)
+    value = register.decode(bytes(bytes_at[register.address + k] for k in range(register.size)))
     low, high = register.low, register.high
     if (low is not None and value < low) or (high is not None and value > high):
         reason = f"{register.name} ({register.address}) = {value} is outside {low} to {high}"
         raise Refusal(ErrorCode.DATA_RANGE, reason)
     return value
+
+
+def check(table: ControlTable, register: Register, value: int, *, by_shadow_id: bool = False) -> None:
+    """Raise `Refusal` if the state of the other registers forbids this write."""
+    name = register.name
+    if register.eeprom:
+        _check_unlocked(table, register, by_shadow_id)
+    if table.get("bus_watchdog") == WATCHDOG_EXPIRED and (name in GOALS or (name == "bus_watchdog" and value != 0)):
+        raise Refusal(ErrorCode.DATA_RANGE, f"{name}: the bus watchdog has expired; write 0 to register 98 first")
+    if name == "operating_mode" and value not in table.model.modes:
+        raise Refusal(ErrorCode.DATA_RANGE, f"operating mode {value} is none of {sorted(table.model.modes)}")
+    if name in GOALS:
+        _check_goal(table, name, value)
+
+
+def _check_unlocked(table: ControlTable, register: Register, by_shadow_id: bool) -> None:
+    if table.get("torque_enable"):
+        reason = f"{register.name} ({register.address}) is EEPROM, locked while torque is on"
+        raise Refusal(ErrorCode.ACCESS, reason)
+    if by_shadow_id:
+        raise Refusal(ErrorCode.ACCESS, f"{register.name} ({register.address}) is EEPROM, closed to the secondary id")
+
+
+def _check_goal(table: ControlTable, name: str, value: int) -> None:
+    low, high = _goal_range(table, name)
+    if not low <= value <= high:
+        raise Refusal(ErrorCode.DATA_LIMIT, f"{name} = {value} is outside {low} to {high}")
+
+
+def _goal_range(table: ControlTable, name: str) -> tuple[int, int]:
+    if name == "goal_position":
+        if table.get("operating_mode") == Mode.POSITION:
+            return table.get("min_position_limit"), table.get("max_position_limit")
+        return -EXTENDED_RANGE, EXTENDED_RANGE
+    limit = table.get(name.removeprefix("goal_") + "_limit")
+    return -limit, limit
+
+
+def seed_goals(table: ControlTable, position_counts: int) -> None:
+    """Goals that ask for no motion. Outside PWM mode, goal PWM is only the limit of the controller."""
+    mode = table.get("operating_mode")
+    table.set("goal_position", position_counts)
+    table.set("goal_velocity", 0)
+    table.set("goal_pwm", 0 if mode == Mode.PWM else table.get("pwm_limit"))
+    if "goal_current" in table.model.by_name:
+        table.set("goal_current", 0 if mode == Mode.CURRENT else table.get("current_limit"))

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
+from trade_hil_sim.serial import _packets as packets
+from trade_hil_sim.serial._packets import BROADCAST, Reading, Writing
+
 __all__ = [
-    "BROADCAST",
     "ErrorCode",
     "Instruction",
     "JoinedStatus",
@@ -25,7 +27,6 @@ __all__ = [
 HEADER: Final = b"\xff\xff\xfd\x00"
 RESYNC: Final = b"\xff\xff\xfd"
 STUFFED: Final = b"\xff\xff\xfd\xfd"
-BROADCAST: Final = 254
 HIGHEST_ID: Final = 252
 BODY: Final = 7
 """Where the instruction stands: header, id and length come before."""
@@ -112,47 +113,69 @@ def status(device_id: int, error: int, params: bytes = b"") -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(packets.Packet):
     """One packet, unstuffed."""
 
-    device_id: int
-    instruction: int
-    params: bytes
     intact: bool = True
     """Whether the CRC was right."""
+    names = Instruction
 
-    @property
-    def name(self) -> str:
-        """Lower-case name of the instruction, or its number in hex."""
-        try:
-            return Instruction(self.instruction).name.lower()
-        except ValueError:
-            return f"{self.instruction:#04x}"
+    def readings(self) -> list[Reading]:
+        """What a read, sync read or bulk read (fast or not) asks for; nothing if its parameters make no sense."""
+        params = self.params
+        match self.instruction:
+            case Instruction.READ if len(params) == 4:
+                return [Reading(self.device_id, _word(params, 0), _word(params, 2))]
+            case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
+                return [Reading(device_id, _word(params, 0), _word(params, 2)) for device_id in params[4:]]
+            case Instruction.BULK_READ | Instruction.FAST_BULK_READ if len(params) % 5 == 0:
+                starts = range(0, len(params), 5)
+                return [Reading(params[i], _word(params, i + 1), _word(params, i + 3)) for i in starts]
+            case _:
+                return []
+
+    def writings(self) -> list[Writing]:
+        """What a write, reg write, sync write or bulk write asks for; nothing if its parameters make no sense."""
+        params = self.params
+        match self.instruction:
+            case Instruction.WRITE | Instruction.REG_WRITE if len(params) > 2:
+                return [Writing(self.device_id, _word(params, 0), params[2:])]
+            case Instruction.SYNC_WRITE:
+                return _sync_writings(params)
+            case Instruction.BULK_WRITE:
+                return _bulk_writings(params)
+            case _:
+                return []
 
 
-class PacketReader:
+def _sync_writings(params: bytes) -> list[Writing]:
+    address, size, rest = _word(params, 0), _word(params, 2), params[4:]
+    if size == 0 or len(rest) % (size + 1):
+        return []
+    return [Writing(rest[i], address, rest[i + 1 : i + 1 + size]) for i in range(0, len(rest), size + 1)]
+
+
+def _bulk_writings(params: bytes) -> list[Writing]:
+    found: list[Writing] = []
+    while params:
+        size = _word(params, 3) if len(params) >= 5 else 0
+        if size == 0 or len(params) < 5 + size:
+            return []
+        found.append(Writing(params[0], _word(params, 1), params[5 : 5 + size]))
+        params = params[5 + size :]
+    return found
+
+
+def _word(params: bytes, at: int) -> int:
+    return int.from_bytes(params[at : at + 2], "little")
+
+
+class PacketReader(packets.PacketReader[Packet]):
     """Cuts a stream of bytes into packets, wherever the chunks break.
 
     Strict like a device: a header inside a packet that is not stuffed begins a new one, so what a client sends without
     stuffing is lost, not guessed at.
     """
-
-    def __init__(self) -> None:
-        self._held = b""
-        self.skipped = 0
-        """Bytes thrown away so far because they belonged to no packet."""
-
-    def feed(self, data: bytes) -> list[Packet]:
-        """Take in bytes; return the packets they completed."""
-        self._held += data
-        packets: list[Packet] = []
-        while (packet := self._next()) is not None:
-            packets.append(packet)
-        return packets
-
-    def reset(self) -> None:
-        """Forget a packet begun."""
-        self._skip(len(self._held))
 
     def _next(self) -> Packet | None:
         while True:
@@ -171,10 +194,6 @@ class PacketReader:
                 return None
             self._held = held[BODY + length :]
             return _decoded(held[: BODY + length])
-
-    def _skip(self, count: int) -> None:
-        self._held = self._held[count:]
-        self.skipped += count
 
 
 def _header_at(held: bytes) -> int:

@@ -4,18 +4,18 @@ Sources: ROBOTIS e-Manual, the models' pages (control table of EEPROM area, of R
 their own on purpose: a mistake in one of them shows.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
-from math import tau
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Final
 
-__all__ = ["ACCELERATION_COUNTS_S2", "COUNTS_PER_TURN", "VELOCITY_COUNTS_S", "Access", "Indirect", "Model", "Register"]
+from trade_hil_sim.serial import _registers as registers
+from trade_hil_sim.serial._registers import Access
+from trade_hil_sim.serial._servo import CENTRE, COUNTS_PER_TURN
+
+__all__ = ["ACCELERATION_COUNTS_S2", "VELOCITY_COUNTS_S", "Access", "Indirect", "Mode", "Model", "Register"]
 __all__ += ["gain", "x_series"]
 
-COUNTS_PER_TURN: Final = 4096
-CENTRE: Final = 2048
-RAD_PER_COUNT: Final = tau / COUNTS_PER_TURN
 VELOCITY_COUNTS_S: Final = 0.229 * COUNTS_PER_TURN / 60
 """Counts per second in one unit of velocity, 0.229 rev/min."""
 ACCELERATION_COUNTS_S2: Final = 214.577 * COUNTS_PER_TURN / 3600
@@ -27,24 +27,32 @@ BAUDS: Final = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_00
 """Register 8 is an index into these."""
 
 
-class Access(Enum):
-    """Who may change a register."""
+class Mode(IntEnum):
+    """Operating mode, register 11."""
 
-    READ = "R"
-    WRITE = "RW"
+    CURRENT = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    CURRENT_BASED_POSITION = 5
+    PWM = 16
+
+    @property
+    def seeks_position(self) -> bool:
+        """Whether the goal position is what it goes for."""
+        return self in {Mode.POSITION, Mode.EXTENDED_POSITION, Mode.CURRENT_BASED_POSITION}
+
+    @property
+    def goal(self) -> str:
+        """The register that sets it going."""
+        names = {Mode.CURRENT: "goal_current", Mode.VELOCITY: "goal_velocity", Mode.PWM: "goal_pwm"}
+        return names.get(self, "goal_position")
 
 
 @dataclass(frozen=True, slots=True)
-class Register:
-    """One item of the control table, in the device's own units."""
+class Register(registers.Register):
+    """One item of the control table."""
 
-    address: int
-    size: int
-    name: str
-    access: Access = Access.WRITE
-    default: int = 0
-    low: int | None = None
-    high: int | None = None
     signed: bool = False
 
     @property
@@ -52,10 +60,13 @@ class Register:
         """Whether it survives power loss, and is locked while torque is on."""
         return self.address < RAM_BEGINS
 
-    @property
-    def writable(self) -> bool:
-        """Whether an instruction may change it."""
-        return self.access is Access.WRITE
+    def decode(self, raw: bytes) -> int:
+        """The value of its bytes: low byte first, two's complement."""
+        return int.from_bytes(raw, "little", signed=self.signed)
+
+    def encode(self, value: int) -> bytes:
+        """Its bytes; surplus bits are cut off."""
+        return (value & (1 << 8 * self.size) - 1).to_bytes(self.size, "little")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,22 +81,14 @@ class Indirect:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class Model(registers.Model[Register]):
     """One kind of servo."""
 
-    name: str
-    number: int
     firmware: int
-    registers: tuple[Register, ...]
     modes: frozenset[int]
     no_load_rpm: float
     """At the voltage it is made for, e-Manual "Specifications"."""
-    supply_v: float
     indirect: tuple[Indirect, ...]
-    by_name: Mapping[str, Register] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "by_name", {register.name: register for register in self.registers})
 
     @property
     def ends(self) -> int:

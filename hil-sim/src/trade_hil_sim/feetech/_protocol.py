@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-__all__ = ["BROADCAST", "Instruction", "Packet", "PacketReader", "Reading", "Writing", "checksum", "encode"]
-__all__ += ["readings", "status", "writings"]
+from trade_hil_sim.serial import _packets as packets
+from trade_hil_sim.serial._packets import BROADCAST, Reading, Writing
+
+__all__ = ["Instruction", "Packet", "PacketReader", "checksum", "encode", "status"]
 
 HEADER: Final = b"\xff\xff"
-BROADCAST: Final = 254
 LONGEST: Final = 250
 """The greatest LEN that is no noise: an assumption."""
 
@@ -48,41 +49,38 @@ def status(device_id: int, complaints: int, params: bytes = b"") -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(packets.Packet):
     """One packet."""
 
-    device_id: int
-    instruction: int
-    params: bytes
+    names = Instruction
 
-    @property
-    def name(self) -> str:
-        """Lower-case name of the instruction, or its number in hex."""
-        try:
-            return Instruction(self.instruction).name.lower()
-        except ValueError:
-            return f"{self.instruction:#04x}"
+    def readings(self) -> list[Reading]:
+        """What a read or sync read asks for; nothing if its parameters make no sense."""
+        params = self.params
+        match self.instruction:
+            case Instruction.READ if len(params) == 2:
+                return [Reading(self.device_id, *params)]
+            case Instruction.SYNC_READ if len(params) > 2:
+                return [Reading(device_id, params[0], params[1]) for device_id in params[2:]]
+            case _:
+                return []
+
+    def writings(self) -> list[Writing]:
+        """What a write, reg write or sync write asks for; nothing if its parameters make no sense."""
+        params = self.params
+        match self.instruction:
+            case Instruction.WRITE | Instruction.REG_WRITE if len(params) > 1:
+                return [Writing(self.device_id, params[0], params[1:])]
+            case Instruction.SYNC_WRITE if len(params) > 2 and params[1] and not (len(params) - 2) % (params[1] + 1):
+                address, size = params[:2]
+                starts = range(2, len(params), size + 1)
+                return [Writing(params[at], address, params[at + 1 : at + 1 + size]) for at in starts]
+            case _:
+                return []
 
 
-class PacketReader:
+class PacketReader(packets.PacketReader[Packet]):
     """Cuts a stream of bytes into packets, wherever the chunks break; what has a wrong checksum is none."""
-
-    def __init__(self) -> None:
-        self._held = b""
-        self.skipped = 0
-        """Bytes thrown away so far because they belonged to no packet."""
-
-    def feed(self, data: bytes) -> list[Packet]:
-        """Take in bytes; return the packets they completed."""
-        self._held += data
-        packets: list[Packet] = []
-        while (packet := self._next()) is not None:
-            packets.append(packet)
-        return packets
-
-    def reset(self) -> None:
-        """Forget a packet begun."""
-        self._skip(len(self._held))
 
     def _next(self) -> Packet | None:
         while True:
@@ -103,51 +101,3 @@ class PacketReader:
                 continue
             self._held = held[4 + length :]
             return Packet(device_id, packet[4], packet[5:-1])
-
-    def _skip(self, count: int) -> None:
-        self._held = self._held[count:]
-        self.skipped += count
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """Read `length` bytes from `address` of one device."""
-
-    device_id: int
-    address: int
-    length: int
-
-
-@dataclass(frozen=True, slots=True)
-class Writing:
-    """Write `data` to `address` of one device."""
-
-    device_id: int
-    address: int
-    data: bytes
-
-
-def readings(packet: Packet) -> list[Reading]:
-    """What a read or sync read asks for; nothing if its parameters make no sense."""
-    params = packet.params
-    match packet.instruction:
-        case Instruction.READ if len(params) == 2:
-            return [Reading(packet.device_id, *params)]
-        case Instruction.SYNC_READ if len(params) > 2:
-            return [Reading(device_id, params[0], params[1]) for device_id in params[2:]]
-        case _:
-            return []
-
-
-def writings(packet: Packet) -> list[Writing]:
-    """What a write, reg write or sync write asks for; nothing if its parameters make no sense."""
-    params = packet.params
-    match packet.instruction:
-        case Instruction.WRITE | Instruction.REG_WRITE if len(params) > 1:
-            return [Writing(packet.device_id, params[0], params[1:])]
-        case Instruction.SYNC_WRITE if len(params) > 2 and params[1] and not (len(params) - 2) % (params[1] + 1):
-            address, size = params[:2]
-            starts = range(2, len(params), size + 1)
-            return [Writing(params[at], address, params[at + 1 : at + 1 + size]) for at in starts]
-        case _:
-            return []

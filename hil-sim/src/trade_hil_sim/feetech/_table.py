@@ -4,17 +4,15 @@ Sources: addresses, sizes and defaults from Feetech's "STS memory table", where 
 library has them. The drivers keep a table of their own on purpose: a mistake in one of them shows.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from enum import Enum
-from math import tau
+from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["ACCELERATION_STEPS_S2", "BAUDS", "CENTRE", "RAD_PER_COUNT", "STS3215", "Access", "Model", "Register"]
+from trade_hil_sim.serial import _registers as registers
+from trade_hil_sim.serial._registers import Access
+from trade_hil_sim.serial._servo import CENTRE
 
-CENTRE: Final = 2048
-COUNTS_PER_TURN: Final = 4096
-RAD_PER_COUNT: Final = tau / COUNTS_PER_TURN
+__all__ = ["ACCELERATION_STEPS_S2", "BAUDS", "STS3215", "Model", "Register"]
+
 ACCELERATION_STEPS_S2: Final = 100
 EEPROM_BEGINS: Final = 5
 RAM_BEGINS: Final = 40
@@ -23,35 +21,16 @@ BAUDS: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200)
 """Register 6 is an index into these; of the slower ones, sources disagree."""
 
 
-class Access(Enum):
-    """Who may change a register."""
-
-    READ = "R"
-    WRITE = "RW"
-
-
 @dataclass(frozen=True, slots=True)
-class Register:
-    """One item of the memory table, in the device's own units."""
+class Register(registers.Register):
+    """One item of the memory table."""
 
-    address: int
-    size: int
-    name: str
-    access: Access = Access.WRITE
-    default: int = 0
-    low: int | None = None
-    high: int | None = None
     sign_bit: int | None = None
 
     @property
     def eeprom(self) -> bool:
         """Whether it can be kept without power."""
         return EEPROM_BEGINS <= self.address < RAM_BEGINS
-
-    @property
-    def writable(self) -> bool:
-        """Whether an instruction may change it."""
-        return self.access is Access.WRITE
 
     def decode(self, raw: bytes) -> int:
         """The value of its bytes: low byte first, sign and magnitude."""
@@ -70,19 +49,11 @@ class Register:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class Model(registers.Model[Register]):
     """One kind of servo."""
 
-    name: str
-    number: int
-    registers: tuple[Register, ...]
     top_speed_counts_s: float
     """The fastest the shaft turns, whatever the registers say."""
-    supply_v: float
-    by_name: Mapping[str, Register] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "by_name", {register.name: register for register in self.registers})
 
 
 READ: Final = Access.READ

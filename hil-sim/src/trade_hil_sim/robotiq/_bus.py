@@ -1,17 +1,17 @@
 """A simulated Modbus line with 2F-85 grippers, with a log and scripted faults."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.serial._device_bus import DeviceLine
 
 from . import _table as table
-from ._gripper import Gripper, Object
+from ._gripper import Gripper
 from ._protocol import (
     BROADCAST,
     MOST_REGISTERS,
@@ -42,7 +42,7 @@ class RobotiqBus(DeviceLine[Gripper]):
     """Grippers on one serial line; a client opens `port` as it would a real adapter.
 
     Args:
-        grippers: on the bus, each with an id of its own.
+        devices: grippers on the bus, each with an id of its own.
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
@@ -50,20 +50,9 @@ class RobotiqBus(DeviceLine[Gripper]):
         clock: the grippers' clock, in seconds. The line itself keeps real time.
     """
 
-    def __init__(
-        self,
-        grippers: Iterable[Gripper],
-        port: Path,
-        *,
-        name: str = "bus",
-        log: ByteLog | None = None,
-        paced: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__(grippers, port, name=name, log=log, paced=paced, clock=clock)
-        self._reader = RequestReader()
-        for gripper in self._devices:
-            gripper.emit = self._event
+    @cached_property
+    def _reader(self) -> RequestReader:
+        return RequestReader()
 
     @classmethod
     def from_robot(
@@ -93,35 +82,9 @@ class RobotiqBus(DeviceLine[Gripper]):
         for device in devices:
             if device.model != MODEL:
                 raise SimulationError(f'"{device.name}".model: {device.model!r} is not simulated; there is {MODEL}')
-        clock = time.monotonic
-        grippers = [Gripper(device.id, name=device.name, t=clock(), baud=bus.baud) for device in devices]
-        return cls(grippers, port, name=bus.name, log=log, paced=paced, clock=clock)
-
-    def _do_to(self, device: Gripper, command: faults.Command, t: float) -> None:
-        match command:
-            case faults.Absent():
-                device.absent = command.on
-            case faults.Freeze():
-                device.freeze(command.on, t)
-            case faults.Jam():
-                device.jam(command.on, t)
-            case faults.BrownOut():
-                device.lose_power(t)
-            case faults.HardwareFault():
-                device.fail(command.bits, t)
-            case faults.Supply():
-                device.set_supply(t, voltage_v=command.voltage_v, temperature_c=command.temperature_c)
-            case faults.WrongModel():
-                device.foreign = True
-            case faults.Put(width_m=None):
-                device.put(None, t)
-            case faults.Put(width_m=float(width_m)):
-                device.put(Object(width_m, command.stiffness_n_m, command.inside), t)
-            case _:
-                raise SimulationError(f"{type(command).__name__} is nothing that happens to a {MODEL}")
-
-    def _heal(self, device: Gripper, t: float) -> None:
-        device.heal(t)
+        t = time.monotonic()
+        grippers = [Gripper(device.id, name=device.name, t=t, baud=bus.baud) for device in devices]
+        return cls(grippers, port, name=bus.name, log=log, paced=paced)
 
     # --- requests
 
@@ -145,7 +108,7 @@ class RobotiqBus(DeviceLine[Gripper]):
             gripper.heard(now)
             answer = _obey(gripper, request, now)
             if isinstance(answer, ExceptionCode):
-                self._event(gripper, "refused", now, answer.name.lower())
+                gripper.note("refused", now, answer.name.lower())
                 answer = exception(request, answer) if gripper.exceptions or gripper.foreign else None
             silenced = self._faults.silences(gripper.device_id, request.name)
             if answer is not None and request.device_id != BROADCAST and not silenced:
@@ -174,22 +137,6 @@ class RobotiqBus(DeviceLine[Gripper]):
                 address=address,
                 registers=names,
                 moves=moves,
-            )
-        )
-
-    def _event(self, gripper: Gripper, name: str, t: float, detail: str) -> None:
-        counts = gripper.position(t)
-        self.log.add(
-            Entry(
-                t,
-                self.name,
-                "event",
-                name,
-                gripper.device_id,
-                joint=gripper.name,
-                position_counts=round(counts),
-                width_m=table.width_of(counts),
-                detail=detail,
             )
         )
 

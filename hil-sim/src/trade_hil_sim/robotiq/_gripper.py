@@ -3,13 +3,16 @@
 Time is an argument everywhere, in seconds on the caller's clock; nothing happens but in `advance`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf
 from typing import Final
 
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._truth import GripperTruth
+from trade_hil_sim.serial._device_bus import LineDevice
 
 from . import _table as table
 
@@ -74,14 +77,7 @@ def _within(counts: int) -> int:
     return min(table.CLOSED_COUNTS, max(table.OPEN_COUNTS, counts))
 
 
-Emit = Callable[["Gripper", str, float, str], None]
-
-
-def _quiet(_gripper: "Gripper", _name: str, _t: float, _detail: str) -> None:
-    return
-
-
-class Gripper:
+class Gripper(LineDevice):
     """A gripper on the bus, powered up at `t` and not activated.
 
     Args:
@@ -93,6 +89,8 @@ class Gripper:
         exceptions: answer bad requests with exceptions; the manual says it stays silent.
     """
 
+    thing = "a 2F-85"
+
     def __init__(
         self,
         device_id: int = 9,
@@ -103,12 +101,10 @@ class Gripper:
         baud: int = 115_200,
         exceptions: bool = False,
     ) -> None:
-        self.device_id, self.name, self.baud, self.exceptions = device_id, name, baud, exceptions
-        self.emit: Emit = _quiet
-        self.absent = False
+        super().__init__()
+        self._device_id, self.name, self.baud, self.exceptions = device_id, name, baud, exceptions
         self.foreign = False
         """Another Modbus device has its id, with other registers."""
-        self._volts, self._celsius = 24.0, 30
         self._wanted = [0, 0, 0]
         self._taken = [0, 0, 0]
         self._take_at = _NEVER
@@ -123,6 +119,11 @@ class Gripper:
         self._frozen: int | None = None
         self._heard_at = t
         self._deaf_until = _NEVER
+
+    @property
+    def device_id(self) -> int:
+        """Its slave id."""
+        return self._device_id
 
     # --- registers
 
@@ -226,15 +227,15 @@ class Gripper:
 
     def _deactivate(self, t: float) -> None:
         if self._activated or self._activating or self._fault:
-            self.emit(self, "deactivated", t, "")
+            self.note("deactivated", t)
         self._activated = self._activating = False
         self._fault = 0
         self._halt(t)
-        self._feel(t)
+        self._check_supply(t)
 
     def _begin_activation(self, t: float) -> None:
         if self._fault < table.MAJOR_FAULT:
-            self.emit(self, "activating", t, "")
+            self.note("activating", t)
             self._activating = True
             self._then = [table.OPEN_COUNTS]
             self._run_to(table.CLOSED_COUNTS, ACTIVATION_COUNTS_S, t)
@@ -252,7 +253,7 @@ class Gripper:
         self._stretch = _Stretch(t, here, end, speed)
         if not self._moving and end != here:
             self._moving = True
-            self.emit(self, "motion_started", t, f"to {table.width_of(end):.4f} m")
+            self.note("motion_started", t, f"to {table.width_of(end):.4f} m")
         elif end == here:
             self._arrive(t)
 
@@ -275,7 +276,7 @@ class Gripper:
             return
         if self._activating:
             self._activating, self._activated = False, True
-            self.emit(self, "activated", t, "")
+            self.note("activated", t)
             self._rest(t, "activated")
             self._go(t)
             return
@@ -293,7 +294,7 @@ class Gripper:
     def _rest(self, t: float, why: str) -> None:
         if self._moving:
             self._moving = False
-            self.emit(self, "at_rest", t, why)
+            self.note("at_rest", t, why)
 
     # --- the world
 
@@ -302,12 +303,27 @@ class Gripper:
         self._put = what
         self._go(t)
 
+    def _do_rare(self, command: faults.Command, t: float) -> None:
+        match command:
+            case faults.HardwareFault():
+                self.fail(command.bits, t)
+            case faults.Put(width_m=None):
+                self.put(None, t)
+            case faults.Put(width_m=float(width_m)):
+                self.put(Object(width_m, command.stiffness_n_m, command.inside), t)
+            case _:
+                super()._do_rare(command, t)
+
+    def wrong_model(self, number: int) -> None:  # noqa: ARG002 - a Modbus device has none
+        """Be another Modbus device, with other registers."""
+        self.foreign = True
+
     def jam(self, on: bool, t: float) -> None:
         """Hold the fingers fast, or let go."""
         self._jammed = on
         self._go(t)
 
-    def freeze(self, on: bool, t: float) -> None:
+    def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
         """Let the position read stand still."""
         self._frozen = round(self.position(t)) if on else None
 
@@ -317,39 +333,47 @@ class Gripper:
         if fault >= table.MAJOR_FAULT:
             self._activated = self._activating = False
         self._halt(t)
-        self.emit(self, "fault", t, f"{fault:#04x}")
+        self.note("fault", t, f"{fault:#04x}")
 
-    def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:
-        """Change what it measures of its supply and housing; outside of its limits that is a fault."""
-        self._volts = self._volts if voltage_v is None else voltage_v
-        self._celsius = self._celsius if temperature_c is None else temperature_c
-        if self._fault == table.HOT_FAULT and self._celsius < COOL_C:
-            self._fault = 0
-        self._feel(t)
-
-    def _feel(self, t: float) -> None:
+    def _check_supply(self, t: float) -> None:
         """Fail, unless it has failed already, while its supply or its housing is outside of its limits."""
-        if self._volts < LEAST_V and self._fault < table.MAJOR_FAULT:
+        if self._fault == table.HOT_FAULT and self.temperature_c < COOL_C:
+            self._fault = 0
+        if self.supply_v < LEAST_V and self._fault < table.MAJOR_FAULT:
             self.fail(table.LOW_VOLTAGE_FAULT, t)
-        elif self._celsius >= HOT_C and not self._fault:
+        elif self.temperature_c >= HOT_C and not self._fault:
             self.fail(table.HOT_FAULT, t)
 
-    def heal(self, t: float) -> None:
+    def _restore(self, t: float) -> None:  # noqa: ARG002 - at once
         """End what was done to it but for a major fault, which only a new activation clears."""
-        self.absent = self.foreign = False
-        self._frozen = None
-        self._volts, self._celsius = 24.0, 30
+        self.foreign = False
+        self.supply_v, self.temperature_c = self.healthy
         if self._fault < table.MAJOR_FAULT:
             self._fault = 0
-        self.jam(False, t)
 
-    def lose_power(self, t: float) -> None:
+    def brown_out(self, t: float) -> None:
         """The supply dips: the registers are 0, the fingers stand, and it has to be activated again."""
         self._wanted, self._taken, self._take_at = [0, 0, 0], [0, 0, 0], _NEVER
         self._activated = self._activating = False
         self._fault = 0
         self._halt(t)
-        self.emit(self, "brown_out", t, "")
+        self.note("brown_out", t)
+
+    def note(self, name: str, t: float, detail: str = "") -> None:
+        """Log an event, with where the fingers are."""
+        counts = self.position(t)
+        entry = Entry(
+            t,
+            "",
+            "event",
+            name,
+            self.device_id,
+            joint=self.name,
+            position_counts=round(counts),
+            width_m=table.width_of(counts),
+            detail=detail,
+        )
+        self.emit(entry)
 
     def state(self, t: float) -> GripperTruth:
         """The truth about it, now."""

@@ -6,43 +6,33 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import msgspec
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._active import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import ByteLog
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.mechanics._device import DeviceModel
 from trade_hil_sim.mechanics._truth import BusState, DeviceState, GripperTruth
 from trade_hil_sim.serial._line import SerialLine
 
-__all__ = ["DeviceLine", "interleaved"]
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["DeviceLine", "LineDevice", "interleaved"]
 
 
-class Device(Protocol):
-    """Something with an id that does things by itself."""
+class LineDevice(DeviceModel):
+    """A device on a serial line."""
 
-    @property
-    def device_id(self) -> int:
-        """Its id on the bus."""
-        ...
-
-    def advance(self, t: float) -> None:
-        """Do what is due at time `t`."""
-        ...
-
+    @abstractmethod
     def next_due(self) -> float | None:
         """When something happens by itself; None if never."""
-        ...
-
-    def state(self, t: float) -> DeviceState | GripperTruth:
-        """The truth about it at time `t`."""
-        ...
 
 
-_Device = TypeVar("_Device", bound=Device)
-_Bus = TypeVar("_Bus", bound="DeviceLine[Any]")
+_Device = TypeVar("_Device", bound=LineDevice)
 
 
 class DeviceLine(ABC, Generic[_Device]):
@@ -53,7 +43,7 @@ class DeviceLine(ABC, Generic[_Device]):
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
-        paced: take as long as the real wire; else answer as fast as possible.
+        paced: take as long as the real wire, pauses before answers included; else answer as fast as possible.
         clock: the devices' clock, in seconds. The line itself keeps real time.
     """
 
@@ -62,22 +52,24 @@ class DeviceLine(ABC, Generic[_Device]):
         devices: Iterable[_Device],
         port: Path,
         *,
-        name: str,
-        log: ByteLog | None,
-        paced: bool,
+        name: str = "bus",
+        log: ByteLog | None = None,
+        paced: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name, self.port = name, port
         self.log = ByteLog() if log is None else log
         self._clock = clock
         self._devices = list(devices)
+        for device in self._devices:
+            device.emit = self._emit
         self._lock = threading.RLock()
         self._faults = ActiveFaults()
         self._last_byte_at = 0.0
         self._echo = False
         self._line = SerialLine(port, self, name=name, log=self.log, paced=paced)
 
-    def open(self: _Bus) -> _Bus:
+    def open(self) -> "Self":
         """Plug in: from now on the port can be opened."""
         self._line.open()
         return self
@@ -86,7 +78,7 @@ class DeviceLine(ABC, Generic[_Device]):
         """Hang up and remove the port. Idempotent; a log passed in stays open."""
         self._line.close()
 
-    def __enter__(self: _Bus) -> _Bus:
+    def __enter__(self) -> "Self":
         return self.open()
 
     def __exit__(self, *exc: object) -> None:
@@ -139,8 +131,7 @@ class DeviceLine(ABC, Generic[_Device]):
                 self._faults.heal()
                 self._echo = False
                 for device in self._devices:
-                    device.advance(t)
-                    self._heal(device, t)
+                    device.heal(t)
             case faults.Echo():
                 self._echo = command.on
             case faults.Unplug() | faults.Replug() | faults.HangUp() | faults.Local():
@@ -148,25 +139,19 @@ class DeviceLine(ABC, Generic[_Device]):
             case faults.Absent(nth=int(nth)) if nth > len(self._devices):
                 raise SimulationError(f"bus {self.name} has {len(self._devices)} devices, no number {nth}")
             case faults.Absent(nth=int(nth)):
-                self._do_to(self._devices[nth - 1], command, t)
+                self._devices[nth - 1].do(command, t)
             case _:
                 for device in self._named(command.ids):
-                    device.advance(t)
-                    self._do_to(device, command, t)
-
-    @abstractmethod
-    def _do_to(self, device: _Device, command: faults.Command, t: float) -> None:
-        """Carry out an order on one device; raises `SimulationError` for what it cannot have."""
-
-    @abstractmethod
-    def _heal(self, device: _Device, t: float) -> None:
-        """End what orders did to one device."""
+                    device.do(command, t)
 
     def _named(self, ids: tuple[int, ...] | None) -> Sequence[_Device]:
         here = {device.device_id for device in self._devices}
         if unknown := set(ids or ()) - here:
             raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
         return [device for device in self._devices if ids is None or device.device_id in ids]
+
+    def _emit(self, entry: Entry) -> None:
+        self.log.add(msgspec.structs.replace(entry, bus=self.name))
 
     # the far end of the line; called from its thread
 

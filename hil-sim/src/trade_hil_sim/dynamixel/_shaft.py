@@ -1,49 +1,20 @@
-"""The moving part of a servo: which registers set it going how, and what its sensors then show.
+"""The moving part of a servo: which registers set it going how, and what its sensors then show."""
 
-There is no thread and no integration: a course is planned when a goal is written, and positions are computed from the
-clock when they are read.
-"""
-
-from enum import IntEnum
 from math import inf
 from typing import Final
 
-from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
+from trade_hil_sim.mechanics._profile import at_rest, to_position, to_speed
+from trade_hil_sim.serial._servo import CENTRE, COUNTS_PER_TURN, IN_POSITION_COUNTS, QUICK_COUNTS_S2, ServoShaft
 
 from ._memory import ControlTable
-from ._table import ACCELERATION_COUNTS_S2, CENTRE, COUNTS_PER_TURN, RAD_PER_COUNT, VELOCITY_COUNTS_S
+from ._table import ACCELERATION_COUNTS_S2, VELOCITY_COUNTS_S, Mode
 
-__all__ = ["Drive", "Mode"]
+__all__ = ["Shaft"]
 
-QUICK_COUNTS_S2: Final = 200.0 / RAD_PER_COUNT
-"""The most a servo's motor accelerates its shaft, 200 rad/s^2: an assumption, no data sheet gives it."""
 PWM_FULL: Final = 885
-IN_POSITION_COUNTS: Final = 10
 
 
-class Mode(IntEnum):
-    """Operating mode, register 11."""
-
-    CURRENT = 0
-    VELOCITY = 1
-    POSITION = 3
-    EXTENDED_POSITION = 4
-    CURRENT_BASED_POSITION = 5
-    PWM = 16
-
-    @property
-    def seeks_position(self) -> bool:
-        """Whether the goal position is what it goes for."""
-        return self in {Mode.POSITION, Mode.EXTENDED_POSITION, Mode.CURRENT_BASED_POSITION}
-
-    @property
-    def goal(self) -> str:
-        """The register that sets it going."""
-        names = {Mode.CURRENT: "goal_current", Mode.VELOCITY: "goal_velocity", Mode.PWM: "goal_pwm"}
-        return names.get(self, "goal_position")
-
-
-class Drive:
+class Shaft(ServoShaft):
     """The shaft of one servo and the controller that turns it.
 
     Args:
@@ -55,11 +26,7 @@ class Drive:
     def __init__(self, table: ControlTable, position_counts: float, t: float) -> None:
         self._table = table
         self._top = table.model.top_speed_counts_s
-        self.course: Course = at_rest(t, self._shaft(position_counts))
-        self.jammed = False
-        self.temperature_c = 30
-        self.supply_v = table.model.supply_v
-        self._shown: float | None = None
+        super().__init__(at_rest(t, self._inside(position_counts)))
 
     @property
     def mode(self) -> Mode:
@@ -70,17 +37,9 @@ class Drive:
         """Where the shaft is, in counts of register 132, unrounded."""
         return self._flip(self.course.at(t)[0]) + self._table.get("homing_offset")
 
-    def speed(self, t: float) -> float:
-        """How fast it turns, in counts/s with the sign of register 128."""
-        return self._direction * self.course.at(t)[1]
-
-    def moving(self, t: float) -> bool:
-        """Whether the shaft turns, or is about to."""
-        return t < self.course.ends or self.course.final_speed != 0.0
-
     def place(self, position_counts: float, t: float) -> None:
         """Put the shaft somewhere, at rest."""
-        self.course = at_rest(t, self._shaft(position_counts))
+        self.course = at_rest(t, self._inside(position_counts))
 
     def wrap(self, t: float) -> None:
         """Forget whole turns: the position becomes 0 to 4095."""
@@ -88,38 +47,26 @@ class Drive:
         within_a_turn = self._flip(self._flip(position) % COUNTS_PER_TURN)
         self.course = to_speed(t, within_a_turn, speed, 0.0, QUICK_COUNTS_S2)
 
-    def stop(self, t: float) -> None:
-        """Come to rest as fast as the motor can."""
-        position, speed, _ = self.course.at(t)
-        self.course = to_speed(t, position, speed, 0.0, QUICK_COUNTS_S2)
-
     def follow(self, t: float) -> None:
         """Set off for what the goal register of the present mode asks for."""
         position, speed, _ = self.course.at(t)
         if self.jammed:
             self.course = at_rest(t, position)
         elif self.mode.seeks_position:
-            goal = self._shaft(self._table.get("goal_position"))
+            goal = self._inside(self._table.get("goal_position"))
             top, acceleration = self._profile(abs(goal - position))
             self.course = to_position(t, position, speed, goal, top, acceleration)
         else:
-            self.course = to_speed(t, position, speed, self._direction * self._wanted(), self._ramp())
+            self.course = to_speed(t, position, speed, self.direction * self._wanted(), self._ramp())
 
-    def strains(self, t: float) -> bool:
-        """Whether it is held off where it should go or how fast it should turn."""
-        if not self.jammed:
-            return False
-        if self.mode.seeks_position:
-            return abs(self._table.get("goal_position") - self.position(t)) > IN_POSITION_COUNTS
-        return self._wanted() != 0.0
+    def ahead(self, t: float) -> float:
+        """How far the goal position is, or how fast it should turn."""
+        return self._table.get("goal_position") - self.position(t) if self.mode.seeks_position else self._wanted()
 
-    def freeze_sensor(self, t: float) -> None:
-        """From now on the position register shows what it shows now, whatever the shaft does."""
-        self._shown = self.position(t)
-
-    def thaw_sensor(self) -> None:
-        """The position register shows the shaft's position again."""
-        self._shown = None
+    @property
+    def tolerance(self) -> int:
+        """How far off it may be held without straining."""
+        return IN_POSITION_COUNTS if self.mode.seeks_position else 0
 
     def refresh(self, t: float, torque: bool) -> None:
         """Write what the sensors show into the table."""
@@ -132,8 +79,6 @@ class Drive:
             ("present_velocity", units),
             ("velocity_trajectory", round(speed / VELOCITY_COUNTS_S)),
             ("present_pwm", round(speed / self._top * PWM_FULL) if torque else 0),
-            ("present_input_voltage", round(self.supply_v * 10)),
-            ("present_temperature", self.temperature_c),
             ("moving", int(self._shows_motion(t, units))),
             ("moving_status", self._moving_status(t)),
         ):
@@ -142,14 +87,15 @@ class Drive:
         table.set(effort, round(self._effort(t) * table.model.full_effort_counts) if torque else 0)
 
     @property
-    def _direction(self) -> int:
+    def direction(self) -> int:
+        """-1 in reverse mode."""
         return -1 if self._table.get("drive_mode") & 1 else 1
 
     def _flip(self, position: float) -> float:
         """Between shaft and encoder, either way: reverse mode mirrors about the centre."""
-        return 2 * CENTRE - position if self._direction < 0 else position
+        return 2 * CENTRE - position if self.direction < 0 else position
 
-    def _shaft(self, register: float) -> float:
+    def _inside(self, register: float) -> float:
         return self._flip(register - self._table.get("homing_offset"))
 
     def _wanted(self) -> float:
@@ -190,12 +136,3 @@ class Drive:
         arrived = abs(self._table.get("goal_position") - self.position(t)) <= IN_POSITION_COUNTS
         underway = t < self.course.ends
         return shape | 0x02 * underway | 0x01 * (arrived and not underway) | 0x08 * self.strains(t)
-
-    def _effort(self, t: float) -> float:
-        """Between -1 and 1: all there is against a jam, else for acceleration and a little for friction."""
-        _, speed, acceleration = self.course.at(t)
-        if self.strains(t):
-            ahead = self._table.get("goal_position") - self.position(t) if self.mode.seeks_position else self._wanted()
-            return 1.0 if ahead > 0 else -1.0
-        friction = 0.05 * ((speed > 0) - (speed < 0))
-        return self._direction * max(-1.0, min(1.0, friction + 0.5 * acceleration / QUICK_COUNTS_S2))

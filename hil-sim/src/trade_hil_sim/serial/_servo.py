@@ -1,0 +1,274 @@
+"""A servo with a table of registers: its shaft, and what it does by itself as time passes, whoever made it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from math import copysign, tau
+from typing import Final, Generic, TypeVar
+
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.mechanics._device import Emit, JointModel
+from trade_hil_sim.mechanics._profile import Course, to_speed
+from trade_hil_sim.serial._device_bus import LineDevice
+from trade_hil_sim.serial._registers import Memory, Register
+
+__all__ = ["CENTRE", "COUNTS_PER_TURN", "QUICK_COUNTS_S2", "RAD_PER_COUNT", "ServoModel", "ServoShaft"]
+
+COUNTS_PER_TURN: Final = 4096
+CENTRE: Final = 2048
+RAD_PER_COUNT: Final = tau / COUNTS_PER_TURN
+QUICK_COUNTS_S2: Final = 200.0 / RAD_PER_COUNT
+"""The most a servo's motor accelerates its shaft, 200 rad/s^2: an assumption, no data sheet gives it."""
+IN_POSITION_COUNTS: Final = 10
+RETURN_DELAY_UNIT_S: Final = 2e-6
+BOOT_S: Final = 0.1
+"""How long it hears nothing after a reboot: an assumption."""
+OVERLOAD: Final = 0x20
+"""Bit of an overload in the error registers of all these servos."""
+
+
+class ServoShaft(ABC):
+    """The shaft of one servo and the controller that turns it.
+
+    There is no thread and no integration: a course is planned when a goal is written, and positions are computed from
+    the clock when they are read.
+    """
+
+    direction = 1
+    """-1: positive counts are turns the other way."""
+    tolerance = IN_POSITION_COUNTS
+    """How far off it may be held without straining."""
+
+    def __init__(self, course: Course) -> None:
+        self.course = course
+        self.jammed = False
+        self._shown: float | None = None
+
+    @abstractmethod
+    def position(self, t: float) -> float:
+        """Where the shaft is, in counts of the register that shows it, unrounded."""
+
+    @abstractmethod
+    def place(self, position_counts: float, t: float) -> None:
+        """Put the shaft somewhere, at rest."""
+
+    @abstractmethod
+    def ahead(self, t: float) -> float:
+        """How far the goal is, in counts, or how fast it should turn, with the sign of the way."""
+
+    def speed(self, t: float) -> float:
+        """How fast it turns, in counts/s."""
+        return self.direction * self.course.at(t)[1]
+
+    def moving(self, t: float) -> bool:
+        """Whether the shaft turns, or is about to."""
+        return t < self.course.ends or self.course.final_speed != 0.0
+
+    def stop(self, t: float) -> None:
+        """Come to rest as fast as the motor can."""
+        position, speed, _ = self.course.at(t)
+        self.course = to_speed(t, position, speed, 0.0, QUICK_COUNTS_S2)
+
+    def strains(self, t: float) -> bool:
+        """Whether it is held off where it should go or how fast it should turn."""
+        return self.jammed and abs(self.ahead(t)) > self.tolerance
+
+    def freeze(self, on: bool, t: float) -> None:
+        """Let the position register show what it shows now, whatever the shaft does, or the truth again."""
+        self._shown = self.position(t) if on else None
+
+    def _effort(self, t: float) -> float:
+        """Between -1 and 1: all there is against a jam, else for acceleration and a little for friction."""
+        _, speed, acceleration = self.course.at(t)
+        if self.strains(t):
+            return copysign(1.0, self.ahead(t))
+        friction = 0.05 * ((speed > 0) - (speed < 0))
+        return self.direction * max(-1.0, min(1.0, friction + 0.5 * acceleration / QUICK_COUNTS_S2))
+
+
+_Memory_co = TypeVar("_Memory_co", bound=Memory[Register], covariant=True)
+_Shaft_co = TypeVar("_Shaft_co", bound=ServoShaft, covariant=True)
+
+
+class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
+    """A servo, fresh from the box but for its id, baud rate and position: torque off, position mode.
+
+    Args:
+        memory: its registers.
+        shaft: what it moves.
+        model: its name.
+        supply_v: what it is made for.
+        joint: name of the joint it drives, for logs.
+        reversed_: whether the joint turns against the device.
+        offset_rad: joint angle when the device reads its centre.
+        emit: told what happens.
+    """
+
+    overload_s = 1.0
+    """How long it strains against a jam before it gives up."""
+
+    def __init__(
+        self,
+        memory: _Memory_co,
+        shaft: _Shaft_co,
+        *,
+        model: str,
+        supply_v: float,
+        joint: str,
+        reversed_: bool,
+        offset_rad: float,
+        emit: Emit,
+    ) -> None:
+        super().__init__(joint, model, (-1 if reversed_ else 1) * RAD_PER_COUNT, offset_rad)
+        self.memory, self.shaft, self.emit = memory, shaft, emit
+        self.supply_v = supply_v
+        self._model_number = memory.get("model_number")
+        self._registered: tuple[int, bytes] | None = None
+        self._boots_at: float | None = None
+        self._strains_since: float | None = None
+
+    # what it is
+
+    @property
+    def device_id(self) -> int:
+        """Its id on the bus."""
+        return self.memory.get("id")
+
+    @property
+    @abstractmethod
+    def baud(self) -> int:
+        """Bits per second it listens at."""
+
+    @property
+    def shadow_id(self) -> int | None:
+        """The second id it obeys writes to, if there is one."""
+        return None
+
+    @property
+    def return_delay_s(self) -> float:
+        """Its pause before an answer."""
+        return self.memory.get("return_delay_time") * RETURN_DELAY_UNIT_S
+
+    @property
+    def torque(self) -> bool:
+        """Whether the motor is switched on; its protection may have cut it off all the same."""
+        return self.memory.get("torque_enable") != 0
+
+    @property
+    def hears(self) -> bool:
+        """Whether it is there and awake."""
+        return not self.absent and self._boots_at is None
+
+    @property
+    def registered(self) -> tuple[int, bytes] | None:
+        """The write kept for later, if any: address and data."""
+        return self._registered
+
+    def counts(self, t: float) -> int:
+        """Where the shaft really is, in counts."""
+        return round(self.shaft.position(t))
+
+    def _units(self, t: float) -> tuple[float, float]:
+        return self.shaft.position(t) - CENTRE, self.shaft.speed(t)
+
+    def _moving(self, t: float) -> bool:
+        return self.shaft.moving(t)
+
+    def _bound_for(self) -> str:
+        return f"goal position {self.memory.get('goal_position')}"
+
+    # time
+
+    def next_due(self) -> float | None:
+        """When it will next do something by itself."""
+        return min((t for t, _ in self._dues()), default=None)
+
+    def advance(self, t: float) -> None:
+        """Let happen what is due by time `t`, in order."""
+        while due := min((due for due in self._dues() if due[0] <= t), key=lambda due: due[0], default=None):
+            when, happen = due
+            happen(when)
+
+    def _dues(self) -> Iterator[tuple[float, Callable[[float], None]]]:
+        if self._underway and self.shaft.course.final_speed == 0.0:
+            yield self.shaft.course.ends, self._note_motion
+        if self._boots_at is not None:
+            yield self._boots_at, self._boot
+        if self._strains_since is not None:
+            yield self._strains_since + self.overload_s, self._overload
+
+    def _boot(self, t: float) -> None:
+        self._boots_at = None
+        self._start_ram(t)
+        self.note("booted", t)
+
+    def _overload(self, t: float) -> None:
+        self._strains_since = None
+        self.fail(OVERLOAD, t)
+
+    @abstractmethod
+    def _start_ram(self, t: float) -> None:
+        """Begin with the RAM at its defaults."""
+
+    def reboot(self, t: float, event: str = "rebooted") -> None:
+        """Lose the RAM area, let go of the shaft, and hear nothing for a moment."""
+        self.note(event, t)
+        self._release(t)
+        self.memory.set("torque_enable", 0)
+        self._boots_at = t + BOOT_S
+
+    # faults
+
+    def _do_rare(self, command: faults.Command, t: float) -> None:
+        match command:
+            case faults.HardwareFault():
+                self.fail(command.bits, t)
+            case faults.Place():
+                self.place(command.counts, t)
+            case _:
+                super()._do_rare(command, t)
+
+    @abstractmethod
+    def fail(self, bits: int, t: float) -> None:
+        """Latch errors."""
+
+    def place(self, position_counts: int, t: float) -> None:
+        """Turn the shaft by hand; with torque on it goes back to its goal."""
+        self.shaft.place(position_counts, t)
+        self.note("placed", t)
+        self._set_off(t) if self.torque else self._note_motion(t)
+
+    def jam(self, on: bool, t: float) -> None:
+        """Hold the shaft fast, or let go of it."""
+        if on == self.shaft.jammed:
+            return
+        self.shaft.jammed = on
+        if on:
+            self.shaft.place(self.shaft.position(t), t)
+            self._note_motion(t)
+        self._strains_since = t if self.torque and self.shaft.strains(t) else None
+        if not on and self.torque:
+            self._set_off(t)
+
+    def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - not all have a clock
+        """Let the position register stand still, or show the truth again."""
+        self.shaft.freeze(on, t)
+
+    def wrong_model(self, number: int) -> None:
+        """Report another model number."""
+        self.memory.set("model_number", number)
+
+    def brown_out(self, t: float) -> None:
+        """Lose power for a moment."""
+        self.reboot(t, "brown_out")
+
+    def _restore(self, t: float) -> None:  # noqa: ARG002 - at once
+        self.wrong_model(self._model_number)
+
+    @abstractmethod
+    def _set_off(self, t: float) -> None:
+        """Make for the goal, if it may."""
+
+    def _release(self, t: float) -> None:
+        self._strains_since = None
+        self.shaft.stop(t)
+        self._note_motion(t)
