@@ -19,7 +19,6 @@ HALT: Final = 1 << 8
 REACHED: Final = 1 << 10
 LIMITED: Final = 1 << 11
 BIT_12: Final = 1 << 12
-BIT_13: Final = 1 << 13
 FULL: Final = 1000
 """Torque is in thousandths."""
 MOTION: Final = frozenset({"controlword", "mode", "target_position", "target_velocity", "target_torque"})

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 from trade_hil_sim.faults._commands import SimulationError
 
@@ -67,7 +67,8 @@ class Mailbox:
 
     def __init__(self, who: str, answer_s: float) -> None:
         self._who, self._answer_s = who, answer_s
-        self._asked: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._asked: deque[tuple[Callable[[], None], Callable[[Exception], None]]] = deque()
+        """How to carry out each call, and how to refuse it."""
         self._guard = threading.Lock()
         self._rope = -1
         """Where the bell is rung; below 0 while nobody listens."""
@@ -89,10 +90,16 @@ class Mailbox:
         """
         done: Future[_T] = Future()
 
+        def carry_out() -> None:
+            try:
+                done.set_result(act())
+            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
+                done.set_exception(problem)
+
         with self._guard:
             if self._rope < 0:
                 raise self._closed()
-            self._asked.append((act, done))
+            self._asked.append((carry_out, done.set_exception))
             self._ring()
         return done.result(self._answer_s)
 
@@ -106,11 +113,7 @@ class Mailbox:
         with suppress(BlockingIOError):
             os.read(self.bell, 4096)
         while self._asked:
-            act, done = self._asked.popleft()
-            try:
-                done.set_result(act())
-            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
-                done.set_exception(problem)
+            self._asked.popleft()[0]()
 
     def close(self) -> None:
         """In the thread, at its end: who has asked and who does so from now on is told."""
@@ -119,7 +122,7 @@ class Mailbox:
             self._rope = -1
         os.close(self.bell)
         while self._asked:
-            self._asked.popleft()[1].set_exception(self._closed())
+            self._asked.popleft()[1](self._closed())
 
     def _closed(self) -> SimulationError:
         return SimulationError(f"{self._who} is closed")

@@ -4,7 +4,6 @@
 """
 
 from ._camera import SceneCamera
-from ._drawing import BACKGROUND, LIMB, OBJECT, Field, draw, fields
-from ._png import png
+from ._drawing import BACKGROUND, LIMB, OBJECT, Field, draw, fields, png
 
 __all__ = ["BACKGROUND", "LIMB", "OBJECT", "Field", "SceneCamera", "draw", "fields", "png"]

@@ -15,8 +15,7 @@ from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
 from trade_hil_sim.robot._bus_thread import BusThread, ready
 
-from ._drawing import draw
-from ._png import png
+from ._drawing import draw, png
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Camera, Sensor

@@ -1,17 +1,19 @@
-"""What a camera sees of a simulated robot: each device in a field of the picture of its own. Pure.
+"""What a camera sees of a simulated robot: each device in a field of the picture of its own, as a PNG file. Pure.
 
 A joint is a limb that swings about the middle of its field: 0 rad points to the right, positive angles turn it
 counter-clockwise. A gripper is two fingers, as far apart as they are, and what was put between them. An arm has a field
 for each of its joints.
 """
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from math import ceil, cos, sin, sqrt
 from typing import Final, NamedTuple
 
 from trade_hil_sim.mechanics._truth import BusState, GripperTruth
 
-__all__ = ["BACKGROUND", "LIMB", "OBJECT", "Colour", "Field", "draw", "fields"]
+__all__ = ["BACKGROUND", "LIMB", "OBJECT", "Colour", "Field", "draw", "fields", "png"]
 
 Colour = tuple[int, int, int]
 
@@ -21,6 +23,10 @@ LIMB: Final[Colour] = (240, 200, 60)
 OBJECT: Final[Colour] = (220, 60, 50)
 _SPAN_M: Final = 0.12
 """As much of the world as a gripper's field shows from side to side."""
+
+_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_TRUECOLOUR_8: Final = bytes((8, 2, 0, 0, 0))
+"""Bit depth, colour type, compression, filter method, no interlace."""
 
 
 class Field(NamedTuple):
@@ -97,3 +103,24 @@ def _draw_gripper(canvas: _Canvas, field: Field, gripper: GripperTruth) -> None:
         canvas.box(centre - wide / 2, top + 0.25 * high, wide, 0.5 * high, OBJECT)
     canvas.box(centre - gripper.width_m * scale / 2 - thick, top, thick, high, LIMB)
     canvas.box(centre + gripper.width_m * scale / 2, top, thick, high, LIMB)
+
+
+def png(rgb: bytes | bytearray, width_px: int, height_px: int) -> bytes:
+    """A PNG file of these pixels (ISO/IEC 15948): truecolour, 8 bits, no filter.
+
+    Args:
+        rgb: three bytes a pixel, row by row from the upper left.
+        width_px: pixels in a row.
+        height_px: rows.
+    """
+    if len(rgb) != 3 * width_px * height_px:
+        raise ValueError(f"{len(rgb)} bytes are not {width_px} x {height_px} pixels")
+    step = 3 * width_px
+    rows = b"".join(b"\0" + rgb[at : at + step] for at in range(0, len(rgb), step))
+    size = struct.pack(">II", width_px, height_px)
+    parts = (_chunk(b"IHDR", size + _TRUECOLOUR_8), _chunk(b"IDAT", zlib.compress(rows, 1)), _chunk(b"IEND", b""))
+    return _SIGNATURE + b"".join(parts)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -2,9 +2,9 @@
 
 from ._arm import HOME, JOINTS, Arm
 from ._bus import UrBus
-from ._packets import Packet, PacketType, Recipe
-from ._ports import PORTS
+from ._protocol import Packet, PacketType, Recipe
 from ._table import INPUTS, MODELS, OUTPUTS, Command, RobotMode, SafetyMode
+from ._tcp import PORTS
 
 __all__ = [
     "HOME",

@@ -18,13 +18,12 @@ from trade_hil_sim.mechanics._truth import ArmTruth, BusState
 from trade_hil_sim.robot._bus_thread import BusThread, ready
 
 from ._arm import HOME, Arm
-from ._client import MOST_HELD, Client
 from ._dashboard import GREETING, Dashboard, lines_in
-from ._packets import Packet
-from ._ports import listeners
 from ._program import Program
+from ._protocol import Packet
 from ._rtde import Rtde, RtdeSession, measured
 from ._table import SafetyMode
+from ._tcp import MOST_HELD, Client, listeners
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Arm as ArmRecord

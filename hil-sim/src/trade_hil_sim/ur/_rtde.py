@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from ._arm import Arm
-from ._packets import MOST_PAYLOAD, Packet, PacketType, Recipe, Value, frames, names_in
 from ._program import PLAYING, Program
+from ._protocol import MOST_PAYLOAD, Packet, PacketType, Recipe, Value, frames, names_in
 from ._table import INPUTS, OUTPUTS, RobotMode
 
 __all__ = ["Rtde", "RtdeSession", "measured"]

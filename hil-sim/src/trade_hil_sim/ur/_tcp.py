@@ -1,4 +1,4 @@
-"""One TCP connection to a controller: bytes in, answers out, each when it is due."""
+"""The TCP side of a controller: its ports, and connections whose answers leave when they are due."""
 
 import socket
 import time
@@ -9,7 +9,10 @@ from typing import Final
 
 from trade_hil_sim.faults._commands import Piece
 
-__all__ = ["MOST_HELD", "Client"]
+__all__ = ["MOST_HELD", "PORTS", "Client", "listeners"]
+
+PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
+"""The same on every controller."""
 
 MOST_UNSENT: Final = 65_536
 """Bytes kept for a client that does not read; then it is hung up on."""
@@ -87,3 +90,20 @@ class Client:
     def close(self) -> None:
         """Hang up."""
         self.connection.close()
+
+
+def listeners(host: str) -> dict[str, socket.socket]:
+    """A socket that listens on each; raises OSError when one is taken."""
+    made: dict[str, socket.socket] = {}
+    try:
+        for name, number in PORTS.items():
+            made[name] = socket.socket()
+            made[name].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            made[name].bind((host, number))
+            made[name].listen()
+            made[name].setblocking(False)
+    except OSError:
+        for listener in made.values():
+            listener.close()
+        raise
+    return made
