@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from trade_drivers.robotfile import CanBus as CanRecord
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from trade_drivers.robotfile import Bus, Joint
+    from trade_drivers.robotfile import CanBus as CanRecord
 
 __all__ = ["JointBus"]
 
@@ -29,7 +29,7 @@ class JointBus(CanBus):
 
     @classmethod
     @abstractmethod
-    def device_for(cls, joint: "Joint", record: CanRecord, t: float) -> Device:
+    def device_for(cls, joint: "Joint", record: "CanRecord", t: float) -> Device:
         """The device of a joint, at its zero or as near as its limits allow; raises SimulationError: it cannot be."""
 
     @classmethod
@@ -56,6 +56,8 @@ class JointBus(CanBus):
         Raises:
             SimulationError: an id or a model there cannot be, or a key that is missing.
         """
+        from trade_drivers.robotfile import CanBus as CanRecord  # noqa: PLC0415 - a robot file has been read
+
         if not isinstance(bus, CanRecord):
             raise SimulationError(f"bus.{bus.name}: {cls.kind} are on CAN; write interface and channel, not port")
         return cls(

@@ -1,18 +1,17 @@
 """A CANopen node (CiA 301): network management, heartbeats both ways, emergency messages, SDO and PDO. Pure."""
 
-from collections.abc import Sequence
 from enum import IntEnum
 from math import inf
-from typing import Final, Protocol
+from typing import Final
 
 from trade_hil_sim.can import Frame
 
 from ._objects import Object
-from ._pdo import Pdos
+from ._pdo import Application, Pdos
 from ._sdo import SdoServer
 from ._store import Abort, AbortCode, Store
 
-__all__ = ["Application", "Node", "NodeState"]
+__all__ = ["Node", "NodeState"]
 
 BOOT_S: Final = 0.05
 """From power or reset to the boot-up message."""
@@ -36,42 +35,6 @@ class NodeState(IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
-class Application(Protocol):
-    """What the node is good for."""
-
-    def refresh(self, t: float) -> None:
-        """Bring measured values up to date."""
-        ...
-
-    def check(self, entry: Object, value: int) -> None:
-        """Raise `Abort` if this must not be written."""
-        ...
-
-    def written(self, name: str, values: Sequence[tuple[Object, int]], t: float) -> None:
-        """Take what has been written, by ``sdo_write`` or ``rpdo1`` and so on, all at once."""
-        ...
-
-    def link_lost(self, reason: str, t: float) -> None:
-        """Nobody is in charge any more: the abort connection option applies."""
-        ...
-
-    def link_back(self, t: float) -> None:
-        """Whose heartbeat was missed is back."""
-        ...
-
-    def power_on(self, t: float) -> None:
-        """Start anew; the store has its defaults."""
-        ...
-
-    def put(self, frame: Frame, t: float) -> None:
-        """Send a frame."""
-        ...
-
-    def note(self, name: str, t: float, detail: str = "") -> None:
-        """Put an event into the log."""
-        ...
-
-
 class Node:
     """The communication side of a device.
 
@@ -85,7 +48,7 @@ class Node:
     def __init__(self, node_id: int, store: Store, application: Application, t: float) -> None:
         self.node_id, self.state = node_id, NodeState.BOOTING
         self._store, self._app = store, application
-        self._sdo, self._pdos = SdoServer(self), Pdos(store, self)
+        self._sdo, self._pdos = SdoServer(self), Pdos(store, application, self.emergency)
         self._served = frozenset({0x000, 0x600 + node_id})
         self._boots_at = inf
         self._beats_at = inf
@@ -291,21 +254,3 @@ class Node:
             self._missed.discard(entry.sub)
         elif entry.index == 0x1017:
             self._start_beating(t)
-
-    # process data, as the PDOs want it
-
-    def refresh(self, t: float) -> None:
-        """Bring measured values up to date."""
-        self._app.refresh(t)
-
-    def take(self, pdo: str, values: Sequence[tuple[Object, int]], t: float) -> None:
-        """Values of a PDO take effect."""
-        self._app.written(pdo, values, t)
-
-    def transmit(self, frame: Frame, t: float) -> None:
-        """Send a PDO."""
-        self._app.put(frame, t)
-
-    def complain(self, code: int, t: float) -> None:
-        """Tell of an error that is no fault."""
-        self.emergency(code, t)

@@ -1,7 +1,7 @@
 """Process data objects: which values travel in which frames, and when (CiA 301, 7.2.2). Pure: time is an argument."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Final, Protocol
 
@@ -10,7 +10,7 @@ from trade_hil_sim.can import Frame
 from ._objects import DUMMIES, ENTRIES, PDOS, Object
 from ._store import Abort, AbortCode, Store
 
-__all__ = ["Pdos", "Process"]
+__all__ = ["Application", "Pdos"]
 
 FIRST_OBJECT: Final = 0x1000
 """Below are data types, which a map may name to skip bytes."""
@@ -28,23 +28,39 @@ TOO_LONG: Final = 0x8220
 FORMATS: Final = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i"}
 
 
-class Process(Protocol):
-    """What process data comes from and goes to."""
+class Application(Protocol):
+    """The device behind its communication."""
 
     def refresh(self, t: float) -> None:
         """Bring measured values up to date."""
         ...
 
-    def take(self, pdo: str, values: Sequence[tuple[Object, int]], t: float) -> None:
-        """Values have come and take effect now."""
+    def check(self, entry: Object, value: int) -> None:
+        """Raise `Abort` if this must not be written."""
         ...
 
-    def transmit(self, frame: Frame, t: float) -> None:
+    def written(self, name: str, values: Sequence[tuple[Object, int]], t: float) -> None:
+        """Take what has been written, by ``sdo_write`` or ``rpdo1`` and so on, all at once."""
+        ...
+
+    def link_lost(self, reason: str, t: float) -> None:
+        """Nobody is in charge any more: the abort connection option applies."""
+        ...
+
+    def link_back(self, t: float) -> None:
+        """Whose heartbeat was missed is back."""
+        ...
+
+    def power_on(self, t: float) -> None:
+        """Start anew; the store has its defaults."""
+        ...
+
+    def put(self, frame: Frame, t: float) -> None:
         """Send a frame."""
         ...
 
-    def complain(self, code: int, t: float) -> None:
-        """Report an error that is no fault, by an emergency message."""
+    def note(self, name: str, t: float, detail: str = "") -> None:
+        """Put an event into the log."""
         ...
 
 
@@ -94,11 +110,12 @@ class Pdos:
 
     Args:
         store: the device's objects.
-        process: what the values come from and go to.
+        application: what the values come from and go to.
+        complain: reports an error that is no fault, by an emergency message.
     """
 
-    def __init__(self, store: Store, process: Process) -> None:
-        self._store, self._process = store, process
+    def __init__(self, store: Store, application: Application, complain: Callable[[int, float], None]) -> None:
+        self._store, self._app, self._complain = store, application, complain
         self.running = False
         self._load()
 
@@ -200,10 +217,10 @@ class Pdos:
 
     def _hear(self, pdo: _Pdo, data: bytes, t: float) -> None:
         if len(data) < pdo.layout.size:
-            self._process.complain(TOO_SHORT, t)
+            self._complain(TOO_SHORT, t)
             return
         if len(data) > pdo.layout.size:
-            self._process.complain(TOO_LONG, t)
+            self._complain(TOO_LONG, t)
         if pdo.synchronous:
             pdo.held = data
         else:
@@ -211,12 +228,12 @@ class Pdos:
 
     def _apply(self, pdo: _Pdo, data: bytes, t: float) -> None:
         values = zip(pdo.carries, pdo.layout.unpack_from(data), strict=True)
-        self._process.take(pdo.name, [(entry, value) for entry, value in values if entry.index >= FIRST_OBJECT], t)
+        self._app.written(pdo.name, [(entry, value) for entry, value in values if entry.index >= FIRST_OBJECT], t)
 
     def _sync(self, pdo: _Pdo, t: float) -> None:
         pdo.syncs += 1
         if pdo.type == 0:
-            self._process.refresh(t)
+            self._app.refresh(t)
             if self._values(pdo) != pdo.last:
                 self._send(pdo, t)
         elif pdo.syncs >= pdo.type:
@@ -224,11 +241,11 @@ class Pdos:
             self._send(pdo, t)
 
     def _send(self, pdo: _Pdo, t: float) -> None:
-        self._process.refresh(t)
+        self._app.refresh(t)
         pdo.sent_at, pdo.waits = t, False
         values = self._values(pdo)
         pdo.last = values if pdo.synchronous else self._events(pdo)
-        self._process.transmit(Frame(pdo.can_id, pdo.layout.pack(*values)), t)
+        self._app.put(Frame(pdo.can_id, pdo.layout.pack(*values)), t)
 
     def _values(self, pdo: _Pdo) -> tuple[int, ...]:
         return tuple(map(self._store.get, pdo.names))

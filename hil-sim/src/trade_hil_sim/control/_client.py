@@ -2,8 +2,9 @@
 
 import socket
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -15,6 +16,7 @@ from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, Grip
 
 __all__ = ["SimControl"]
 
+_Truth = TypeVar("_Truth", DeviceState, GripperTruth, ArmTruth)
 ANSWER_S: Final = 10.0
 """How long a simulator may take over a command."""
 
@@ -68,11 +70,7 @@ class SimControl(FaultMethods):
             SimulationError: no such device; names those there are. The same if an id is on two buses.
         """
         devices = [device for bus in self.state() for device in bus.devices]
-        found = [device for device in devices if which in {device.joint, device.device_id}]
-        if len(found) != 1:
-            known = ", ".join(f"{device.joint} ({device.bus} {device.device_id})" for device in devices)
-            raise SimulationError(f"{len(found)} devices are called {which!r}; there is {known}")
-        return found[0]
+        return _only("devices", which, [(device.joint, device) for device in devices])
 
     def gripper(self, which: str | int) -> GripperTruth:
         """The truth about one gripper, by its name or its id.
@@ -81,11 +79,7 @@ class SimControl(FaultMethods):
             SimulationError: no such gripper; names those there are. The same if an id is on two buses.
         """
         grippers = [gripper for bus in self.state() for gripper in bus.grippers]
-        found = [gripper for gripper in grippers if which in {gripper.gripper, gripper.device_id}]
-        if len(found) != 1:
-            known = ", ".join(f"{gripper.gripper} ({gripper.bus} {gripper.device_id})" for gripper in grippers)
-            raise SimulationError(f"{len(found)} grippers are called {which!r}; there is {known or 'none'}")
-        return found[0]
+        return _only("grippers", which, [(one.gripper, one) for one in grippers])
 
     def arm(self, which: str) -> ArmTruth:
         """The truth about one arm, by its name.
@@ -93,10 +87,8 @@ class SimControl(FaultMethods):
         Raises:
             SimulationError: no such arm; names those there are.
         """
-        arms = {arm.arm: arm for bus in self.state() for arm in bus.arms}
-        if which not in arms:
-            raise SimulationError(f"no arm is called {which!r}; there is {', '.join(arms) or 'none'}")
-        return arms[which]
+        arms = [arm for bus in self.state() for arm in bus.arms]
+        return _only("arms", which, [(arm.arm, arm) for arm in arms])
 
     def do(self, command: faults.Command) -> None:
         """Send any command of the simulator."""
@@ -122,3 +114,12 @@ class SimControl(FaultMethods):
             self._held += data
         line, _, self._held = self._held.partition(b"\n")
         return line
+
+
+def _only(kind: str, which: str | int, named: Sequence[tuple[str, _Truth]]) -> _Truth:
+    """The only one of this name or id."""
+    found = [thing for name, thing in named if which in {name, thing.device_id}]
+    if len(found) != 1:
+        known = ", ".join(f"{name} ({thing.bus} {thing.device_id})" for name, thing in named) or "none"
+        raise SimulationError(f"{len(found)} {kind} are called {which!r}; there is {known}")
+    return found[0]

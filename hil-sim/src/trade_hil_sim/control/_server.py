@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 from msgspec.structs import replace
@@ -19,29 +19,15 @@ from msgspec.structs import replace
 from trade_hil_sim.faults._commands import Command, SimulationError, kinds_of
 from trade_hil_sim.mechanics._truth import BusState
 
-__all__ = ["Answer", "ControlServer", "State", "Steered"]
+if TYPE_CHECKING:
+    from trade_hil_sim.robot._robot import SimulatedBus
+
+__all__ = ["Answer", "ControlServer", "State"]
 
 LONGEST_LINE: Final = 65_536
 LONGEST_PATH: Final = 100
 """Unix socket paths end at 108 bytes on Linux and sooner elsewhere."""
 _UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-
-
-class Steered(Protocol):
-    """A bus, as far as the control socket is concerned."""
-
-    @property
-    def name(self) -> str:
-        """Its name in commands."""
-        ...
-
-    def do(self, command: Command) -> None:
-        """Carry out a command."""
-        ...
-
-    def state(self) -> BusState:
-        """The truth about it."""
-        ...
 
 
 class State(msgspec.Struct, frozen=True, tag_field="do", tag="state", forbid_unknown_fields=True):
@@ -68,7 +54,7 @@ class ControlServer:
         buses: what to steer.
     """
 
-    def __init__(self, path: Path, buses: Sequence[Steered]) -> None:
+    def __init__(self, path: Path, buses: "Sequence[SimulatedBus]") -> None:
         self.path = path
         self._buses = {bus.name: bus for bus in buses}
         self._decoder: msgspec.json.Decoder[Command | State] = msgspec.json.Decoder(Command | State)  # pyright: ignore[reportArgumentType]
@@ -116,7 +102,7 @@ class ControlServer:
             return Answer(error=str(problem))
         return Answer(ok=True)
 
-    def _meant(self, command: Command) -> list[tuple[Steered, Command]]:
+    def _meant(self, command: Command) -> "list[tuple[SimulatedBus, Command]]":
         """Which bus gets what: without a bus's name, each the ids it has."""
         ids: tuple[int, ...] | None = getattr(command, "ids", None)
         if command.bus is not None:
@@ -127,7 +113,7 @@ class ControlServer:
             return [(bus, command) for bus in self._buses.values()]
         return self._by_bus(command, ids)
 
-    def _by_bus(self, command: Command, ids: tuple[int, ...]) -> list[tuple[Steered, Command]]:
+    def _by_bus(self, command: Command, ids: tuple[int, ...]) -> "list[tuple[SimulatedBus, Command]]":
         states = {name: bus.state() for name, bus in self._buses.items()}
         here = {name: {device.device_id for device in (*s.devices, *s.grippers, *s.arms)} for name, s in states.items()}
         if unknown := set(ids).difference(*here.values()):

@@ -62,14 +62,14 @@ class Dispatch:
         for servo in _shadows(servos, packet.device_id):
             self._obey_shadow(servo, packet, t)
         answers = [self._answer(servo, packet, t, act) for servo in servos if servo.device_id == packet.device_id]
-        return _collided([answer for answer in answers if answer is not None])
+        return _collided(answers)
 
     def _to_all(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
         found: list[Answer] = []
         for device_id in sorted({servo.device_id for servo in servos}):
             twins = [servo for servo in servos if servo.device_id == device_id]
             answers = [self._answer(servo, packet, t, lambda one: _carry_out(one, packet, t)) for servo in twins]
-            found += _collided([answer for answer in answers if answer is not None])
+            found += _collided(answers)
         return found
 
     def _answer(self, servo: Servo, packet: Packet, t: float, act: Callable[[Servo], bytes]) -> Answer | None:
@@ -97,7 +97,7 @@ class Dispatch:
             alone = Packet(wish.device_id, packet.instruction, b"")
             twins = [servo for servo in servos if servo.device_id == wish.device_id]
             answers = [self._answer(servo, alone, t, _reader(wish, t)) for servo in twins]
-            found += _collided([answer for answer in answers if answer is not None])
+            found += _collided(answers)
         return found
 
     def _joined(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
@@ -153,8 +153,9 @@ def _shadows(servos: Iterable[Servo], device_id: int) -> list[Servo]:
     return [servo for servo in servos if servo.shadow_id == device_id]
 
 
-def _collided(answers: list[Answer]) -> list[Answer]:
+def _collided(given: list[Answer | None]) -> list[Answer]:
     """Devices with one id answer on top of each other: the bytes of all come, none of them where it belongs."""
+    answers = [answer for answer in given if answer is not None]
     if len(answers) < 2:
         return answers
     mixed = interleaved([answer.data for answer in answers])

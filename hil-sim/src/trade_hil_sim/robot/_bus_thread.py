@@ -2,6 +2,7 @@
 
 import os
 import select
+import socket
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
@@ -15,7 +16,7 @@ from trade_hil_sim.faults._commands import SimulationError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["BusThread", "Mailbox", "ready"]
+__all__ = ["BusThread", "Mailbox", "listener", "ready"]
 
 _T = TypeVar("_T")
 _FEW: Final = 1024
@@ -55,6 +56,20 @@ def ready(reading: Sequence[File], writing: Sequence[File] = (), timeout_s: floa
 
 def _number(thing: "int | _HasFile") -> int:
     return thing if isinstance(thing, int) else thing.fileno()
+
+
+def listener(host: str, number: int) -> socket.socket:
+    """A socket that listens on a port, or with 0 on any; raises OSError if it is taken."""
+    made = socket.socket()
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.bind((host, number))
+        made.listen()
+        made.setblocking(False)
+    except OSError:
+        made.close()
+        raise
+    return made
 
 
 class Mailbox:

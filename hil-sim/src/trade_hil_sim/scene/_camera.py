@@ -13,7 +13,7 @@ from trade_hil_sim.faults._active import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._bus_thread import BusThread, ready
+from trade_hil_sim.robot._bus_thread import BusThread, listener, ready
 
 from ._drawing import draw, png
 
@@ -122,17 +122,17 @@ class SceneCamera(BusThread):
     # the thread
 
     def _begin(self) -> None:
-        self._listener = _listen(0)
+        self._listener = listener("127.0.0.1", 0)
         self._number = self._listener.getsockname()[1]
 
     def _step(self) -> None:
-        bell, listener = self._errands.bell, self._listener
-        readable = ready([bell] if listener is None else [bell, listener.fileno()])
+        bell, opened = self._errands.bell, self._listener
+        readable = ready([bell] if opened is None else [bell, opened.fileno()])
         if bell in readable:
             self._errands.run()
-        elif listener is not None:
+        elif opened is not None:
             with suppress(OSError):
-                client, _ = listener.accept()
+                client, _ = opened.accept()
                 with client:
                     client.settimeout(_CLIENT_S)
                     self._serve(client)
@@ -142,7 +142,7 @@ class SceneCamera(BusThread):
 
     def _plug(self, on: bool) -> None:
         if on and self._listener is None:
-            self._listener = _listen(self._number)
+            self._listener = listener("127.0.0.1", self._number)
         elif not on and self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -183,16 +183,3 @@ class SceneCamera(BusThread):
 
     def _note(self, name: str, detail: str) -> None:
         self.log.add(Entry(t=time.monotonic(), bus=self.name, kind="event", name=name, detail=detail))
-
-
-def _listen(number: int) -> socket.socket:
-    listener = socket.socket()
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(("127.0.0.1", number))
-        listener.listen()
-        listener.setblocking(False)
-    except OSError:
-        listener.close()
-        raise
-    return listener

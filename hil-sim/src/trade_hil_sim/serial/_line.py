@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
-from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, Entry, Kind
 from trade_hil_sim.robot._bus_thread import BusThread
 from trade_hil_sim.serial._pty import Terminal
 
@@ -154,7 +154,7 @@ class SerialLine(BusThread):
             chunk = heapq.heappop(self._out)
             # logged first: whoever has an answer finds it in the log, and the wire does not wait for the log
             due = max(chunk.due, time.monotonic())
-            self._note("sent", chunk.data, t=due, name=chunk.name, device_id=chunk.device_id)
+            self._note("sent", chunk.data, due, name=chunk.name, device_id=chunk.device_id)
             _sleep_until(due)
             self._write(chunk)
 
@@ -182,15 +182,11 @@ class SerialLine(BusThread):
             self._wire_free_at = max(t, self._wire_free_at) + len(data) * self._byte_s()
         # events that fell due before these bytes come first in the log
         self._peer.wake()
-        self._note("received", data, t=t)
+        self._note("received", data, t)
         self._peer.received(data, t)
 
-    def _note(
-        self, kind: str, data: bytes, *, t: float | None = None, name: str = "", device_id: int | None = None
-    ) -> None:
-        when = time.monotonic() if t is None else t
-        direction = "received" if kind == "received" else "sent"
-        self._log.add(Entry(when, self.name, direction, name, device_id=device_id, hex=data.hex()))
+    def _note(self, kind: Kind, data: bytes, t: float, *, name: str = "", device_id: int | None = None) -> None:
+        self._log.add(Entry(t, self.name, kind, name, device_id=device_id, hex=data.hex()))
 
     def _byte_s(self) -> float:
         return BITS_PER_BYTE / self._baud if self._baud else 0.0

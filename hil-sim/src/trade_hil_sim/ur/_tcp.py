@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Final
 
 from trade_hil_sim.faults._commands import Piece
+from trade_hil_sim.robot._bus_thread import listener
 
 __all__ = ["MOST_HELD", "PORTS", "Client", "listeners"]
 
@@ -97,13 +98,9 @@ def listeners(host: str) -> dict[str, socket.socket]:
     made: dict[str, socket.socket] = {}
     try:
         for name, number in PORTS.items():
-            made[name] = socket.socket()
-            made[name].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            made[name].bind((host, number))
-            made[name].listen()
-            made[name].setblocking(False)
+            made[name] = listener(host, number)
     except OSError:
-        for listener in made.values():
-            listener.close()
+        for opened in made.values():
+            opened.close()
         raise
     return made
