@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from trade_gateway.config._children import Supervised
-from trade_gateway.supervisor._state_machine import Life, State, Transition
+from trade_gateway.supervisor._restart_policy import Life, State, Transition
 
 
 def life(**terms: Any) -> Life:

@@ -16,8 +16,8 @@ SUBPROTOCOL: Final = "trade.v1"
 _BEARER: Final = "bearer."
 
 
-class Entry:
-    """Tells who is who, and lets in whom the policy has not revoked."""
+class Authenticator:
+    """Identifies clients by token or certificate, and admits those that the policy has not revoked."""
 
     def __init__(self, tokens: Tokens, judge: ClientAuthorizer) -> None:
         self._tokens = tokens

@@ -14,7 +14,7 @@ from starlette.routing import Route
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
 from trade_gateway.clients import Client, ClientApi, NoSuchSession
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.http._authentication import Entry
+from trade_gateway.http._authentication import Authenticator
 from trade_gateway.http._openapi import document
 from trade_gateway.http._origin_check import problem_response
 from trade_gateway.http._problem_json import BadMessage, HttpError, NeedsSession, NotLetIn
@@ -32,9 +32,9 @@ Answer = Callable[[Request], Awaitable[Response]]
 class Http:
     """The routes."""
 
-    def __init__(self, deeds: ClientApi, entry: Entry, leases: Leases) -> None:
+    def __init__(self, deeds: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
         self._deeds = deeds
-        self._entry = entry
+        self._authenticator = authenticator
         self._leases = leases
 
     def routes(self) -> list[Route]:
@@ -120,7 +120,7 @@ class Http:
     # --- calling
 
     async def call(self, request: Request) -> Response:
-        who, body = self._entry.who(request.scope), await _body(request, messages.CallBody)
+        who, body = self._authenticator.who(request.scope), await _body(request, messages.CallBody)
         handle = self._deeds.find(who, request.path_params["group"], request.path_params["name"], body.container)
         named = self._heard(request, who, stops=handle.effect == "stop")
         async with self._client(request, who, named) as (client, alone):
@@ -139,7 +139,7 @@ class Http:
     async def open_session(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.SessionBody)
         client = await self._deeds.apart(self._deeds.clients.open, who)
-        self._leases.begin(client, body.lease_s, lambda: self._entry.still(request.scope, who))
+        self._leases.begin(client, body.lease_s, lambda: self._authenticator.still(request.scope, who))
         return _answer(messages.SessionOpened(client.secret, client.session.name, body.lease_s), 201)
 
     async def session(self, request: Request) -> Response:
@@ -184,7 +184,7 @@ class Http:
         return _answer(self._deeds.estops(self._who(request)))
 
     async def estop(self, request: Request) -> Response:
-        who = self._entry.who(request.scope)
+        who = self._authenticator.who(request.scope)
         self._heard(request, who, stops=True)
         return _answer(await self._deeds.estop(who, await _body(request, messages.EstopBody)))
 
@@ -194,7 +194,7 @@ class Http:
     # --- who, and in which session
 
     def _who(self, request: Request) -> str:
-        who = self._entry.who(request.scope)
+        who = self._authenticator.who(request.scope)
         self._heard(request, who)
         return who
 
@@ -229,7 +229,7 @@ class Http:
             yield named, False
             return
         client = await self._deeds.apart(self._deeds.clients.open_for_one, who, stops=True)
-        self._leases.begin(client, 0, lambda: self._entry.still(request.scope, who))
+        self._leases.begin(client, 0, lambda: self._authenticator.still(request.scope, who))
         try:
             yield client, True
         finally:

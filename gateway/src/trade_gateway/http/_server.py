@@ -22,7 +22,7 @@ from trade.errors import ConfigurationError
 from trade.listening import BoundedListener
 from trade_gateway.clients import ClientApi
 from trade_gateway.dashboard import pages
-from trade_gateway.http._authentication import Entry
+from trade_gateway.http._authentication import Authenticator
 from trade_gateway.http._http import SESSION, Http, broken, refused
 from trade_gateway.http._origin_check import LOOPBACK_NAMES, Gate
 from trade_gateway.http._protocols import HttpProtocol, SocketProtocol
@@ -140,7 +140,7 @@ class Door:
 
 
 def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
-    entry, leases = Entry(tokens, deeds.judge), Leases(deeds)
+    authenticator, leases = Authenticator(tokens, deeds.judge), Leases(deeds)
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
@@ -160,8 +160,8 @@ def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origi
         )
     application = Starlette(
         routes=[
-            *Http(deeds, entry, leases).routes(),
-            WebSocketRoute("/ws", Socket(deeds, entry, leases).serve),
+            *Http(deeds, authenticator, leases).routes(),
+            WebSocketRoute("/ws", Socket(deeds, authenticator, leases).serve),
             *pages(),
         ],
         middleware=middleware,

@@ -14,7 +14,7 @@ from trade import Handle, Run
 from trade.errors import InvalidResult, LockLost, TradeError
 from trade_gateway.clients import Client, ClientApi, TooMany
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.http._authentication import SUBPROTOCOL, Entry
+from trade_gateway.http._authentication import SUBPROTOCOL, Authenticator
 from trade_gateway.http._origin_check import problem_response
 from trade_gateway.http._problem_json import BadMessage, problem_of
 from trade_gateway.http._session_timeouts import Leases
@@ -39,15 +39,15 @@ _ENDED: Final = 1008
 class Socket:
     """Its endpoint."""
 
-    def __init__(self, deeds: ClientApi, entry: Entry, leases: Leases) -> None:
+    def __init__(self, deeds: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
         self._deeds = deeds
-        self._entry = entry
+        self._authenticator = authenticator
         self._leases = leases
 
     async def serve(self, websocket: WebSocket) -> None:
         """One connection, from its handshake to its end."""
         try:
-            who = self._entry.who(websocket.scope)
+            who = self._authenticator.who(websocket.scope)
             client = await self._deeds.apart(self._deeds.clients.open, who, stops=True)
         except TradeError as error:
             await websocket.send_denial_response(problem_response(error))
@@ -55,7 +55,7 @@ class Socket:
         try:
             offered = SUBPROTOCOL in websocket.scope["subprotocols"]
             await websocket.accept(SUBPROTOCOL if offered else None)
-            self._leases.begin(client, 0, lambda: self._entry.still(websocket.scope, who))
+            self._leases.begin(client, 0, lambda: self._authenticator.still(websocket.scope, who))
             await Conversation(websocket, client, self._deeds).run()
             with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is gone
                 await websocket.close(_ENDED)

@@ -10,7 +10,7 @@ from trade_gateway.process._kill_timer import TimerLease, uptime_s
 from trade_gateway.supervisor._furnish import CreatedObjects
 from trade_gateway.supervisor._lease_protocol import Leased
 from trade_gateway.supervisor._process import Process
-from trade_gateway.supervisor._state_machine import Life, State
+from trade_gateway.supervisor._restart_policy import Life, State
 
 __all__ = ["ChildInfo", "News", "Unit"]
 

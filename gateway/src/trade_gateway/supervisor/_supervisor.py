@@ -23,8 +23,8 @@ from trade_gateway.supervisor._child import ChildInfo, News, Unit
 from trade_gateway.supervisor._furnish import CreatedObjects, furnish, save
 from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
 from trade_gateway.supervisor._process import Process, rss_mb
+from trade_gateway.supervisor._restart_policy import GRACE_S, SAVE_S, State, Transition
 from trade_gateway.supervisor._single_instance import lock_of
-from trade_gateway.supervisor._state_machine import GRACE_S, SAVE_S, State, Transition
 from trade_gateway.supervisor._store import StateStore
 
 __all__ = ["Supervisor"]

@@ -1,4 +1,4 @@
-"""The life of one child as a state machine: told what happened and when, it says what to do. No I/O, no clock."""
+"""The restart policy of one child as a state machine: it gets events with their times and returns what to do; no I/O."""
 
 import enum
 import math

@@ -1,4 +1,4 @@
-"""The gateway as a guest in other systems: a container in each, and a border between it and our own."""
+"""What the gateway offers in other systems, and takes from them, as its file says."""
 
 import threading
 from contextlib import ExitStack

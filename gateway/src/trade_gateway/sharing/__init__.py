@@ -1,0 +1,1 @@
+"""The gateway as a guest in other systems: a container in each, and a `trade.sharing.Border` to it."""
