@@ -24,7 +24,7 @@ _REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
 
 def _frame(data: bytes) -> Any:
     """A message of the WebSocket, as the door takes it."""
-    asked = messages.read_asked(data)
+    asked = messages.read(data, messages.ASKED)
     messages.numbers(getattr(asked, "args", None))
     return asked
 

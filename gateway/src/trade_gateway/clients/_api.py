@@ -133,10 +133,9 @@ class ClientApi:
     def _begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
         try:
             given: Any = messages.numbers(body.args)
-        except RecursionError:
-            problem = f"is nested more than {messages.MOST_DEEP} deep"
+        except ValueError as bad:
             raise InvalidArgument(
-                service=handle.label, argument="args", problem=problem, signature=handle.signature
+                service=handle.label, argument="args", problem=f"is {bad}", signature=handle.signature
             ) from None
         args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
         kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}

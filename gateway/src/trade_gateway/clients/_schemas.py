@@ -1,13 +1,16 @@
 """What clients say and are told, over HTTP and over the WebSocket: records, read strictly."""
 
 import sys
-from typing import Annotated, Any, Final, Literal, cast
+from typing import Annotated, Any, Final, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct
 
 from trade import Handle, LockInfo, Span
 from trade.policies import VERBS, Policy
+from trade_gateway.clients._errors import BadMessage
+
+T = TypeVar("T")
 
 APPROVALS: Final = "approvals"
 """Where what waits is a service."""
@@ -16,7 +19,7 @@ MOST_DEADLINE_S: Final = 86_400.0
 SESSION_LEASE_S: Final = 2.0
 LEAST_INTEGER: Final = -(2**63)
 MOST_INTEGER: Final = 2**64 - 1
-MOST_DEEP: Final = 100
+_MOST_DEEP: Final = 100
 """How deep arguments may be nested."""
 _MOST_EXACT: Final = 2**53
 
@@ -323,10 +326,10 @@ def plain(value: Any) -> Any:
 def numbers(value: Any, deep: int = 0) -> Any:
     """JSON has one kind of number: 2.0 is an integer where one is asked for, and what no integer holds is a float.
 
-    Raises RecursionError: it is nested more than ``MOST_DEEP`` deep.
+    Raises ValueError: it is nested more than ``_MOST_DEEP`` deep.
     """
-    if deep > MOST_DEEP:
-        raise RecursionError
+    if deep > _MOST_DEEP:
+        raise ValueError(f"nested more than {_MOST_DEEP} deep")
     match value:
         case dict():
             return {key: numbers(inner, deep + 1) for key, inner in cast("dict[str, Any]", value).items()}
@@ -340,7 +343,15 @@ def numbers(value: Any, deep: int = 0) -> Any:
             return value
 
 
+def read(text: str | bytes, decoder: msgspec.json.Decoder[T]) -> T:
+    """What a client has sent. Raises BadMessage: it is no JSON, or not of this form."""
+    try:
+        return decoder.decode(text)
+    except (msgspec.DecodeError, ValueError, RecursionError) as bad:
+        raise BadMessage(problem=str(bad)) from None
+
+
 NO_JSON: Final = (TypeError, ValueError, OverflowError, RecursionError)
 """What encoding raises of values that have no form in JSON."""
 encoder: Final = msgspec.json.Encoder(enc_hook=plain)
-read_asked: Final = msgspec.json.Decoder(Asked).decode
+ASKED: Final[msgspec.json.Decoder[Asked]] = msgspec.json.Decoder(Asked)

@@ -7,7 +7,7 @@ from starlette.types import Scope
 
 from trade.errors import AccessDenied
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
-from trade_gateway.http._problem_json import NotLetIn
+from trade_gateway.clients._errors import NotLetIn
 from trade_gateway.http._tokens import Tokens
 
 CERTIFIED: Final = "trade.certified"

@@ -14,10 +14,10 @@ from starlette.routing import Route
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
 from trade_gateway.clients import Client, ClientApi, NoSuchSession
 from trade_gateway.clients import _schemas as messages
+from trade_gateway.clients._errors import BadMessage, HttpError, NeedsSession, NotLetIn
 from trade_gateway.http._authentication import Authenticator
 from trade_gateway.http._openapi import document
 from trade_gateway.http._origin_check import problem_response
-from trade_gateway.http._problem_json import BadMessage, HttpError, NeedsSession, NotLetIn
 from trade_gateway.http._session_timeouts import Leases
 
 MOST_BODY_BYTES: Final = 1 << 20
@@ -255,10 +255,7 @@ async def _body(request: Request, kind: type[Body]) -> Body:
         data = await asyncio.wait_for(_read(request), _BODY_S)
     except asyncio.TimeoutError:
         raise HttpError(status=408, problem=f"the body did not arrive within {_BODY_S:g} s") from None
-    try:
-        return msgspec.json.decode(data or b"{}", type=kind)
-    except (msgspec.DecodeError, ValueError, RecursionError) as bad:
-        raise BadMessage(problem=str(bad)) from None
+    return messages.read(data or b"{}", msgspec.json.Decoder(kind))
 
 
 async def _read(request: Request) -> bytes:

@@ -8,7 +8,8 @@ import msgspec
 
 from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Sight
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.http._problem_json import MEDIA_TYPE, Problem
+from trade_gateway.clients._problems import Problem
+from trade_gateway.http._origin_check import MEDIA_TYPE
 
 Schema = dict[str, Any]
 

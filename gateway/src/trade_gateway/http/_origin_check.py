@@ -8,9 +8,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from trade_gateway.clients._errors import WrongDoor
+from trade_gateway.clients._problems import problem_of
 from trade_gateway.clients._schemas import encoder
-from trade_gateway.http._problem_json import MEDIA_TYPE, WrongDoor, problem_of
 
+MEDIA_TYPE: Final = "application/problem+json"
+"""Of errors, by RFC 9457."""
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
 
 

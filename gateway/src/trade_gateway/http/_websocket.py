@@ -7,16 +7,16 @@ from contextlib import nullcontext, suppress
 from typing import Any, Final
 
 import anyio
-import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trade import Handle, Run
 from trade.errors import InvalidResult, LockLost, TradeError
 from trade_gateway.clients import Client, ClientApi, TooMany
 from trade_gateway.clients import _schemas as messages
+from trade_gateway.clients._errors import BadMessage
+from trade_gateway.clients._problems import problem_of
 from trade_gateway.http._authentication import SUBPROTOCOL, Authenticator
 from trade_gateway.http._origin_check import problem_response
-from trade_gateway.http._problem_json import BadMessage, problem_of
 from trade_gateway.http._session_timeouts import Leases
 
 MOST_UNDER_WAY: Final = 64
@@ -186,9 +186,9 @@ class Conversation:
 
     def _hear(self, text: str) -> None:
         try:
-            asked = messages.read_asked(text)
-        except (msgspec.DecodeError, ValueError, RecursionError) as bad:
-            self._note({"id": None, "problem": problem_of(BadMessage(problem=str(bad)))})
+            asked: messages.Asked = messages.read(text, messages.ASKED)
+        except BadMessage as bad:
+            self._note({"id": None, "problem": problem_of(bad)})
             return
         try:
             ongoing = self._admitted(asked)

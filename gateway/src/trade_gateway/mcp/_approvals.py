@@ -15,8 +15,8 @@ from msgspec import Struct
 from trade import Container, Handle, current_call, service, where
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import places
+from trade_gateway.clients._errors import NeedsApproval
 from trade_gateway.clients._schemas import APPROVALS
-from trade_gateway.mcp._errors import NeedsApproval
 
 __all__ = ["Approvals", "Request"]
 

@@ -17,8 +17,8 @@ from msgspec import Struct
 from trade import Container, Handle, Settings
 from trade.errors import NoSuchService, TradeError
 from trade_gateway._usage import find
+from trade_gateway.clients._errors import NoTwin
 from trade_gateway.drill._processes import Actor, DrillFailed, bare_environment
-from trade_gateway.mcp._errors import NoTwin
 
 __all__ = ["Tried", "Twin"]
 

@@ -14,9 +14,9 @@ from trade import Container, Handle
 from trade.errors import LockLost, NoSuchService, TradeError
 from trade_gateway.clients import Client, ClientApi
 from trade_gateway.clients import _schemas as messages
+from trade_gateway.clients._errors import NeedsLock, NoSuchTool, NoTwin, WrongTool
 from trade_gateway.language import Lexicon, Memory, Talk
 from trade_gateway.mcp._approvals import Approvals
-from trade_gateway.mcp._errors import NeedsLock, NoSuchTool, NoTwin, WrongTool
 from trade_gateway.mcp._simulation_twin import Tried, Twin
 
 __all__ = ["TOOLS", "Tool", "Tools"]
@@ -117,9 +117,8 @@ class Tools:
         try:
             try:
                 asked = msgspec.convert(messages.numbers(given), tool.asked)
-            except (msgspec.ValidationError, ValueError, RecursionError) as bad:
-                problem = f"nested more than {messages.MOST_DEEP} deep" if isinstance(bad, RecursionError) else bad
-                raise WrongTool(problem=f"the arguments of {name} are wrong: {problem}") from None
+            except (msgspec.ValidationError, ValueError) as bad:
+                raise WrongTool(problem=f"the arguments of {name} are wrong: {bad}") from None
             about = _about(asked)
             result = await tool.do(self, asked, progress)
         except Exception as error:
@@ -176,15 +175,13 @@ class Tools:
     async def call(self, asked: ToCall, progress: Progress) -> Any:
         """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
         handle = self._find(asked.group, asked.name, asked.container)
-        if handle.effect == "actuate" and not self._client.has_locked(handle):
-            raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
+        self._require_lock(handle)
         self._deeds.judge.require_call(self._client.identity, handle)
         admitted = self._client.admit(handle)
         if self._approvals.needed(handle):
             progress("waits for somebody's approval")
             await self._approvals.ask(handle, asked.args, asked.why, _APPROVED_WITHIN_S)
-            if handle.effect == "actuate" and not self._client.has_locked(handle):
-                raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
+            self._require_lock(handle)
         run = await self._deeds.begin(self._client, handle, asked, admitted)
         run.on_progress(progress)
         try:
@@ -236,6 +233,10 @@ class Tools:
 
     def _find(self, group: str, name: str, container: str) -> Handle:
         return self._deeds.find(self._client.identity, group, name, container)
+
+    def _require_lock(self, handle: Handle) -> None:
+        if handle.effect == "actuate" and not self._client.has_locked(handle):
+            raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
 
     async def _state_of(self, handle: Handle) -> Any:
         """What the robot says of what the service moves; None if it says nothing."""

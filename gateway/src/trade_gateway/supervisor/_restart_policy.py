@@ -1,4 +1,4 @@
-"""The restart policy of one child as a state machine: it gets events with their times and returns what to do; no I/O."""
+"""The restart policy of one child as a state machine: it gets events with their times and says what to do. No I/O."""
 
 import enum
 import math

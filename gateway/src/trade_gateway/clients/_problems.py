@@ -1,6 +1,6 @@
-"""Errors as they leave by the door: ``application/problem+json`` with the error's name, data and remedy."""
+"""How an error is shown to a client, whatever protocol carries it: its name, HTTP status, message and data."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -8,62 +8,8 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from trade import errors
-from trade.errors import CallerError, TradeError
-from trade_gateway.clients import NoAuditRecord, NoSuchSession, TooMany
-
-MEDIA_TYPE: Final = "application/problem+json"
-
-
-@dataclass(kw_only=True, eq=False)
-class NotLetIn(CallerError, PermissionError):
-    """Nobody knows who asks; nothing was done."""
-
-    reason: str
-
-    def describe(self) -> str:
-        return f"{self.reason}; show a token (Authorization: Bearer ...), which `trade door token NAME` makes"
-
-
-@dataclass(kw_only=True, eq=False)
-class WrongDoor(CallerError, PermissionError):
-    """A page of another site, or somebody under another name of this host; nothing was done."""
-
-    what: str
-    remedy: str
-
-    def describe(self) -> str:
-        return f"{self.what} is not let in; {self.remedy}"
-
-
-@dataclass(kw_only=True, eq=False)
-class NeedsSession(CallerError, LookupError):
-    """What was asked for lives as long as its session, and a plain request has none that lasts."""
-
-    what: str
-
-    def describe(self) -> str:
-        return f"{self.what} needs a session: POST /session and send its id as Trade-Session, or speak over /ws"
-
-
-@dataclass(kw_only=True, eq=False)
-class BadMessage(CallerError, ValueError):
-    """A body or message is no JSON, or not of the form that belongs here; nothing was done."""
-
-    problem: str
-
-    def describe(self) -> str:
-        return f"this cannot be read: {self.problem}; /openapi.json says what belongs here"
-
-
-@dataclass(kw_only=True, eq=False)
-class HttpError(CallerError):
-    """What HTTP itself refuses."""
-
-    status: int
-    problem: str
-
-    def describe(self) -> str:
-        return self.problem
+from trade.errors import TradeError
+from trade_gateway.clients._errors import HttpError, Refusal
 
 
 class Problem(Struct, frozen=True, omit_defaults=True):
@@ -79,16 +25,10 @@ class Problem(Struct, frozen=True, omit_defaults=True):
 
 
 _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
-    (NotLetIn, HTTPStatus.UNAUTHORIZED),
-    (WrongDoor, HTTPStatus.FORBIDDEN),
-    (TooMany, HTTPStatus.TOO_MANY_REQUESTS),
     (errors.AccessDenied, HTTPStatus.FORBIDDEN),
     (errors.NotInstantiable, HTTPStatus.FORBIDDEN),
     (errors.TooLarge, HTTPStatus.REQUEST_ENTITY_TOO_LARGE),
-    (NoSuchSession, HTTPStatus.NOT_FOUND),
-    (NoAuditRecord, HTTPStatus.NOT_FOUND),
     (errors.SessionEnded, HTTPStatus.NOT_FOUND),
-    (NeedsSession, HTTPStatus.BAD_REQUEST),
     (errors.NoSuchService, HTTPStatus.NOT_FOUND),
     (errors.NoSuchEstop, HTTPStatus.NOT_FOUND),
     (errors.ServiceGone, HTTPStatus.NOT_FOUND),
@@ -98,7 +38,6 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
     (errors.LimitExceeded, HTTPStatus.BAD_REQUEST),
     (errors.NotSerialisable, HTTPStatus.BAD_REQUEST),
     (errors.ConfigurationError, HTTPStatus.BAD_REQUEST),
-    (BadMessage, HTTPStatus.BAD_REQUEST),
     (errors.Busy, HTTPStatus.SERVICE_UNAVAILABLE),
     (errors.NobodyFound, HTTPStatus.SERVICE_UNAVAILABLE),
     (errors.CallerError, HTTPStatus.CONFLICT),
@@ -110,8 +49,8 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
 
 def status_of(error: BaseException) -> int:
     """The HTTP status that says most of an error."""
-    if isinstance(error, HttpError):
-        return error.status
+    if isinstance(error, Refusal):
+        return error.status if isinstance(error, HttpError) else error.http_status
     return next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
 
 
