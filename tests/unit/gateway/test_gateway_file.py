@@ -6,8 +6,10 @@ import shutil
 import signal
 from datetime import timedelta
 from pathlib import Path
+from socket import AF_INET, AF_INET6, AF_PACKET
 from types import SimpleNamespace
 
+import psutil
 import pytest
 from typer.testing import CliRunner
 
@@ -386,13 +388,23 @@ def test_loopback_is_of_the_first_network_and_everywhere_of_all(
     )
 
 
-def test_the_addresses_of_this_host_are_told_by_interface(tmp_path: Path) -> None:
-    listing = tmp_path / "if_inet6"
-    listing.write_text("fd000000000000000000000000000002 02 40 00 80     eth7\n")
-    found = addresses(listing)
-    assert "127.0.0.1" in found[loopback_interface()]
-    assert found["eth7"] == {"fd00::2"}
-    assert "127.0.0.1" in addresses(tmp_path / "no IPv6")[loopback_interface()]
+def test_the_addresses_of_this_host_are_told_by_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "127.0.0.1" in addresses()[loopback_interface()]
+
+    def address(family: int, text: str) -> SimpleNamespace:
+        return SimpleNamespace(family=family, address=text)
+
+    listed = {
+        "eth7": [
+            address(AF_INET6, "fd00::2"),
+            address(AF_INET6, "fe80::1%eth7"),
+            address(AF_PACKET, "02:fc:00:00:00:01"),
+        ],
+        "eth7:1": [address(AF_INET, "192.0.2.7")],
+        "ifb0": [address(AF_PACKET, "02:fc:00:00:00:02")],
+    }
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: listed)
+    assert addresses() == {"eth7": {"fd00::2", "fe80::1", "192.0.2.7"}}
 
 
 def test_a_host_that_forwards_between_the_networks_is_told_of(

@@ -1,9 +1,6 @@
 """Addresses: whether one is of this host alone, how it is written, which interface has it, what the host passes on."""
 
 import socket
-import struct
-import sys
-from array import array
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from ipaddress import ip_address
@@ -12,12 +9,6 @@ from typing import Final
 
 __all__ = ["addresses", "forwarding", "in_url", "is_loopback"]
 
-_SIOCGIFCONF: Final = 0x8912
-_NAME: Final = 16
-_REQUEST: Final = struct.Struct(f"{_NAME}s 2s 2s 4s {16 if struct.calcsize('P') > 4 else 8}x")
-"""Linux's `struct ifreq` with an IPv4 address in it: name, family, port, address."""
-_MOST: Final = 512
-_IPV6: Final = Path("/proc/net/if_inet6")
 _SYSCTLS: Final = Path("/proc/sys/net")
 
 
@@ -36,32 +27,21 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def addresses(ipv6: Path = _IPV6) -> Mapping[str, frozenset[str]]:
-    """The addresses of each interface of this host, by its name; empty where there is no Linux to ask."""
+def addresses() -> Mapping[str, frozenset[str]]:
+    """The addresses of each interface of this host, by its name; empty where the system does not list them."""
+    import psutil  # noqa: PLC0415 - commands that need no list of interfaces start without it
+
     found: dict[str, set[str]] = {}
-    for name, address in (*_of_ipv4(), *_of_ipv6(ipv6)):
-        found.setdefault(name, set()).add(address)
-    return {name: frozenset(known) for name, known in found.items()}
-
-
-def _of_ipv4() -> Iterable[tuple[str, str]]:
-    if sys.platform != "linux":
-        return
-    import fcntl  # noqa: PLC0415 - not every operating system has it
-
-    room = array("B", bytes(_REQUEST.size * _MOST))
-    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        told = fcntl.ioctl(asking, _SIOCGIFCONF, struct.pack("iP", len(room), room.buffer_info()[0]))
-        used: int = struct.unpack("iP", told)[0]
-        for label, _, _, address in _REQUEST.iter_unpack(room.tobytes()[:used]):
-            yield label.split(b"\0")[0].decode().partition(":")[0], socket.inet_ntoa(address)
-
-
-def _of_ipv6(listing: Path) -> Iterable[tuple[str, str]]:
     with suppress(OSError):
-        for line in listing.read_text(encoding="ascii").splitlines():
-            digits, *_, name = line.split()
-            yield name, str(ip_address(bytes.fromhex(digits)))
+        for label, listed in psutil.net_if_addrs().items():
+            own = found.setdefault(label.partition(":")[0], set())
+            own.update(_bare(one.address) for one in listed if one.family in (socket.AF_INET, socket.AF_INET6))
+    return {name: frozenset(own) for name, own in found.items() if own}
+
+
+def _bare(address: str) -> str:
+    """Without the interface that follows a link-local address."""
+    return str(ip_address(address.partition("%")[0]))
 
 
 def forwarding(interfaces: Iterable[str], sysctls: Path = _SYSCTLS) -> list[str]:

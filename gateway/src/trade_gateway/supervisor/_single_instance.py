@@ -1,4 +1,8 @@
-"""A lock that a process has for its life, whoever started it: of one container there is one process on a host."""
+"""A lock file that a process holds for its life, whoever started it: of one container there is one process on a host.
+
+No library for lock files: these unlock when they are released, and with that every process the lock was passed on to
+(decision 78).
+"""
 
 import contextlib
 import fcntl

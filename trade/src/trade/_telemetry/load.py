@@ -59,12 +59,12 @@ class LoadMeter:
     def __init__(
         self,
         container: str,
-        crews: Callable[[], Sequence[WorkerPool]],
+        worker_pools: Callable[[], Sequence[WorkerPool]],
         queued: Callable[[], int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._container = container
-        self._worker_pools = crews
+        self._worker_pools = worker_pools
         self._queued = queued
         self._clock = clock
         self._lock = threading.Lock()

@@ -1,7 +1,7 @@
-"""Threads that do one piece of work at a time and wait a while for the next one.
+"""A thread pool that reuses idle threads; it has no maximum, and its threads are daemons (decision 78).
 
 To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off. What
-is due (`Clockwork`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion
+is due (`Scheduler`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion
 does, and must hold up nobody.
 """
 
@@ -38,24 +38,24 @@ class ThreadPool:
             RuntimeError: the process may have no more threads.
         """
         try:
-            hand = self._idle.pop()
+            worker = self._idle.pop()
         except IndexError:
-            hand = _Worker(self)
-        hand.give(work, name)
+            worker = _Worker(self)
+        worker.give(work, name)
 
-    def rejoin(self, hand: "_Worker") -> bool:
+    def rejoin(self, worker: "_Worker") -> bool:
         """Whether one that has done its work is to wait for more."""
         if self._closed or len(self._idle) >= _MOST_IDLE:
             return False
-        self._idle.append(hand)
+        self._idle.append(worker)
         if self._closed:  # meanwhile
-            return not self.leave(hand)
+            return not self.leave(worker)
         return True
 
-    def leave(self, hand: "_Worker") -> bool:
+    def leave(self, worker: "_Worker") -> bool:
         """Whether one that waits may end; if not, work is on its way to it."""
         try:
-            self._idle.remove(hand)
+            self._idle.remove(worker)
         except ValueError:
             return False
         return True
@@ -63,14 +63,14 @@ class ThreadPool:
     def close(self) -> None:
         """Those that wait end; work that is under way goes on. Idempotent."""
         self._closed = True
-        for hand in list(self._idle):
-            if self.leave(hand):
-                hand.dismiss()
+        for worker in list(self._idle):
+            if self.leave(worker):
+                worker.dismiss()
 
 
 class _Worker:
-    def __init__(self, hands: ThreadPool) -> None:
-        self._hands = hands
+    def __init__(self, pool: ThreadPool) -> None:
+        self._pool = pool
         self._work: Work | None = None
         self._given = threading.Lock()
         self._given.acquire()
@@ -92,7 +92,7 @@ class _Worker:
     def _main(self) -> None:
         while True:
             if not self._given.acquire(timeout=_PATIENCE_S):
-                if self._hands.leave(self):
+                if self._pool.leave(self):
                     return
                 self._given.acquire()
             work, self._work = self._work, None
@@ -103,5 +103,5 @@ class _Worker:
             except Exception:
                 _logger.exception("what was begun failed")
             del work  # it may hold on to much
-            if not self._hands.rejoin(self):
+            if not self._pool.rejoin(self):
                 return
