@@ -14,7 +14,7 @@ from trade import Container, where
 from trade.errors import ConfigurationError, MotionStopped, Stopped
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import _write
-from trade_gateway.cli.watching._call_model import Model, read, write
+from trade_gateway.cli.watching._profile import Model, read, write
 from trade_gateway.http import add_token
 from trade_gateway.pki._authority import Authority
 from trade_hil_sim import events, read_log

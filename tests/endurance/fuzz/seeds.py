@@ -34,7 +34,7 @@ from trade_drivers.vendors.feetech._frames import packet as feetech_packet
 from trade_gateway.cli.operation._archive import _MANIFEST as MANIFEST
 from trade_gateway.cli.operation._archive import Entry, Manifest
 from trade_gateway.mcp._tools import TOOLS
-from trade_gateway.ros.ros2._attachment import Attachment
+from trade_gateway.ros.ros2._node import Attachment
 from trade_hil_sim.dynamixel import encode as dynamixel_packet
 from trade_hil_sim.robotiq._protocol import frame as modbus_frame
 

@@ -7,7 +7,7 @@ import sys
 import threading
 
 from tests.support.waiting import PATIENCE_S, wait_until
-from trade_gateway.process._signal_event import SignalEvent
+from trade_gateway.process._signals import SignalEvent
 
 
 def test_it_is_heard_by_all_who_wait_and_until_it_is_cleared() -> None:

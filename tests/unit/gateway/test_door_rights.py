@@ -12,7 +12,7 @@ from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
 from trade.errors import ConfigurationError
-from trade_gateway.clients._audit_reader import newest
+from trade_gateway.clients._system_info import newest
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from trade_drivers.robotfile import Drill
 from trade_gateway._usage import UsageError
 from trade_gateway.cli.hardware._drill import _chosen
 from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
-from trade_gateway.drill._judge import Judge
 from trade_gateway.drill._processes import DrillFailed
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
+from trade_gateway.drill._testbed import Judge
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 DRILL_PAGE = EXAMPLES.parent / "docs" / "drill.md"

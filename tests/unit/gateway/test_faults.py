@@ -9,7 +9,7 @@ import pytest
 from trade_drivers import FaultLog, Gripper, Motor
 from trade_drivers.faults._trouble import Found
 from trade_gateway.cli._output import Output
-from trade_gateway.cli.robots._fault_reporter import FaultWatch
+from trade_gateway.cli.robots._up import FaultWatch
 
 OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
 BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")

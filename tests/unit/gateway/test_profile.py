@@ -7,8 +7,7 @@ import pytest
 
 from trade import Span
 from trade.errors import ConfigurationError
-from trade_gateway.cli.watching._call_model import deviations, learn, read, sequences, write
-from trade_gateway.cli.watching._profile import statistics
+from trade_gateway.cli.watching._profile import deviations, learn, read, sequences, statistics, write
 
 
 def span(call_id: int, service: str, **others: Any) -> Span:

@@ -32,7 +32,7 @@ from trade_gateway.recording._channels import (
 from trade_gateway.recording._fault_trigger import HOLD_OFF_S, SavedAtFault
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._reader import entries
-from trade_gateway.recording._ring_buffer import Ring
+from trade_gateway.recording._recorder import Ring
 from trade_gateway.recording._sources import within
 
 S = 1_000_000_000

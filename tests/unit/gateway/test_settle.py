@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade_gateway.process._running import settle
+from trade_gateway.process._signals import settle
 
 
 @pytest.fixture(autouse=True)

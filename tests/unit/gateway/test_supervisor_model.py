@@ -19,7 +19,7 @@ from trade.errors import ConfigurationError
 from trade.starting import Started
 from trade_gateway.config._children import Child, Supervised
 from trade_gateway.supervisor import Supervisor
-from trade_gateway.supervisor._furnish import CreatedObjects
+from trade_gateway.supervisor._objects import CreatedObjects
 
 AFTER = {"a": (), "b": ("a",), "c": ("a", "b"), "d": ()}
 GRACE_S = 20.0

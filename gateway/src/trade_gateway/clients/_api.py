@@ -33,15 +33,14 @@ from trade.errors import (
 )
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._authorizer import ClientAuthorizer
-from trade_gateway.clients._clients import Client, Clients, places
-from trade_gateway.clients._quota import MOST, Quota
+from trade_gateway.clients._clients import MOST_CALLS, Client, Clients, Quota, places
 from trade_gateway.clients._system_info import Overview
 
 _logger = logging.getLogger("trade")
 
 T = TypeVar("T")
 
-_THREADS: Final = MOST + 16
+_THREADS: Final = MOST_CALLS + 16
 """As many as there may be calls, locks and questions under way, and some for sessions that come and go."""
 _HEARD_S: Final = 1.0
 """How long to wait for everybody to be heard."""

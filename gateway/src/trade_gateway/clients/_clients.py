@@ -2,6 +2,7 @@
 
 import secrets
 import threading
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Final
@@ -11,6 +12,8 @@ from msgspec import Struct
 from trade import Container, Handle, Lock, Run, Session
 from trade_gateway.clients._errors import NoSuchSession, TooMany
 
+MOST_CALLS: Final = 64
+MOST_CALLS_OF_ONE: Final = 16
 MOST_CLIENTS: Final = 64
 MOST_OF_ONE: Final = 16
 """Sessions of one identity that last; those of single requests do not count."""
@@ -207,6 +210,30 @@ class Clients:
         """End all. Idempotent."""
         for client in self:
             client.close()
+
+
+class Quota:
+    """Calls and requests for locks that have not ended; stops are not among them (S07)."""
+
+    def __init__(self) -> None:
+        self._under_way: Counter[str] = Counter()
+        self._guard = threading.Lock()
+
+    def take(self, who: str) -> Callable[[], None]:
+        """One more; returns what is to be called once when it has ended, on any thread. Raises TooMany."""
+        with self._guard:
+            if sum(self._under_way.values()) >= MOST_CALLS:
+                raise TooMany(what="calls under way", limit=MOST_CALLS)
+            if self._under_way[who] >= MOST_CALLS_OF_ONE:
+                raise TooMany(what=f"calls of {who} under way", limit=MOST_CALLS_OF_ONE)
+            self._under_way[who] += 1
+        return lambda: self._ended(who)
+
+    def _ended(self, who: str) -> None:
+        with self._guard:
+            self._under_way[who] -= 1
+            if not self._under_way[who]:
+                del self._under_way[who]
 
 
 def places(handles: Iterable[Handle]) -> set[Place]:

@@ -1,17 +1,99 @@
-"""What clients are told of the system itself: who may read, instrument or administer it is judged by the policy."""
+"""What clients are told of the system itself, its calls and its audit record, as far as the policy lets them."""
 
+import heapq
+import sqlite3
 import threading
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
 from typing import Any, Final
 
-from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span
+import msgspec
+
+from trade import Container, Handle, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span, where
+from trade.auditing import AuditRow, reading, records_in
+from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.clients._audit_reader import newest
 from trade_gateway.clients._authorizer import ClientAuthorizer
 from trade_gateway.clients._errors import NoAuditRecord
 from trade_gateway.clients._load_table import loads
-from trade_gateway.clients._span_reader import CallReader
+from trade_gateway.clients._schemas import AuditView
+
+
+def newest(folder: Path, most: int) -> list[AuditView]:
+    """The newest rows of all records, the newest first.
+
+    Raises:
+        ConfigurationError: one of them cannot be read.
+    """
+    found = [_view(path.stem, row) for path in records_in(folder) for row in _last(path, most)]
+    return heapq.nlargest(most, found, key=lambda view: view.at)
+
+
+def _last(path: Path, most: int) -> Iterator[AuditRow]:
+    try:
+        with reading(path) as (end, _):
+            after = max(0, end.seq - most)
+        with reading(path, after) as (_, links):
+            yield from (link.row for link in links)
+    except (sqlite3.Error, msgspec.ValidationError) as bad:
+        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
+
+
+def _view(container: str, row: AuditRow) -> AuditView:
+    return AuditView(
+        at=row.at_ns / 1e9,
+        container=container,
+        kind=row.kind,
+        what=row.what,
+        about=row.about,
+        who=row.who,
+        session=row.session,
+        outcome=row.outcome,
+        why=row.why,
+        call_id=str(row.call_id),
+    )
+
+
+_MOST: Final = 200
+"""Of what was noted before anybody asked."""
+
+
+class CallReader:
+    """Reads on where it was: each call once, or twice if who called and who served it are both traced.
+
+    Args:
+        container: of whose system.
+        reads: also calls of services that only read.
+    """
+
+    def __init__(self, container: Container, *, reads: bool) -> None:
+        self._container = container
+        self._reads = reads
+        self._read: dict[Handle, int] = {}
+        """By what tells of a container's calls, the number of the last one told."""
+
+    def read(self) -> list[Span]:
+        """What has ended since the last time, in the order in which it began; the first time the newest 200.
+
+        Raises:
+            AccessDenied: the policy does not let this container read group ``trade``.
+        """
+        handles, first = self._container.services(where(name="spans", group="trade")), not self._read
+        reading = [] if self._reads else [one for one in self._container.services() if one.effect == "read"]
+        left_out = {one.label for one in reading}
+        new: list[Span] = []
+        for outcome in self._container.call_all([one.bind(None, self._read.get(one, 0)) for one in handles]):
+            if isinstance(outcome.error, AccessDenied):
+                raise outcome.error
+            if not outcome.ok:  # it has left meanwhile
+                continue
+            spans: list[Span] = outcome.result
+            self._read[outcome.handle] = spans[-1].number if spans else self._read.get(outcome.handle, 0)
+            new += [span for span in spans if span.service not in left_out]
+        new.sort(key=lambda span: (span.began, span.call_id))
+        return new[-_MOST:] if first else new
+
 
 _ROWS: Final = 200
 """Of the audit records."""

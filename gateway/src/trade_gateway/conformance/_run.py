@@ -1,4 +1,4 @@
-"""Running the checks one after the other, each on a container that is at rest."""
+"""All checks, in the order they run, each on a container that is at rest."""
 
 import logging
 import tempfile
@@ -10,9 +10,66 @@ from typing import Final
 from msgspec import Struct
 
 from trade.errors import TradeError
+from trade_gateway.conformance import _callbacks, _calling, _estopping, _locking, _moving, _presence
 from trade_gateway.conformance._assertions import NotHeld
 from trade_gateway.conformance._check import Check
 from trade_gateway.conformance._environment import Stage
+
+CHECKS: Final[tuple[Check, ...]] = (
+    _presence.presence,
+    _presence.offers,
+    _presence.describes,
+    _presence.tells_late,
+    _presence.found,
+    _presence.survives_rubbish,
+    _presence.restarts,
+    _presence.leaves,
+    _calling.answers,
+    _calling.refuses_arguments,
+    _calling.knows_not,
+    _calling.late_is_never,
+    _calling.late_when_frozen,
+    _calling.once,
+    _calling.once_for_ever,
+    _calling.once_for_each,
+    _calling.cancels,
+    _calling.cancels_own_only,
+    _calling.versions,
+    _calling.forged,
+    _moving.turns,
+    _moving.stops,
+    _moving.stops_late,
+    _moving.stop_latches,
+    _moving.stop_latches_own,
+    _moving.session_ends,
+    _moving.caller_ends,
+    _moving.behalf_ends,
+    _moving.too_late_for_ended,
+    _locking.locks,
+    _locking.locks_told,
+    _locking.locked_by_ours,
+    _locking.one_owner,
+    _locking.waits_for_motion,
+    _locking.leases,
+    _locking.owner_ends,
+    _locking.lost_stops,
+    _locking.stop_needs_no_lock,
+    _locking.stop_beside_waiting,
+    _callbacks.calls,
+    _callbacks.calls_no_longer,
+    _callbacks.passes_errors,
+    _callbacks.locks_ours,
+    _callbacks.renews,
+    _callbacks.is_refused,
+    _callbacks.streams,
+    _estopping.estop,
+    _estopping.estop_reported,
+    _estopping.estop_forged,
+    _estopping.estop_of_any_version,
+    _estopping.estop_kept,
+    _estopping.estop_learnt,
+)
+
 
 OK: Final = "ok"
 FAILED: Final = "failed"

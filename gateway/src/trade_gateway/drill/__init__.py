@@ -1,7 +1,6 @@
 """``trade drill``: while a simulated twin of a robot moves, what it hangs on is taken away, and the time is taken."""
 
-from trade_gateway.drill._page import page
-from trade_gateway.drill._record import Played, Report, Stop, as_data
+from trade_gateway.drill._report import Played, Report, Stop, as_data, page
 from trade_gateway.drill._runner import play
 from trade_gateway.drill._scenes import SCENES, Scene
 from trade_gateway.drill._targets import Target, targets_of

@@ -7,7 +7,7 @@ from typing import Final
 
 from trade_drivers.robotfile import Drill
 from trade_gateway.drill._processes import Actor, DrillFailed
-from trade_gateway.drill._record import Played, Stop
+from trade_gateway.drill._report import Played, Stop
 from trade_gateway.drill._scenes import Scene, limit_s
 from trade_gateway.drill._targets import Target
 from trade_gateway.drill._testbed import Stand

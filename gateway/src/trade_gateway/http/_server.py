@@ -22,12 +22,11 @@ from trade.errors import ConfigurationError
 from trade.listening import BoundedListener
 from trade_gateway.clients import ClientApi
 from trade_gateway.dashboard import pages
-from trade_gateway.http._authentication import Authenticator
+from trade_gateway.http._authentication import Authenticator, Tokens
 from trade_gateway.http._http import SESSION, Http, broken, refused
 from trade_gateway.http._origin_check import LOOPBACK_NAMES, Gate
 from trade_gateway.http._protocols import HttpProtocol, SocketProtocol
 from trade_gateway.http._session_timeouts import Leases
-from trade_gateway.http._tokens import Tokens
 from trade_gateway.http._websocket import Socket
 from trade_gateway.process._addresses import in_url, is_loopback
 

@@ -2,6 +2,6 @@
 
 from trade_gateway.language._dialogue import Reply, Talk
 from trade_gateway.language._lexicon import Lexicon, NotUnderstood, read_lexicon
-from trade_gateway.language._previous_answer import Memory
+from trade_gateway.language._questions import Memory
 
 __all__ = ["Lexicon", "Memory", "NotUnderstood", "Reply", "Talk", "read_lexicon"]

@@ -9,8 +9,7 @@ from msgspec import Struct
 from trade import Container
 from trade_gateway._usage import find
 from trade_gateway.language._lexicon import Lexicon, NotUnderstood, Phrase
-from trade_gateway.language._previous_answer import Memory
-from trade_gateway.language._questions import QUESTIONS, Unknown
+from trade_gateway.language._questions import QUESTIONS, Memory, Unknown
 
 __all__ = ["Reply", "Talk"]
 

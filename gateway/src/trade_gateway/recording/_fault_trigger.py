@@ -11,7 +11,7 @@ import msgspec
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import FAULTS, Fault, Message
 from trade_gateway.recording._file import Attachment
-from trade_gateway.recording._ring_buffer import Ring
+from trade_gateway.recording._recorder import Ring
 
 __all__ = ["SavedAtFault"]
 

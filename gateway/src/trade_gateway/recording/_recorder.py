@@ -3,18 +3,55 @@
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from itertools import chain
+from pathlib import Path
 from typing import Final, Protocol
 
 from trade import Container
-from trade_gateway.process._signal_event import SignalEvent
+from trade_gateway.process._signals import SignalEvent
 from trade_gateway.recording._channels import Message
+from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._poller import Watch
 from trade_gateway.recording._sources import Sources, Wanted
 
-__all__ = ["Recorder", "Sink", "about"]
+__all__ = ["Recorder", "Ring", "Sink", "about"]
+
+
+class Ring:
+    """Messages of the last seconds. Used by one thread."""
+
+    def __init__(self, keep_s: float, most_bytes: int) -> None:
+        self._keep_ns = int(keep_s * 1e9)
+        self._most_bytes = most_bytes
+        self._kept: deque[Message] = deque()
+        self.size_bytes = 0
+        """Of what is kept."""
+        self.cut_short = 0
+        """So many messages had to go before their time, for want of room."""
+
+    def write(self, message: Message) -> None:
+        """Keep it, and let go of what is too old or too much."""
+        self._kept.append(message)
+        self.size_bytes += len(message.data)
+        while self._kept[0].arrived_ns < message.arrived_ns - self._keep_ns:
+            self._drop()
+        while self.size_bytes > self._most_bytes and len(self._kept) > 1:
+            self._drop()
+            self.cut_short += 1
+
+    def _drop(self) -> None:
+        self.size_bytes -= len(self._kept.popleft().data)
+
+    def save(self, path: Path, about: Mapping[str, str], attachments: Sequence[Attachment] = ()) -> int:
+        """Write what is kept to a file, and keep it; returns how many messages there are. Raises like the file."""
+        with RecordingFile(path, about, attachments) as file:
+            for message in self._kept:
+                file.write(message)
+        return len(self._kept)
+
 
 _LOOK_S: Final = 0.5
 """So often it looks for services that have come or gone."""

@@ -7,8 +7,8 @@ from msgspec import Struct
 
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease, uptime_s
-from trade_gateway.supervisor._furnish import CreatedObjects
 from trade_gateway.supervisor._lease_protocol import Leased
+from trade_gateway.supervisor._objects import CreatedObjects
 from trade_gateway.supervisor._process import Process
 from trade_gateway.supervisor._restart_policy import Life, State
 

@@ -20,8 +20,8 @@ from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._child import ChildInfo, News, Unit
-from trade_gateway.supervisor._furnish import CreatedObjects, furnish, save
 from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
+from trade_gateway.supervisor._objects import CreatedObjects, furnish, save
 from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._restart_policy import GRACE_S, SAVE_S, State, Transition
 from trade_gateway.supervisor._single_instance import lock_of

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from tests.support.waiting import wait_until
-from trade_gateway.ros.ros2._at_once import AtOnce
+from trade_gateway.ros._mailbox import AtOnce
 
 
 class Hanging:
@@ -47,7 +47,7 @@ def test_there_are_only_so_many_threads_and_who_waits_is_told_after_all() -> Non
 
 
 def test_what_waits_at_the_end_and_what_comes_after_it_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trade_gateway.ros.ros2._at_once._END_S", 0.0)
+    monkeypatch.setattr("trade_gateway.ros._mailbox._END_S", 0.0)
     hanging, dropped = Hanging("first"), []
     at_once = AtOnce[str]("test", hanging, most=1, drop=dropped.append)
     at_once.put("first")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from zenoh.ext import Int64, UInt8, z_serialize
 from zenoh_ros2_sdk.attachment import Attachment as Theirs
 
-from trade_gateway.ros.ros2._attachment import Attachment
+from trade_gateway.ros.ros2._node import Attachment
 
 longs = st.integers(-(2**63), 2**63 - 1)
 gids = st.binary(min_size=16, max_size=16)

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from tests.support.waiting import wait_until
-from trade_gateway.ros.ros2._mailbox import Mailbox
+from trade_gateway.ros._mailbox import Mailbox
 
 
 class Slow:

@@ -10,7 +10,7 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._addresses import is_loopback
-from trade_gateway.process._running import leaving
+from trade_gateway.process._signals import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted

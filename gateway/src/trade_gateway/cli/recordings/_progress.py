@@ -12,8 +12,7 @@ from trade.errors import ConfigurationError
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.recording._fault_trigger import SavedAtFault
 from trade_gateway.recording._file import Attachment, RecordingFile
-from trade_gateway.recording._recorder import Recorder, about
-from trade_gateway.recording._ring_buffer import Ring
+from trade_gateway.recording._recorder import Recorder, Ring, about
 
 __all__ = ["Recorder", "Ring", "about", "kept_for_faults", "to_file"]
 

@@ -9,7 +9,7 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.process._running import leaving
+from trade_gateway.process._signals import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
 

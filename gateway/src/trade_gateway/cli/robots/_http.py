@@ -12,7 +12,7 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.cli.robots._detached import ready
-from trade_gateway.process._running import leaving, refuse_twice, settle
+from trade_gateway.process._signals import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S: Final = 1.0
 _TOKENS: Final = Path("door-tokens.toml")

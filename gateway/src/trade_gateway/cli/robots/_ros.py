@@ -13,7 +13,7 @@ from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
-from trade_gateway.process._running import leaving, refuse_twice, settle
+from trade_gateway.process._signals import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S: Final = 0.5
 _UP_WITHIN_S: Final = 30.0

@@ -14,7 +14,7 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of
 from trade_gateway.cli.robots._system_up import Bringing, Told, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
-from trade_gateway.process._running import leaving
+from trade_gateway.process._signals import leaving
 
 app = typer.Typer(no_args_is_help=True, help="A whole system from one file, over its hosts.")
 

@@ -18,7 +18,7 @@ from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway.cli.robots._detached import detached
 from trade_gateway.config._system import SystemPlan
 from trade_gateway.config._tables import ContainerSpec
-from trade_gateway.process._signal_event import SignalEvent
+from trade_gateway.process._signals import SignalEvent
 from trade_gateway.supervisor._objects import GROUP, lacking, make
 
 _LEFT_S: Final = 20.0

@@ -1,27 +1,86 @@
 """``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_drivers import AttachedRobot, attach, load, without
+from trade_drivers import AttachedRobot, FaultInfo, FaultLog, Gripper, Motor, attach, load, without
 from trade_drivers import check as drivers_check
 from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli._output import Output, as_commands, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import choice_of
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
-from trade_gateway.cli.robots._fault_reporter import FaultWatch
-from trade_gateway.process._running import leaving, refuse_twice, settle
+from trade_gateway.process._signals import leaving, refuse_twice, settle
+
+_CALLS: Final = ((Motor, "enable"), (Gripper, "activate"))
+"""What helps once the cause is gone."""
+
+
+class FaultWatch:
+    """Compares what a robot's log of faults says is wrong now with what it said before.
+
+    Args:
+        log: of the robot.
+        providers: its devices by name.
+    """
+
+    def __init__(self, log: FaultLog, providers: Mapping[str, object]) -> None:
+        self._log = log
+        self._providers = providers
+        self._known: dict[str, FaultInfo] = {}
+        """By device, what was told of it."""
+
+    def begin(self, out: Output) -> None:
+        """Say what is wrong, or that nothing is."""
+        if not self.tell(out):
+            out.say(f"{_now():%H:%M:%S} no joint has a fault")
+
+    def tell(self, out: Output) -> bool:
+        """Say what has changed since the last time; returns whether anything has. Of several faults the newest."""
+        found = reversed(self._log.faults(open_only=True))
+        now = {info.device: info for info in found}
+        before, self._known = self._known, now
+        changed = [device for device in {**before, **now} if _kind(before.get(device)) != _kind(now.get(device))]
+        for device in changed:
+            self._say(out, device, now.get(device))
+        return bool(changed)
+
+    def _say(self, out: Output, device: str, info: FaultInfo | None) -> None:
+        text = "" if info is None else self._sentence(info)
+        if out.as_json:
+            out.data({"at": _now().isoformat(timespec="milliseconds"), "joint": device, "fault": text})
+        elif info is None:
+            out.say(f"{_now():%H:%M:%S} [green]{device}: well again[/]")
+        else:
+            out.say(f"{_now():%H:%M:%S} [bold red]{escape(text)}[/]")
+
+    def _sentence(self, info: FaultInfo) -> str:
+        device = self._providers.get(info.device)
+        call = next((name for kind, name in _CALLS if isinstance(device, kind)), "")
+        if not info.remedy or not call:
+            return f"{info.text}; {as_commands(info.device, info.remedy)}" if info.remedy else info.text
+        end = "" if info.text.endswith("?") else "."
+        return f"{info.text}{end} When you have looked: trade call {info.device}.{call}"
+
+
+def _kind(info: FaultInfo | None) -> str:
+    return "" if info is None else info.kind
+
+
+def _now() -> datetime:
+    return datetime.now().astimezone()
+
 
 _LOOK_EVERY_S = 0.5
 

@@ -11,7 +11,7 @@ from trade.errors import ConfigurationError
 from trade_gateway.cli._output import complain
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.language import read_lexicon
-from trade_gateway.process._running import settle
+from trade_gateway.process._signals import settle
 
 
 def mcp(

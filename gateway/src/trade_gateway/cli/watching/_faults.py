@@ -10,8 +10,7 @@ from trade import Container, where
 from trade._timestamps import day_and_clock
 from trade.errors import TradeError
 from trade_gateway._usage import UsageError, asked_for
-from trade_gateway.cli._default_command import FirstByDefault
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import FirstByDefault, Json
 from trade_gateway.cli._output import Output, as_commands, complain
 from trade_gateway.cli._system_choice import visitor_among_others
 

@@ -15,7 +15,7 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
-from trade_gateway.process._running import hangups, leaving, refuse_twice
+from trade_gateway.process._signals import hangups, leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
 

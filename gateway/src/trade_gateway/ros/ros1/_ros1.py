@@ -21,17 +21,58 @@ from trade_gateway.ros._graph import (
     Pursuit,
     RosRefused,
 )
+from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros1._action_client import ActionClient
 from trade_gateway.ros.ros1._action_server import ActionServer
-from trade_gateway.ros.ros1._lane import Lane
 from trade_gateway.ros.ros1._link import Link, Opened
 from trade_gateway.ros.ros1._node._frames import Head
-from trade_gateway.ros.ros1._nodes import Nodes
 from trade_gateway.ros.ros1._service import Served
 from trade_gateway.ros.ros1._wire import message_head, service_head
 
-__all__ = ["Ros1"]
+__all__ = ["Nodes", "Ros1"]
+
+
+class Nodes:
+    """The nodes that can be seen. Each watcher is told on a thread of its own, in order, and misses nothing."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._there: set[str] = set()
+        self._watchers: dict[int, Mailbox[tuple[str, bool]]] = {}
+        self._watched = 0
+
+    def told(self, name: str, there: bool) -> None:
+        """A node came, or went."""
+        with self._lock:
+            if there == (name in self._there):
+                return
+            (self._there.add if there else self._there.discard)(name)
+            for watcher in self._watchers.values():
+                watcher.put((name, there))
+
+    def none(self) -> None:
+        """Nothing can be seen any more."""
+        for name in sorted(self._there):
+            self.told(name, False)
+
+    def watch(self, told: NodeTold) -> Callable[[], None]:
+        """Tell of those that are there, and of every change; returns what ends it."""
+        watcher = Mailbox[tuple[str, bool]]("trade-ros1-nodes", lambda news: told(*news), end_s=0.0)
+        with self._lock:
+            self._watched += 1
+            number = self._watched
+            self._watchers[number] = watcher
+            for name in sorted(self._there):
+                watcher.put((name, True))
+
+        def end() -> None:
+            with self._lock:
+                self._watchers.pop(number, None)
+            watcher.close()
+
+        return end
+
 
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 _MASTER: Final = "http://localhost:11311"
@@ -127,13 +168,18 @@ class Ros1(Graph):
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
         """As `subscribe`; so many messages wait at most, the newest. Our node and we have one monotonic clock."""
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
-        lane = Lane(f"trade-ros1{topic}", most)
+
+        def tell(message: tuple[Head, bytes]) -> None:
+            told, body = message
+            heard(self._types.from_bytes(type_name, body), told["who"], told["at"])
+
+        mailbox = Mailbox[tuple[Head, bytes]](f"trade-ros1{topic}", tell, most=most, end_s=0.0)
 
         def came(told: Head, body: bytes) -> None:
-            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"], told["at"]))
+            mailbox.put((told, body))
 
         opened = self._link.open(head, came, most)
-        return opened, (opened.close, lane.close)
+        return opened, (opened.close, mailbox.close)
 
     # --- services
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from trade_gateway.ros._graph import Answer
+from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros._types import Types
-from trade_gateway.ros.ros1._lane import Lane
 from trade_gateway.ros.ros1._node._frames import Head
 
 __all__ = ["Served"]
@@ -46,7 +46,7 @@ class Served:
         self._closed = False
         self._waiting: set[int] = set()
         self._threads = 0
-        self._lane = Lane(self._name)
+        self._mailbox = Mailbox(self._name, self._do, end_s=0.0)
 
     def came(self, head: Head, body: bytes) -> None:
         """A request."""
@@ -62,11 +62,11 @@ class Served:
         if refused:
             self._reply(request.asked, b"", refused)
         elif not (alone and self._begun(request)):
-            self._lane.put(lambda: self._do(request))
+            self._mailbox.put(request)
 
     def close(self) -> None:
         """Whoever waits is told. Idempotent."""
-        self._lane.close()
+        self._mailbox.close()
         with self._lock:
             self._closed = True
             waiting, self._waiting = self._waiting, set()

@@ -16,8 +16,8 @@ from typing import Final
 import zenoh
 
 from trade_gateway.ros._graph import NodeTold
+from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros.ros2._link import Link
-from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_token
 
 __all__ = ["Presence", "Watching"]

@@ -19,10 +19,9 @@ from typing import Any, Final, NamedTuple
 import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
+from trade_gateway.ros._mailbox import AtOnce, Mailbox
 from trade_gateway.ros._types import Message
-from trade_gateway.ros.ros2._at_once import AtOnce
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
-from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Endpoint, Node
 

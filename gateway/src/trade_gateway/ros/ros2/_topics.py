@@ -17,8 +17,8 @@ import zenoh
 import zenoh.ext
 
 from trade_gateway.ros._graph import Heard
+from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
-from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node, Sender
 
