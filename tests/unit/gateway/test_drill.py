@@ -11,7 +11,7 @@ import pytest
 from trade_drivers import load
 from trade_drivers.robotfile import Drill
 from trade_gateway._usage import UsageError
-from trade_gateway.cli.hardware._drill import _chosen
+from trade_gateway.cli._options import chosen
 from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
 from trade_gateway.drill._processes import DrillFailed
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
@@ -85,10 +85,13 @@ def test_an_arm_that_would_be_there_before_its_stream_is_over_shows_nothing_abou
 
 
 def test_scenes_are_chosen_by_name_and_held_in_the_order_of_the_table() -> None:
-    assert _chosen([]) == list(SCENES)
-    assert [scene.name for scene in _chosen(["partition", "caller_killed"])] == ["caller_killed", "partition"]
+    assert chosen(SCENES, [], "scene") == list(SCENES)
+    assert [scene.name for scene in chosen(SCENES, ["partition", "caller_killed"], "scene")] == [
+        "caller_killed",
+        "partition",
+    ]
     with pytest.raises(UsageError, match="there is no such scene; there is caller_killed"):
-        _chosen(["fire"])
+        chosen(SCENES, ["fire"], "scene")
 
 
 def test_the_judge_reads_a_log_while_it_is_written(tmp_path: Path) -> None:

@@ -1,9 +1,55 @@
-"""Options that many commands have, and groups with a default command."""
+"""What many commands have: options, a default command, cases chosen by name, and rooms that need an extra."""
 
-from typing import Annotated, Any
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Annotated, Any, Protocol, TypeVar
 
 import typer
 from typer.core import TyperGroup
+
+from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Groups = Annotated[
+    list[str] | None, typer.Option("--group", help="Only this group and what is beneath it; repeatable.")
+]
+Readers = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--services",
+        help="Also what this service answers, of those that only read: rosie.hand.state; * and ? stand "
+        "for anything. Repeatable.",
+    ),
+]
+
+
+class Case(Protocol):
+    """A check or a scene."""
+
+    @property
+    def name(self) -> str: ...
+
+
+C = TypeVar("C", bound=Case)
+
+
+def chosen(cases: Sequence[C], names: Sequence[str], what: str) -> list[C]:
+    """The cases that ``--only`` names, in the order of the table; all of them if it names none. Raises UsageError."""
+    known = [case.name for case in cases]
+    if unknown := [name for name in names if name not in known]:
+        problem = f"there is no such {what}; there is {', '.join(known)}"
+        raise UsageError(where=f"--only {unknown[0]}", problem=problem)
+    return [case for case in cases if not names or case.name in names]
+
+
+def room_of_extra(extra: str, command: str) -> Any:
+    """A room of this package whose libraries an extra of the same name brings. Raises ConfigurationError."""
+    try:
+        return import_module(f"trade_gateway.{extra}")
+    except ImportError as missing:
+        problem = f"needs {missing.name}; pip install 'trade-gateway[{extra}]'"
+        raise ConfigurationError(where=command, problem=problem) from None
 
 
 class FirstByDefault(TyperGroup):
@@ -14,6 +60,3 @@ class FirstByDefault(TyperGroup):
         if not args or args[0] not in (*self.commands, "-h", "--help"):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
-
-
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

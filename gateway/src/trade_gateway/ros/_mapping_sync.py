@@ -11,7 +11,7 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import failure
 from trade_gateway.ros._graph import Closes
 
-__all__ = ["Following", "Mapping", "Place", "named_services"]
+__all__ = ["Following", "Mapping", "Place", "named_services", "of_name"]
 
 _logger = logging.getLogger("trade")
 
@@ -184,6 +184,12 @@ class _Heard:
 
     def told(self, _: Handle) -> None:
         self._look()
+
+
+def of_name(service: str) -> Constraint:
+    """What a mapped service is found by: its group, if it names one, and its name."""
+    group, _, name = service.rpartition(".")
+    return where(group=group or None, name=name)
 
 
 def named_services(service: str, found: Sequence[Handle]) -> list[Handle]:

@@ -17,7 +17,7 @@ from trade_gateway.clients._clients import Client
 from trade_gateway.ros._conversion import RequestMapping, failure
 from trade_gateway.ros._file import Command
 from trade_gateway.ros._graph import Closes, Graph
-from trade_gateway.ros._mapping_sync import Place, named_services
+from trade_gateway.ros._mapping_sync import Place, named_services, of_name
 from trade_gateway.ros._nodes import Guest, Nodes
 from trade_gateway.ros._types import Message
 
@@ -47,8 +47,7 @@ class CommandsToRos:
 
     @property
     def of(self) -> Constraint:
-        group, _, name = self._entry.service.rpartition(".")
-        return where(group=group or None, name=name)
+        return of_name(self._entry.service)
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):

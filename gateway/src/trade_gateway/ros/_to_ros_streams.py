@@ -10,7 +10,7 @@ from trade_gateway.ros._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
 from trade_gateway.ros._joints import LIMBS, JointNames, joints_of, limbs, measured
-from trade_gateway.ros._mapping_sync import Place, named_services
+from trade_gateway.ros._mapping_sync import Place, named_services, of_name
 from trade_gateway.ros._types import Message
 
 __all__ = ["JointStatesToRos", "StreamsToRos", "Topics"]
@@ -60,8 +60,7 @@ class StreamsToRos:
 
     @property
     def of(self) -> Constraint:
-        group, _, name = self._entry.service.rpartition(".")
-        return where(group=group or None, name=name)
+        return of_name(self._entry.service)
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):

@@ -3,7 +3,6 @@
 import platform
 import signal
 import tempfile
-from collections.abc import Sequence
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -16,9 +15,9 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 from trade_drivers import load, without
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Json, chosen
 from trade_gateway.cli._output import Output
-from trade_gateway.drill import SCENES, Played, Report, Scene, as_data, page, play, standing, targets_of
+from trade_gateway.drill import SCENES, Played, Report, as_data, page, play, standing, targets_of
 
 _COLOURS = {True: "green", False: "bold red"}
 
@@ -48,7 +47,7 @@ def drill(
         return
     if robot_file is None:
         raise UsageError(where="ROBOT.toml", problem="missing; name a robot file, or --list the scenes")
-    scenes = _chosen(only or [])
+    scenes = chosen(SCENES, only or [], "scene")
     robot = load(robot_file)
     targets, left_out = targets_of(robot)
     if not targets:
@@ -84,14 +83,6 @@ def drill(
     _conclude(out, found, report)
     if not found.ok:
         raise typer.Exit(1)
-
-
-def _chosen(names: Sequence[str]) -> list[Scene]:
-    """The scenes asked for, in the order of the table. Raises UsageError."""
-    known = [scene.name for scene in SCENES]
-    if unknown := [name for name in names if name not in known]:
-        raise UsageError(where=f"--only {unknown[0]}", problem=f"there is no such scene; there is {', '.join(known)}")
-    return [scene for scene in SCENES if not names or scene.name in names]
 
 
 def _list(out: Output) -> None:

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Json, chosen
 from trade_gateway.cli._output import Output
 from trade_gateway.conformance import CHECKS, FAILED, LEFT_OUT, OK, Check, Outcome, run
 
@@ -56,14 +56,11 @@ def conformance(
 
 def _chosen(names: Sequence[str], *, motion: bool) -> list[Check]:
     """The checks asked for, in the order of the table. Raises UsageError."""
-    known = [one.name for one in CHECKS]
-    if unknown := [name for name in names if name not in known]:
-        raise UsageError(where=f"--only {unknown[0]}", problem=f"there is no such check; there is {', '.join(known)}")
-    chosen = [one for one in CHECKS if not names or one.name in names]
-    if names and not motion and (moving := [one.name for one in chosen if not one.still]):
+    checks = chosen(CHECKS, names, "check")
+    if names and not motion and (moving := [one.name for one in checks if not one.still]):
         problem = "is a check of motion; add --motion where the arm may turn"
         raise UsageError(where=f"--only {moving[0]}", problem=problem)
-    return chosen
+    return checks
 
 
 def _list(out: Output) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Groups, Json, Readers
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._addresses import is_loopback
@@ -21,14 +21,8 @@ if TYPE_CHECKING:
 
 def foxglove(
     context: typer.Context,
-    group: Annotated[list[str] | None, typer.Option(help="Only this group and what is beneath it; repeatable.")] = None,
-    services: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Also what this service answers, of those that only read: rosie.hand.state; * and ? stand "
-            "for anything. Repeatable."
-        ),
-    ] = None,
+    group: Groups = None,
+    services: Readers = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Where viewers connect to; 0 takes a free one.")] = 8765,
     host: Annotated[
         str, typer.Option(help="Another address of this host lets everybody look on who reaches it: there is no login.")

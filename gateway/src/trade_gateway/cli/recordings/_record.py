@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Groups, Json, Readers
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._signals import leaving
@@ -19,14 +19,8 @@ MB: Final = 1_000_000
 def record(
     context: typer.Context,
     file: Annotated[Path | None, typer.Argument(metavar="OUT.mcap", help="The file to make.")] = None,
-    group: Annotated[list[str] | None, typer.Option(help="Only this group and what is beneath it; repeatable.")] = None,
-    services: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Also what this service answers, of those that only read: rosie.hand.state; * and ? stand "
-            "for anything. Repeatable."
-        ),
-    ] = None,
+    group: Groups = None,
+    services: Readers = None,
     hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Samples of joints a second, at most.")] = 50.0,
     camera_hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Pictures a second, at most.")] = 5.0,
     service_hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Samples of --services a second.")] = 10.0,

@@ -1,14 +1,14 @@
 """``trade door``: HTTP and WebSocket for those who speak nothing else."""
 
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Json, room_of_extra
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.cli.robots._detached import ready
@@ -49,7 +49,7 @@ def door(
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)
-    opened = _doors()
+    opened = room_of_extra("http", "trade door")
     choice: SystemChoice = context.obj
     with (
         leaving() as asked_to_leave,
@@ -85,7 +85,7 @@ def token(
 
     For example: trade door token anna
     """
-    made = _doors().add_token(tokens, identity)
+    made = room_of_extra("http", "trade door").add_token(tokens, identity)
     out = Output(as_json=as_json)
     if as_json:
         out.data({"identity": identity, "token": made})
@@ -93,15 +93,6 @@ def token(
     out.say(f"{escape(identity)} is whoever shows this token; it is not shown again:\n  [bold]{made}[/]")
     out.say("for example, where DOOR is the address that trade door says:")
     out.say(f"  [bold]curl -H 'Authorization: Bearer {made}' DOOR/services[/]")
-
-
-def _doors() -> Any:
-    try:
-        from trade_gateway import http as room  # noqa: PLC0415 - loads what the other commands do not need
-    except ImportError as missing:
-        problem = f"needs {missing.name}; pip install 'trade-gateway[http]'"
-        raise ConfigurationError(where="trade door", problem=problem) from None
-    return room
 
 
 def _say_ready(out: Output, container: Container, url: str) -> None:

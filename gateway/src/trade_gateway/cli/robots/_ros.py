@@ -1,14 +1,13 @@
 """``trade ros``: a bridge between a system and ROS, 1 or 2, by what a file says."""
 
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Container
-from trade.errors import ConfigurationError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import Json, room_of_extra
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import SystemChoice
@@ -35,7 +34,7 @@ def ros(
 
     For example: trade ros examples/ros.toml --check
     """
-    room, out = _room(), Output(as_json=as_json)
+    room, out = room_of_extra("ros", "trade ros"), Output(as_json=as_json)
     read = room.read_ros_file(file)
     if check:
         _say_checked(out, file, room.planned(read, file))
@@ -94,12 +93,3 @@ def _say_ready(out: Output, container: Container, node: str) -> None:
         f"[bold green]bridged[/]: {escape(node)} in ROS, {escape(container.name)} in system "
         f"{escape(container.settings.system)}; Ctrl-C ends it"
     )
-
-
-def _room() -> Any:
-    try:
-        from trade_gateway import ros as room  # noqa: PLC0415 - loads what the other commands do not need
-    except ImportError as missing:
-        problem = f"needs {missing.name}; pip install 'trade-gateway[ros]'"
-        raise ConfigurationError(where="trade ros", problem=problem) from None
-    return room

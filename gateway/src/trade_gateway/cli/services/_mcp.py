@@ -1,13 +1,14 @@
 """``trade mcp``: a system for an agent, over the Model Context Protocol on standard input and output."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
 import typer
 
 from trade import Container
 from trade.errors import ConfigurationError
+from trade_gateway.cli._options import room_of_extra
 from trade_gateway.cli._output import complain
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.language import read_lexicon
@@ -33,7 +34,7 @@ def mcp(
 
     For example: trade mcp --twin rosie.toml --ask-first rosie.legs
     """
-    room = _room()
+    room = room_of_extra("mcp", "trade mcp")
     choice: SystemChoice = context.obj
     if twin is not None and not twin.exists():
         raise ConfigurationError(where=str(twin), problem="there is no such robot file")
@@ -55,12 +56,3 @@ def mcp(
             anyio.run(room.serve, container, approvals, read_lexicon(lexicon), trying, leave)
         finally:
             leave()
-
-
-def _room() -> Any:
-    try:
-        from trade_gateway import mcp as room  # noqa: PLC0415 - loads what the other commands do not need
-    except ImportError as missing:
-        problem = f"needs {missing.name}; pip install 'trade-gateway[mcp]'"
-        raise ConfigurationError(where="trade mcp", problem=problem) from None
-    return room
