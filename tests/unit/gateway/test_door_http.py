@@ -19,7 +19,7 @@ from tests.support.certificates import Papers
 from tests.support.http_clients import Axis, Client, Opened, opened
 from tests.support.two_joint_robot import Robot
 from tests.support.waiting import PATIENCE_S, wait_until
-from trade import Handle, Sight, service, where
+from trade import Handle, Reachability, service, where
 from trade.errors import Stopped
 from trade.testing import memory_system
 from trade_gateway.cli import app
@@ -307,7 +307,7 @@ def test_S09_a_door_tells_where_it_reached_nobody_and_calls_no_e_stop_complete_t
     anna = door.client()
     assert anna.ask("GET", "/sight").body["apart"] == {}
     apart = {"tls/10.0.0.7:7450": "nothing accepts connections there"}
-    monkeypatch.setattr(door.robot.me, "sight", lambda **_: Sight(("tester/a",), apart=apart))
+    monkeypatch.setattr(door.robot.me, "reachability", lambda **_: Reachability(("tester/a",), apart=apart))
     told = anna.ask("POST", "/estop").body
     assert (told["complete"], told["apart"]) == (False, apart)
     assert set(told["confirmed"]) >= {"tester/a", "tester/b"}

@@ -19,7 +19,7 @@ from trade._calls.run import Run
 from trade._container.container import Container
 from trade._container.hooking import Hook
 from trade._container.notifying import POLL_S
-from trade._container.reachability import Sight
+from trade._container.reachability import Reachability
 from trade._container.system import System
 from trade._container.tracing import LogReader, Trace
 from trade._context.call_context import CallContext, current_call, progress
@@ -71,13 +71,13 @@ __all__ = [
     "NotificationInfo",
     "Outcome",
     "Permit",
+    "Reachability",
     "Resource",
     "Run",
     "Sample",
     "Secret",
     "Session",
     "Settings",
-    "Sight",
     "Span",
     "StopReport",
     "Stream",

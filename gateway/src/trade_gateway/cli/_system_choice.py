@@ -44,9 +44,9 @@ def visitor_among_others(context: typer.Context) -> Container:
     container = visitor(context)
     try:
         if container.settings.connect and len(container.addresses()) == 1:
-            sight = container.sight(limit_s=_PATIENCE_S)
-            if not sight.others:
-                raise sight.nobody(container.settings.system)
+            reachability = container.reachability(limit_s=_PATIENCE_S)
+            if not reachability.others:
+                raise reachability.nobody(container.settings.system)
     except BaseException:
         container.close()
         raise

@@ -16,8 +16,8 @@ from trade import (
     Handle,
     Lock,
     Notification,
+    Reachability,
     Run,
-    Sight,
     where,
 )
 from trade import Stream as Samples
@@ -289,10 +289,11 @@ class ClientApi:
         """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
         report = await self.apart(self._container.estop, reason, stops=True)
-        sight = await self.apart(partial(self._container.sight, limit_s=0), stops=True)  # not before: it waits
+        look = partial(self._container.reachability, limit_s=0)
+        reachability = await self.apart(look, stops=True)  # not before: it waits
         if not (report.confirmed or report.missing or report.failed):
-            raise sight.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_TOLD}")
-        return _stopped(report, sight)
+            raise reachability.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_TOLD}")
+        return _stopped(report, reachability)
 
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
         """Clear e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and not everybody was heard."""
@@ -312,9 +313,9 @@ class ClientApi:
             self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
 
     def _require_all_heard(self) -> None:
-        sight = self._container.sight(limit_s=_HEARD_S)
-        if not sight.complete:
-            raise sight.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
+        reachability = self._container.reachability(limit_s=_HEARD_S)
+        if not reachability.complete:
+            raise reachability.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
 
     def estops(self, who: str) -> list[messages.EstopView]:
         """Those that are open. Raises AccessDenied: an identity may do nothing here but stop."""
@@ -378,7 +379,7 @@ def _groups(handles: Sequence[Handle]) -> list[str]:
     return sorted({group for handle in handles for group in handle.groups})
 
 
-def _stopped(report: EstopReport, sight: Sight | None = None) -> messages.Stopped:
-    apart = sight.apart if sight is not None else {}
+def _stopped(report: EstopReport, reachability: Reachability | None = None) -> messages.Stopped:
+    apart = reachability.apart if reachability is not None else {}
     complete = report.complete and not apart
     return messages.Stopped(report.id, complete, report.confirmed, report.missing, report.failed, apart)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from trade import Container, Handle, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span, where
+from trade import Container, Handle, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Reachability, Span, where
 from trade.auditing import AuditRow, reading, records_in
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import _schemas as messages
@@ -97,7 +97,7 @@ class CallReader:
 
 _ROWS: Final = 200
 """Of the audit records."""
-_SIGHT_S: Final = 2.0
+_REACHABILITY_S: Final = 2.0
 """How old it may be: finding out why there is no link takes as long."""
 
 Counted = Callable[..., Coroutine[Any, Any, Any]]
@@ -118,7 +118,7 @@ class Overview:
         self._judge = judge
         self._counted = counted
         self._looking = threading.Lock()
-        self._sight: Sight | None = None
+        self._reachability: Reachability | None = None
         self._looked_at = 0.0
 
     def me(self, who: str) -> messages.Me:
@@ -155,7 +155,7 @@ class Overview:
         """Of the calls of the system that are noted, from what is kept of them."""
         return CallReader(self._container, reads=reads)
 
-    async def sight(self, who: str) -> Sight:
+    async def reachability(self, who: str) -> Reachability:
         """Whom the door has found, and where nobody; looked at once for all who ask within two seconds.
 
         Raises:
@@ -164,12 +164,12 @@ class Overview:
         self._judge.require_some(who, "sight")
         return await self._counted(who, self._look)
 
-    def _look(self) -> Sight:
+    def _look(self) -> Reachability:
         with self._looking:
-            if self._sight is None or time.monotonic() - self._looked_at > _SIGHT_S:
-                self._sight = self._container.sight(limit_s=0)
+            if self._reachability is None or time.monotonic() - self._looked_at > _REACHABILITY_S:
+                self._reachability = self._container.reachability(limit_s=0)
                 self._looked_at = time.monotonic()
-            return self._sight
+            return self._reachability
 
     def containers(self, who: str) -> list[messages.ContainerView]:
         """Those of the system."""

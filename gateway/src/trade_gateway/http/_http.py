@@ -44,7 +44,7 @@ class Http:
             self._route("/services", "group", "name", GET=self.services),
             self._route("/me", GET=self.me),
             self._route("/containers", GET=self.containers),
-            self._route("/sight", GET=self.sight),
+            self._route("/sight", GET=self.reachability),
             self._route("/loads", GET=self.loads),
             self._route("/notifications", GET=self.notifications),
             self._route("/hooks", GET=self.hooks),
@@ -114,8 +114,8 @@ class Http:
     async def containers(self, request: Request) -> Response:
         return _answer(self._deeds.overview.containers(self._who(request)))
 
-    async def sight(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.sight(self._who(request)))
+    async def reachability(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.reachability(self._who(request)))
 
     # --- calling
 

@@ -6,7 +6,7 @@ from typing import Any, Final, cast
 
 import msgspec
 
-from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Sight
+from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Reachability
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._problems import Problem
 from trade_gateway.http._origin_check import MEDIA_TYPE
@@ -33,7 +33,7 @@ _BODIES: Final = (
     LoadInfo,
     NotificationInfo,
     HookInfo,
-    Sight,
+    Reachability,
     Problem,
 )
 _COMPONENTS: Final = "#/components/schemas/"
@@ -154,7 +154,7 @@ def _fixed() -> Schema:
         "/services": {"get": _operation("services", "Services.", _list("ServiceView"), parameters=query)},
         "/me": {"get": _operation("me", "As whom the client is known, and its rights over the system.", _ref("Me"))},
         "/containers": {"get": _operation("containers", "Containers.", _list("ContainerView"))},
-        "/sight": {"get": _operation("sight", "Whom the door has found, and where nobody.", _ref("Sight"))},
+        "/sight": {"get": _operation("sight", "Whom the door has found, and where nobody.", _ref("Reachability"))},
         "/loads": {
             "get": _operation("loads", "How busy they are, over the second that this takes.", _list("LoadInfo"))
         },

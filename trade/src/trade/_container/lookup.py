@@ -7,7 +7,7 @@ from typing import Any
 from trade._calls import batch
 from trade._calls.handle import Bound, Handle
 from trade._container.base import Member
-from trade._container.reachability import Sight, look_around
+from trade._container.reachability import Reachability, look_around
 from trade._context.call_context import patience_s
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
@@ -68,13 +68,13 @@ class Lookup(Member):
         """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
         reach = self._parts.dialer
         if wait_s > 0 or reach is None:
-            return self.sight(limit_s=0).unanswered
+            return self.reachability(limit_s=0).unanswered
         return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
 
-    def sight(self, *, limit_s: float = 3.0) -> Sight:
+    def reachability(self, *, limit_s: float = 3.0) -> Reachability:
         """Whom it has found: what nobody tells is only told by nobody if somebody was there to tell.
 
-        Returns at once when it is `Sight.complete`.
+        Returns at once when it is `Reachability.complete`.
 
         Args:
             limit_s: how long to wait for that, in seconds; also if nobody is found. Finding out why there is no link to

@@ -10,7 +10,7 @@ from trade._protocol.keys import Address
 from trade._registry.registry import Registry
 from trade.errors import NobodyFound
 
-__all__ = ["Sight", "look_around"]
+__all__ = ["Reachability", "look_around"]
 
 _LOOK_S: Final = 0.02
 _HIDDEN: Final = (
@@ -19,7 +19,7 @@ _HIDDEN: Final = (
 )
 
 
-class Sight(Struct, frozen=True):
+class Reachability(Struct, frozen=True):
     """Whom a container has found so far."""
 
     others: tuple[str, ...]
@@ -49,29 +49,29 @@ class Sight(Struct, frozen=True):
         return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
 
 
-def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Sight:
-    """Wait until the sight is complete, for ``limit_s`` seconds at most; what it is then."""
+def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Reachability:
+    """Wait until it is complete, for ``limit_s`` seconds at most; what it is then."""
     until = time.monotonic() + limit_s
-    while not (sight := _sight(registry, reach, own)).complete and time.monotonic() < until:
+    while not (found := _reachability(registry, reach, own)).complete and time.monotonic() < until:
         time.sleep(_LOOK_S)
-    return sight if reach is None else Sight(sight.others, sight.silent, _apart(reach, own, system, sight))
+    return found if reach is None else Reachability(found.others, found.silent, _apart(reach, own, system, found))
 
 
-def _sight(registry: Registry, reach: Dialer | None, own: Address) -> Sight:
+def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Reachability:
     states = [state for state in registry.containers() if state.address != own]
     unlinked = () if reach is None else reach.unlinked()
-    return Sight(
+    return Reachability(
         others=tuple(state.address.who for state in states),
         silent=tuple(state.address.who for state in states if not state.heard.complete),
         apart=dict.fromkeys(unlinked, ""),
     )
 
 
-def _apart(reach: Dialer, own: Address, system: str, sight: Sight) -> dict[str, str]:
+def _apart(reach: Dialer, own: Address, system: str, found: Reachability) -> dict[str, str]:
     """Those without a link, and why; an endpoint may be linked by a link that leads from there to here."""
-    found = {endpoint: reach.why_apart(endpoint, certain=not sight.others) for endpoint in sight.apart}
-    apart = {endpoint: why for endpoint, why in found.items() if why}
-    if not sight.others:
+    reasons = {endpoint: reach.why_apart(endpoint, certain=not found.others) for endpoint in found.apart}
+    apart = {endpoint: why for endpoint, why in reasons.items() if why}
+    if not found.others:
         hidden = _HIDDEN.format(identity=own.identity, system=system)
         apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
     return apart

@@ -30,7 +30,7 @@ def no_such_service(
         constraint: what was looked for.
         records: all services there are.
         waited_s: how long, in seconds.
-        apart: where there is no link, and why (`Sight`).
+        apart: where there is no link, and why (`Reachability`).
         hidden: why the policy does not let it be seen.
     """
     known = list(records)

@@ -166,8 +166,8 @@ def _datagrams() -> socket.socket:
 
 def in_sight(member: Container, system: str) -> Iterator[Finding]:
     """Which containers of the system are seen from here."""
-    sight = member.sight(limit_s=_PATIENCE_S if member.settings.connect else 0)
-    for endpoint, why in sight.apart.items():
+    reachability = member.reachability(limit_s=_PATIENCE_S if member.settings.connect else 0)
+    for endpoint, why in reachability.apart.items():
         fix = "the text says what may be wrong there; else correct TRADE_CONNECT"
         yield Finding(level="error", about=endpoint, text=f"nobody answers there (TRADE_CONNECT): {why}", fix=fix)
     others = sorted(one.name for one in member.containers() if one.epoch != member.address.epoch)
@@ -175,7 +175,7 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
     if others:
         yield Finding(level="ok", about=about, text=f"in sight: {', '.join(others)}")
         return
-    if sight.apart:
+    if reachability.apart:
         return
     fix = "`trade up ROBOT.toml` starts one; elsewhere, the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
     yield Finding(level="ok", about=about, text="no container is in sight", fix=fix)

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade import Container, EstopReport, Sight
+from trade import Container, EstopReport, Reachability
 from trade._estop.controller import new_estop_id
 from trade._stop_line import StopLines
 from trade.errors import NoSuchEstop
@@ -36,11 +36,11 @@ def estop(
     given = "" if clear else _given(context, reason, limit)
     with visitor(context) as container:
         system = container.settings.system
-        sight = container.sight(limit_s=limit) if clear else None
-        if sight is None:
+        reachability = container.reachability(limit_s=limit) if clear else None
+        if reachability is None:
             report = container.estop(reason, limit_s=limit, estop_id=given)
         else:
-            report = _clear(container, sight, ids, limit)
+            report = _clear(container, reachability, ids, limit)
         if report is None:
             if as_json:
                 out.data(None)
@@ -50,12 +50,12 @@ def estop(
             out.data(report)
         else:
             _say(out, report, system, "cleared" if clear else "stopped", container.address.who)
-        if sight is None:
-            sight = container.sight(limit_s=0)  # only now: an order waits for nobody
-    if sight.apart and not clear:
-        raise sight.nobody(system, "who is there was not told to stop; use the switch that cuts the power")
-    if clear and not sight.complete:
-        raise sight.nobody(system, "what is open there stays open until it is cleared once more")
+        if reachability is None:
+            reachability = container.reachability(limit_s=0)  # only now: an order waits for nobody
+    if reachability.apart and not clear:
+        raise reachability.nobody(system, "who is there was not told to stop; use the switch that cuts the power")
+    if clear and not reachability.complete:
+        raise reachability.nobody(system, "what is open there stays open until it is cleared once more")
     if not report.complete or not (clear or _known(report, container.address.who)):
         raise typer.Exit(1)
 
@@ -74,7 +74,7 @@ def _given(context: typer.Context, reason: str, limit_s: float) -> str:
     return estop_id
 
 
-def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: float) -> EstopReport | None:
+def _clear(container: Container, found: Reachability, ids: list[str] | None, limit_s: float) -> EstopReport | None:
     """Clear those, or all that are open; None: none is, say all that there are.
 
     Raises:
@@ -83,14 +83,14 @@ def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: f
     """
     system, cannot_tell = container.settings.system, "so nobody can tell whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
-    if not sight.others or not (wanted or sight.complete):
-        raise sight.nobody(system, cannot_tell)
+    if not found.others or not (wanted or found.complete):
+        raise found.nobody(system, cannot_tell)
     try:
         return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
     except NoSuchEstop:
-        if sight.complete:
+        if found.complete:
             raise
-        raise sight.nobody(system, cannot_tell) from None
+        raise found.nobody(system, cannot_tell) from None
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
