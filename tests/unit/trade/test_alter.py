@@ -152,7 +152,7 @@ def test_what_is_not_registered_or_malformed_is_refused(there: Container, motor:
 
 
 def test_the_functions_of_the_module_do_the_same(monkeypatch: pytest.MonkeyPatch, here: Container) -> None:
-    monkeypatch.setattr(trade, "_default", here)
+    monkeypatch.setattr("trade._container.default._default", here)
     motor, heard = Motor(), queue.SimpleQueue[Handle]()
     trade.changed(where(name="move"), heard.put)
     move = trade.register(motor, "a", meta={"n": 1})[0]

@@ -142,7 +142,7 @@ def test_a_bound_call_is_a_value(here: Container) -> None:
 
 
 def test_the_functions_of_the_module_do_the_same(monkeypatch: pytest.MonkeyPatch, here: Container) -> None:
-    monkeypatch.setattr(trade, "_default", here)
+    monkeypatch.setattr("trade._container.default._default", here)
     [handle] = [handle for handle in trade.register(Lamp(), "hall") if handle.name == "set_level"]
     assert trade.call(where(name="set_level"), 1) == 1
     assert [outcome.result for outcome in trade.call_all([handle], 2)] == [2]

@@ -10,6 +10,7 @@ import pytest
 
 import trade
 from trade import Container, Settings, service, where
+from trade._container import default
 from trade.errors import ConfigurationError, NoSuchService
 
 
@@ -160,10 +161,10 @@ FIRST_USES = {
 
 @pytest.mark.parametrize("use", FIRST_USES.values(), ids=list(FIRST_USES))
 def test_the_default_container_starts_on_first_use_whatever_that_is(system: str, use: str) -> None:
-    assert trade._default is None
+    assert default._default is None
     eval(use, {"trade": trade, "where": where, "Lamp": Lamp, "print": lambda _: None})
-    assert trade._default is not None
-    assert trade._default.healthy()
+    assert default._default is not None
+    assert default._default.healthy()
 
 
 def test_a_look_up_alone_makes_a_program_part_of_the_system(start_program: Any, there: Container) -> None:
@@ -180,7 +181,7 @@ def test_two_programs_have_containers_of_different_names(start_program: Any) -> 
 
 
 def test_importing_starts_nothing(start_program: Any) -> None:
-    program = start_program("import threading; say(threading.active_count(), trade._default)")
+    program = start_program("import threading; say(threading.active_count(), trade._container.default._default)")
     assert program.heard() == "1 None"
 
 

@@ -1,7 +1,6 @@
 """What a container is made of: made in order, each from those before it; ended in the reverse order."""
 
 import contextlib
-import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Protocol
@@ -19,7 +18,7 @@ from trade._counters import Measure
 from trade._discovery.announcer import Announcer
 from trade._discovery.dialer import Dialer
 from trade._discovery.listener import RegistryListener
-from trade._estop.controller import EstopController, check_limit, is_stop
+from trade._estop.controller import LIMIT_S, EstopController, check_limit, is_stop
 from trade._hooks import hook
 from trade._hooks.hook import Hooks
 from trade._locks import api
@@ -161,7 +160,6 @@ class Components:
         )
         self.registry.listen(self.hooks.changed)
         self.session_end_listeners.append(self.hooks.session_ended)
-        self.hook_numbers = itertools.count(1)
 
     def _build_telemetry(self, leaving: contextlib.ExitStack) -> None:
         exported = open_export(self._settings, self._address, leaving)
@@ -264,8 +262,20 @@ class Components:
         """Call the stop services of a group that are known here, for some seconds at most."""
         return stop_group(self._home, stops_of(self.registry, group), group, limit_s)
 
-    def stop_all_of(self, group: str, reason: str, limit_s: float) -> StopReport:
-        """See `Container.stop`."""
+    def stop(self, group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
+        """Stop all that moves in a group, and wait until it is at rest: every stop service there is, at once (S07).
+
+        It needs no lock, and no link that stands already: containers are asked on the stop line, too, and what one of
+        them stopped is stopped. Read the report: `StopReport.complete`. This is software, not safety-rated.
+
+        Args:
+            group: such as ``rosie.left``; all beneath it, too.
+            reason: why, for the record.
+            limit_s: how long to try, in seconds; also if nothing is found.
+
+        Raises:
+            ConfigurationError: that is no group, or no limit.
+        """
         check_limit(limit_s, "stop")
         until = time.monotonic() + limit_s
         wanted = where(group=group)

@@ -1,11 +1,12 @@
-"""One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
+"""One participant of a system. Each of its features is declared in a module of its own, and listed here."""
 
+import functools
 import itertools
 import secrets
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Concatenate, Final, Literal, ParamSpec, TypeVar
 
 from trade._calls.handle import Handle
 from trade._calls.run import Run
@@ -14,8 +15,10 @@ from trade._calls.target_cache import Target
 from trade._container.assembly import Components
 from trade._container.builtin_services import OwnServices
 from trade._container.federating import Federating
+from trade._container.hooking import Hooking
+from trade._container.lookup import Lookup
 from trade._container.migrating import Migrating
-from trade._container.motion_control import MotionControl
+from trade._container.notifying import Notifying
 from trade._container.registering import Registering
 from trade._container.streaming import Streaming
 from trade._container.system import System
@@ -25,10 +28,12 @@ from trade._context.outgoing import new_request
 from trade._context.sessions import Session
 from trade._counters import Measure
 from trade._discovery.dialer import Dialer
+from trade._estop.controller import EstopController
 from trade._estop.services import EstopServices
+from trade._locks.api import LockApi
 from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import Address, ServiceKey, alive_key, as_chunk
-from trade._registry.registry import Record
+from trade._registry.registry import Record, Registry
 from trade._security.authorizer import Authorizer, verb_of
 from trade._settings import Settings
 from trade._threads import fork_guard
@@ -40,7 +45,22 @@ __all__ = ["Container"]
 _STOPPING_S: Final = 2.0
 
 
-class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Federating):
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def delegated(part: str, method: Callable[Concatenate[Any, _P], _R]) -> "Callable[Concatenate[Container, _P], _R]":
+    """A method of the container that a part of it has, with the signature and the docstring that it has there."""
+
+    @functools.wraps(method)
+    def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        self._check_open()
+        return method(getattr(self, part), *args, **kwargs)
+
+    return call
+
+
+class Container:
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -66,9 +86,12 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
         self._closed = False
         self._parts = Components(self, self.settings, transport)
         self._known = self._parts.targets.known
-        self.locking = self._parts.lock_api
+        self._build_features(self._parts)
+        self.locking: Final = self._parts.lock_api
         """Its locks on what others offer, and on what it offers itself."""
-        self.borrowed = self._parts.remote_locks
+        self.estopping: Final = self._parts.estop
+        """Its e-stops."""
+        self.borrowed: Final = self._parts.remote_locks
         """What is locked in other systems behind its grants."""
         self.withdrawn: Final = self._parts.withdrawn
         """What was taken off from elsewhere and can be offered again."""
@@ -82,6 +105,82 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
         """Its end, if others want it."""
         self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estop))
         fork_guard.live.add(self)
+
+    def _build_features(self, parts: Components) -> None:
+        access, registry = self.access, parts.registry
+        lookup = Lookup(self, registry, parts.dialer, access, self.settings.system, self._check_open)
+        notifying = Notifying(lookup, parts.notifier, registry)
+        self._lookup = lookup
+        self._registering = Registering(lookup, parts.providers, parts.withdrawn, parts.deadman)
+        self._migrating = Migrating(lookup, registry)
+        self._notifying = notifying
+        self._hooking = Hooking(lookup, notifying, access)
+        self._streaming = Streaming(lookup, parts.subscriptions, parts.scheduler)
+        self._tracing = Tracing(lookup)
+        self.federating = Federating(self.address, registry, parts.providers, parts.locks, parts.event_loop)
+        """What another system sees of it."""
+
+    # --- offering
+
+    register = delegated("_registering", Registering.register)
+    register_functions = delegated("_registering", Registering.register_functions)
+    deregister = delegated("_registering", Registering.deregister)
+    set_groups = delegated("_registering", Registering.set_groups)
+    add_group = delegated("_registering", Registering.add_group)
+    remove_group = delegated("_registering", Registering.remove_group)
+    set_health = delegated("_registering", Registering.set_health)
+    alter = delegated("_registering", Registering.alter)
+    migrate = delegated("_migrating", Migrating.migrate)
+    save_state = delegated("_migrating", Migrating.save_state)
+    restore_state = delegated("_migrating", Migrating.restore_state)
+
+    # --- finding and calling
+
+    services = delegated("_lookup", Lookup.services)
+    find = delegated("_lookup", Lookup.find)
+    await_services = delegated("_lookup", Lookup.await_services)
+    reachability = delegated("_lookup", Lookup.reachability)
+    call = delegated("_lookup", Lookup.call)
+    call_all = delegated("_lookup", Lookup.call_all)
+    call_sequence = delegated("_lookup", Lookup.call_sequence)
+    acall = delegated("_lookup", Lookup.acall)
+    acall_all = delegated("_lookup", Lookup.acall_all)
+    acall_sequence = delegated("_lookup", Lookup.acall_sequence)
+
+    # --- locks and stops
+
+    lock = delegated("locking", LockApi.lock)
+    locks = delegated("locking", LockApi.locks)
+    request_release = delegated("locking", LockApi.request_release)
+    break_lock = delegated("locking", LockApi.break_lock)
+    resume = delegated("locking", LockApi.resume)
+    stop = delegated("_parts", Components.stop)
+    estop = delegated("estopping", EstopController.estop)
+    estops = delegated("estopping", EstopController.estops)
+    estop_clear = delegated("estopping", EstopController.estop_clear)
+
+    # --- notifications, hooks, streams, traces
+
+    joined = delegated("_notifying", Notifying.joined)
+    left = delegated("_notifying", Notifying.left)
+    changed = delegated("_notifying", Notifying.changed)
+    once = delegated("_notifying", Notifying.once)
+    after = delegated("_notifying", Notifying.after)
+    at = delegated("_notifying", Notifying.at)
+    every = delegated("_notifying", Notifying.every)
+    notifications = delegated("_notifying", Notifying.notifications)
+    cancel_notification = delegated("_notifying", Notifying.cancel_notification)
+    before_service = delegated("_hooking", Hooking.before_service)
+    after_service = delegated("_hooking", Hooking.after_service)
+    hooks = delegated("_hooking", Hooking.hooks)
+    detach_hook = delegated("_hooking", Hooking.detach_hook)
+    stream = delegated("_streaming", Streaming.stream)
+    set_tracing = delegated("_tracing", Tracing.set_tracing)
+    spans = delegated("_tracing", Tracing.spans)
+    trace = delegated("_tracing", Tracing.trace)
+    logs = delegated("_tracing", Tracing.logs)
+
+    # --- its own set-up
 
     def load_policy(self, path: Path | str) -> None:
         """Go by another access policy, or by the same file as it is now; calls under way go on.
@@ -265,6 +364,16 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None
         return Session(self.address, name, presence, self._parts.session_ended)
+
+    @property
+    def registry(self) -> Registry:
+        """What is offered in its system."""
+        return self._parts.registry
+
+    @property
+    def session_end_listeners(self) -> list[Callable[[str], None]]:
+        """Called with every session that ends; none of them keeps anybody waiting."""
+        return self._parts.session_end_listeners
 
     @property
     def name(self) -> str:

@@ -1,24 +1,22 @@
-"""The part of a container that stands at a border: what another system's share of it sees and does here."""
+"""What another system sees of a container, and what the container offers of it."""
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from msgspec import structs
 
 from trade._calls.handle import Handle
-from trade._container.base import Member
 from trade._container.proxy import Speaking, passed_on_service
-from trade._context.sessions import Session
-from trade._estop.controller import EstopController
-from trade._locks.api import LockApi
-from trade._locks.remote_locks import RemoteLocks, SharedResource
+from trade._locks.remote_locks import SharedResource
 from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
+from trade._protocol.keys import DOMAIN, Address, ServiceKey
 from trade._protocol.messages import ProviderInfo, ServiceInfo
 from trade._registry.registry import Registry
+from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
+from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
+from trade._services.providers import Providers
 from trade.errors import ConfigurationError, SessionEnded
 
 _PATIENCE_S = 1.0
@@ -48,47 +46,34 @@ class MemberSystem(NamedTuple):
     """The resource of a name here that has another one there."""
 
 
-class Federating(Member):
-    """Offers what is at home elsewhere, and shows what is at home here."""
+class Federating:
+    """Offers what is at home elsewhere, and shows what is at home here; ``container.federating``."""
 
-    locking: LockApi
-    borrowed: RemoteLocks
+    def __init__(
+        self, address: Address, registry: Registry, providers: Providers, locks: LockTable, event_loop: AsyncLoop
+    ) -> None:
+        self._address = address
+        self._registry = registry
+        self._providers = providers
+        self._locks = locks
+        self._event_loop = event_loop
 
     # --- showing
-
-    @abstractmethod
-    def open_session(self, client: str, *, system: str = "") -> Session:
-        """A presence for one client, here or of another system."""
 
     def offers(self) -> dict[Exposed, ProviderInfo]:
         """Every provider of the system that may offer what it does, the middleware's own left out."""
         return {
             Exposed(state.address, entry.domain, name): entry.info
-            for state in self._parts.registry.containers()
+            for state in self._registry.containers()
             for name, entry in list(state.providers.items())
             if entry.records and entry.domain != DOMAIN
         }
 
-    @property
-    def registry(self) -> Registry:
-        """What is offered in its system."""
-        return self._parts.registry
-
-    @property
-    def session_end_listeners(self) -> list[Callable[[str], None]]:
-        """Called with every session that ends; none of them keeps anybody waiting."""
-        return self._parts.session_end_listeners
-
-    @property
-    def estopping(self) -> EstopController:
-        """Its e-stops."""
-        return self._parts.estop
-
     def require_present(self, session: str) -> None:
         """Raises SessionEnded: its container is not there, or it has ended."""
         address = Address(*session.split("/")[:3])
-        there = self._parts.registry.wait_for(lambda: self._parts.registry.is_alive(address), _PATIENCE_S)
-        if (ended := self._parts.locks.gone((session,))) is not None:
+        there = self._registry.wait_for(lambda: self._registry.is_alive(address), _PATIENCE_S)
+        if (ended := self._locks.gone((session,))) is not None:
             raise ended
         if not there:
             raise SessionEnded(session=session, reason="nobody of that name is here")
@@ -114,10 +99,10 @@ class Federating(Member):
                 return {one.name: self._passed_on(place, one, info, home, adopted) for one in info.services}
             except ValueError as twice:
                 for one in adopted:
-                    self._parts.locks.drop(one)
+                    self._locks.drop(one)
                 raise ConfigurationError(where=place, problem=str(twice)) from None
 
-        return Exposed(self.address, *self._parts.providers.pass_on(provider, info, make))
+        return Exposed(self._address, *self._providers.pass_on(provider, info, make))
 
     def _passed_on(
         self, place: str, service: ServiceInfo, info: ProviderInfo, home: MemberSystem, adopted: list[Resource]
@@ -125,21 +110,17 @@ class Federating(Member):
         label = f"{info.groups[0] if info.groups else info.kind}.{service.name}"
         handle, first = home.handle(home.place.service(service.name)), len(adopted)
         for here, there in _lockable(place, service, home.place).items():
-            adopted.append(self._parts.locks.adopt(home.adopt(here, there)))
+            adopted.append(self._locks.adopt(home.adopt(here, there)))
         resources = tuple(adopted[first:])
-        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._parts.event_loop)
+        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._event_loop)
 
     def tell_anew(self, provider: object, info: ProviderInfo) -> None:
         """Tell something else about what is passed on; its services are the same."""
-        self._parts.providers.alter(provider, lambda known: structs.replace(info, revision=known.revision))
+        self._providers.alter(provider, lambda known: structs.replace(info, revision=known.revision))
 
     def withdraw(self, provider: object) -> None:
         """Pass it on no more. Raises ConfigurationError: it was withdrawn already."""
-        self._parts.providers.remove(provider)
-
-    def function(self, address: Address, name: str) -> Handle:
-        """A function of the middleware of one container."""
-        return self.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
+        self._providers.remove(provider)
 
 
 def _lockable(place: str, service: ServiceInfo, home: Exposed) -> dict[str, str]:

@@ -1,16 +1,19 @@
-"""The part of a container that attaches hooks: call this before that service, or after it, wherever that runs."""
+"""Attaching hooks: call this before that service, or after it, wherever that runs."""
 
 import contextlib
+import itertools
 import logging
 from typing import Final
 
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
+from trade._container.lookup import Lookup
 from trade._container.notifying import Notifying
 from trade._hooks.hook import HookInfo, Side
 from trade._notifications.notification import Notification
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, where
+from trade._security.authorizer import Authorizer
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 
 _logger = logging.getLogger("trade")
@@ -34,17 +37,19 @@ class Hook:
         """Attach it where services are now, and where containers come later. Raises what the first of them does."""
         if isinstance(self.target, Handle):
             self._attach(
-                self._home.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
+                self._home.lookup.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
             ).result()
             return
         everywhere = where(name="attach_hook", group=DOMAIN)
-        runs = [self._attach(handle) for handle in self._home.services(everywhere)]
+        runs = [self._attach(handle) for handle in self._home.lookup.services(everywhere)]
         errors = [error for error in (run.exception() for run in runs) if error is not None]
         refusal = next((error for error in errors if isinstance(error, AccessDenied | ConfigurationError)), None)
         if refusal is not None:
             self.detach()
             raise refusal
-        self._later = self._home.joined(everywhere, self._join, existing=True)  # to be told twice does no harm
+        self._later = self._home.notifying.joined(
+            everywhere, self._join, existing=True
+        )  # to be told twice does no harm
 
     def _attach(self, handle: Handle) -> Run:
         if isinstance(self.target, Handle):
@@ -57,7 +62,7 @@ class Hook:
         try:
             self._attach(handle).result()
             if not self._attached:  # meanwhile, and perhaps before this got there
-                self._home.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
+                self._home.lookup.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
         except (ContainerLost, ServiceGone):  # it has left already
             _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
         except TradeError as error:
@@ -80,8 +85,14 @@ class Hook:
         return f"<Hook {self.call.label} {self.side} {self.target}{'' if self._attached else ', detached'}>"
 
 
-class Hooking(Notifying):
+class Hooking:
     """Hooks of this container on services anywhere."""
+
+    def __init__(self, lookup: Lookup, notifying: Notifying, access: Authorizer) -> None:
+        self.lookup: Final = lookup
+        self.notifying: Final = notifying
+        self._access = access
+        self._numbers = itertools.count(1)
 
     def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
         """Have a service called before each call of another one, with what that is called with.
@@ -107,7 +118,6 @@ class Hooking(Notifying):
         return self._hook("after", target, call)
 
     def _hook(self, side: Side, target: Handle | Constraint, call: Handle) -> Hook:
-        self._check_open()
         named = f"trade.{side}_service"
         if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise ConfigurationError(where=named, problem=f"target must be a handle or where(...), not {target!r}")
@@ -115,24 +125,23 @@ class Hooking(Notifying):
             rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
             raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")
         self._require_instrument(target)
-        hook = Hook(self, f"{self.address.epoch}.h{next(self._parts.hook_numbers)}", side, target, call)
+        hook = Hook(self, f"{self.lookup.home.address.epoch}.h{next(self._numbers)}", side, target, call)
         hook.begin()
         return hook
 
     def _require_instrument(self, target: Handle | Constraint) -> None:
         """Raises AccessDenied: by the policy as it is here, all of these would refuse it."""
-        known = [target] if isinstance(target, Handle) else self.services(target)
+        known = [target] if isinstance(target, Handle) else self.lookup.services(target)
         mine = [one for one in known if one.key.domain != DOMAIN]
-        who = self.address.identity
-        denials = [self.access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
+        who = self.lookup.home.address.identity
+        denials = [self._access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
         denied = next((one for one in denials if one is not None), None)
         if denied is not None and all(denials):
             raise denied
 
     def hooks(self) -> list[HookInfo]:
         """Every hook in the system, once for each container it is attached in."""
-        self._check_open()
-        found = [info for infos in self._ask_all("hooks") for info in infos]
+        found = [info for infos in self.lookup.ask_all("hooks") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def detach_hook(self, hook: str) -> None:
@@ -142,6 +151,5 @@ class Hooking(Notifying):
             NoSuchHook: none has that id.
             AccessDenied: it is another's, and the policy does not let this container administer the system.
         """
-        self._check_open()
-        if not any(self._ask_all("detach_hook", hook)):
+        if not any(self.lookup.ask_all("detach_hook", hook)):
             raise NoSuchHook(id=hook)

@@ -1,23 +1,40 @@
-"""The part of a container that looks services up, is told of them, and calls them by what they are."""
+"""Looking services up, and calling them by what they are."""
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from trade._calls import batch
-from trade._calls.handle import Bound, Handle
-from trade._container.base import Member
+from trade._calls.handle import Bound, CallHost, Handle
 from trade._container.reachability import Reachability, look_around
 from trade._context.call_context import patience_s
-from trade._protocol.keys import DOMAIN
+from trade._discovery.dialer import Dialer
+from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint, where
-from trade._registry.registry import Record
+from trade._registry.registry import Record, Registry
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services
+from trade._security.authorizer import Authorizer
 from trade.errors import AccessDenied
 
 
-class Lookup(Member):
+class Lookup:
     """Finds services here and elsewhere."""
+
+    def __init__(
+        self,
+        home: CallHost,
+        registry: Registry,
+        dialer: Dialer | None,
+        access: Authorizer,
+        system: str,
+        check_open: Callable[[], None],
+    ) -> None:
+        self.home: Final = home
+        self._registry = registry
+        self._dialer = dialer
+        self._access = access
+        self._system = system
+        self._check_open = check_open
 
     # --- looking up
 
@@ -25,7 +42,7 @@ class Lookup(Member):
         """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
         self._check_open()
         wanted = where() if constraint is None else constraint
-        return [Handle(self, record.key, record) for record in self._parts.registry.select(wanted)]
+        return [Handle(self.home, record.key, record) for record in self._registry.select(wanted)]
 
     def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
         """The only service that matches; waits for it to appear.
@@ -38,13 +55,13 @@ class Lookup(Member):
         matches: list[Record] = []
 
         def found() -> bool:
-            matches[:] = self._parts.registry.select(constraint)
+            matches[:] = self._registry.select(constraint)
             return bool(matches)
 
         self.await_services(constraint, found, wait_s)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
-        return Handle(self, matches[0].key, matches[0])
+        return Handle(self.home, matches[0].key, matches[0])
 
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
         """Wait until something holds of what the constraint is to match.
@@ -58,15 +75,15 @@ class Lookup(Member):
             NoSuchService: it does not hold within ``wait_s`` seconds.
         """
         wait_s = patience_s(wait_s)
-        if self._parts.registry.wait_for(ready, wait_s):
+        if self._registry.wait_for(ready, wait_s):
             return
-        apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
-        hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
-        raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
+        apart = self._unanswered(wait_s) if len(self._registry.containers()) == 1 else ()
+        hidden = self._access.hidden(self.home.address.identity, asked_for(constraint, "group"))
+        raise no_such_service(constraint, self._registry.select(where()), wait_s, apart, hidden)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
-        reach = self._parts.dialer
+        reach = self._dialer
         if wait_s > 0 or reach is None:
             return self.reachability(limit_s=0).unanswered
         return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
@@ -81,7 +98,11 @@ class Lookup(Member):
                 an endpoint takes up to 3 s more for each.
         """
         self._check_open()
-        return look_around(self._parts.registry, self._parts.dialer, self.address, self.settings.system, limit_s)
+        return look_around(self._registry, self._dialer, self.home.address, self._system, limit_s)
+
+    def handle(self, key: ServiceKey) -> Handle:
+        """A handle of a service whose key is known."""
+        return Handle(self.home, key, self._registry.get(key))
 
     # --- calling
 
@@ -131,7 +152,7 @@ class Lookup(Member):
         """`call_sequence` from asyncio."""
         return await batch.sequence_async(self._bound(calls, (), {}), go_on=go_on)
 
-    def _ask_all(self, name: str, *args: Any) -> list[Any]:
+    def ask_all(self, name: str, *args: Any) -> list[Any]:
         """What a function of the middleware's own says in each container; those that leave meanwhile say nothing.
 
         Raises:

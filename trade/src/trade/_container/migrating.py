@@ -1,4 +1,4 @@
-"""The part of a container that moves providers, and takes and gives their state."""
+"""Moving providers, and taking and giving their state."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -7,6 +7,7 @@ from trade._calls.handle import Handle
 from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint
+from trade._registry.registry import Registry
 from trade.errors import NoSuchService, TooManyServices
 
 _LONGEST_S: Final = 45.0
@@ -14,8 +15,12 @@ _HEARD_S: Final = 1.0
 """How long to wait until its new place is known here."""
 
 
-class Migrating(Lookup):
+class Migrating:
     """Asks the containers that providers are in."""
+
+    def __init__(self, lookup: Lookup, registry: Registry) -> None:
+        self._lookup = lookup
+        self._registry = registry
 
     def migrate(
         self, which: Handle | Constraint, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
@@ -48,7 +53,7 @@ class Migrating(Lookup):
                 others it is offered as before.
         """
         moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
-        self._parts.registry.wait_for(lambda: all(self.has(one.key) for one in moved), _HEARD_S)
+        self._registry.wait_for(lambda: all(self._registry.get(one.key) is not None for one in moved), _HEARD_S)
         return moved
 
     def save_state(self, which: Handle | Constraint) -> Any:
@@ -70,13 +75,12 @@ class Migrating(Lookup):
         self._of(which, "restore_state", state)
 
     def _of(self, which: Handle | Constraint, name: str, *args: Any) -> Any:
-        self._check_open()
         service = which if isinstance(which, Handle) else self._one(which)
         key = ServiceKey(service.key.address, DOMAIN, PROVIDER, name)
-        return self.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
+        return self._lookup.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
 
     def _one(self, which: Constraint) -> Handle:
-        found = {(one.key.address, one.key.domain, one.key.provider): one for one in self.services(which)}
+        found = {(one.key.address, one.key.domain, one.key.provider): one for one in self._lookup.services(which)}
         if not found:
             raise NoSuchService(constraint=str(which))
         if len(found) > 1:

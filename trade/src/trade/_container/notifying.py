@@ -1,4 +1,4 @@
-"""The part of a container that asks to be told: on this occasion, if this holds, make that call."""
+"""Asking for notifications: on this occasion, if this holds, make that call."""
 
 import time
 from datetime import datetime
@@ -7,17 +7,24 @@ from typing import Final
 from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
 from trade._notifications.notification import Notification, NotificationInfo, Owner
+from trade._notifications.notifier import Notifier
 from trade._notifications.services import Hosted, placed
 from trade._notifications.triggers import OF_SERVICES, TriggerSpec, What, deed_of, epoch_s, target_of
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
+from trade._registry.registry import Registry
 from trade.errors import NoSuchNotification
 
 POLL_S: Final = 1.0
 
 
-class Notifying(Lookup):
+class Notifying:
     """Standing requests of this container, and those that others keep for it."""
+
+    def __init__(self, lookup: Lookup, notifier: Notifier, registry: Registry) -> None:
+        self._lookup = lookup
+        self._notifier = notifier
+        self._registry = registry
 
     # --- of services
 
@@ -149,8 +156,7 @@ class Notifying(Lookup):
 
     def notifications(self) -> list[NotificationInfo]:
         """Every notification that stands anywhere in the system."""
-        self._check_open()
-        found = [info for infos in self._ask_all("notifications") for info in infos]
+        found = [info for infos in self._lookup.ask_all("notifications") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def cancel_notification(self, notification: str) -> None:
@@ -160,24 +166,21 @@ class Notifying(Lookup):
             NoSuchNotification: none has that id, or it has ended.
             AccessDenied: it is another's, and the policy does not let this container administer the system.
         """
-        self._check_open()
-        if not any(self._ask_all("cancel_notification", notification)):
+        if not any(self._lookup.ask_all("cancel_notification", notification)):
             raise NoSuchNotification(id=notification)
 
     def _notify(self, terms: TriggerSpec, call: What, if_: What | None, when: What | None, host: str) -> Notification:
-        self._check_open()
         terms.check()
         named = f"trade.{terms.occasion}"
         target = target_of(call, named, "call", 1 if terms.occasion in OF_SERVICES else 0)
         conditions = [None if what is None else target_of(what, named, "a condition", 0) for what in (if_, when)]
-        if not host or host == self.address.container:
+        own = self._lookup.home.address
+        if not host or host == own.container:
             client = speaking.get()
-            mine = client if client is not None and client.owner == self.address else None
-            owner = Owner(self.session if mine is None else mine.name, acts_as=mine)
-            return placed(
-                self._parts.notifier, self._parts.registry, terms, target, conditions[0], conditions[1], owner
-            )
-        notify = self.find(where(name="notify", group=DOMAIN, container=host))
+            mine = client if client is not None and client.owner == own else None
+            owner = Owner(str(own) if mine is None else mine.name, acts_as=mine)
+            return placed(self._notifier, self._registry, terms, target, conditions[0], conditions[1], owner)
+        notify = self._lookup.find(where(name="notify", group=DOMAIN, container=host))
         deeds = [None if one is None else deed_of(one, host, named) for one in conditions]
         name = notify(terms, deed_of(target, host, named), *deeds)
-        return Hosted(name, terms, notify.key.address, self.handle)
+        return Hosted(name, terms, notify.key.address, self._lookup.handle)

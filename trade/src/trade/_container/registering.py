@@ -1,4 +1,4 @@
-"""The part of a container that hosts: registering objects, altering and withdrawing them."""
+"""Registering objects, altering and withdrawing them."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -7,18 +7,27 @@ from msgspec import structs
 
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed
-from trade._container.base import Member
+from trade._container.lookup import Lookup
+from trade._estop.deadman import Deadman
 from trade._protocol.keys import DOMAIN
 from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
 from trade._registry.constraints import checked_meta
+from trade._services.providers import Providers
 from trade._services.registration import checked_groups, checked_health
+from trade._services.withdrawn import Withdrawn
 from trade._transport.base import ChannelClosed
 
 _logger = logging.getLogger("trade")
 
 
-class Registering(Member):
+class Registering:
     """Offers objects to the whole system."""
+
+    def __init__(self, lookup: Lookup, providers: Providers, withdrawn: Withdrawn, deadman: Deadman) -> None:
+        self._lookup = lookup
+        self._providers = providers
+        self._withdrawn = withdrawn
+        self._deadman = deadman
 
     def register(
         self,
@@ -44,13 +53,12 @@ class Registering(Member):
                 already.
             AccessDenied: the policy does not let this container offer it in one of these groups.
         """
-        self._check_open()
         try:
-            keys = self._parts.providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
+            keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self.address) from None
-        self._parts.withdrawn.forget(provider)
-        return tuple(self.handle(key) for key in keys)
+            raise container_closed(self._lookup.home.address) from None
+        self._withdrawn.forget(provider)
+        return tuple(self._lookup.handle(key) for key in keys)
 
     def register_functions(self, functions: object, name: str) -> tuple[Handle, ...]:
         """Offer further functions of the middleware in group ``trade``; what they need is in the table of access.
@@ -59,8 +67,7 @@ class Registering(Member):
             functions: an object with services.
             name: of the provider; one name, one object.
         """
-        self._check_open()
-        return tuple(self.handle(key) for key in self._parts.providers.add(functions, (DOMAIN,), name=name))
+        return tuple(self._lookup.handle(key) for key in self._providers.add(functions, (DOMAIN,), name=name))
 
     def deregister(self, provider: object) -> None:
         """Withdraw an object's services from the whole system; handles of them fail from now on.
@@ -70,12 +77,10 @@ class Registering(Member):
         Raises:
             ConfigurationError: it is not registered here.
         """
-        self._check_open()
-        parts = self._parts
-        if not parts.withdrawn.forget(provider):
-            for problem in parts.deadman.rest(parts.providers.alone_with(provider), "its services are withdrawn"):
+        if not self._withdrawn.forget(provider):
+            for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
                 _logger.error("withdrawn without having been stopped: %s", problem)
-            parts.providers.remove(provider)
+            self._providers.remove(provider)
 
     def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
         """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
@@ -122,8 +127,7 @@ class Registering(Member):
         self._alter(provider, lambda info: info if new is None else structs.replace(info, meta=new), reread=True)
 
     def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
-        self._check_open()
         try:
-            self._parts.providers.alter(provider, change, reread=reread)
+            self._providers.alter(provider, change, reread=reread)
         except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self.address) from None
+            raise container_closed(self._lookup.home.address) from None

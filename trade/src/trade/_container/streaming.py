@@ -1,4 +1,4 @@
-"""The part of a container that listens: services sampled for it, for as long as it does."""
+"""Listening: services are sampled for a container as long as it does."""
 
 import contextlib
 import logging
@@ -7,12 +7,13 @@ import time
 from typing import Final
 
 from trade._calls.handle import Handle
-from trade._container.hooking import Hooking
+from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
 from trade._notifications.triggers import Action, Target, What, target_of
 from trade._registry.constraints import Constraint
 from trade._streams.source import LEAST_HZ, MOST_HZ, check_sampled
 from trade._streams.stream import If, Stream
+from trade._streams.subscriptions import Subscriptions
 from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError, ServiceGone, SourceLost
 
@@ -22,8 +23,13 @@ _MOST_KEPT = 100_000
 _AGAIN: Final = "; trade.joined(where(...), call=listen, existing=True) has another one opened whenever it comes again"
 
 
-class Streaming(Hooking):
+class Streaming:
     """Streams that this container has opened."""
+
+    def __init__(self, lookup: Lookup, subscriptions: Subscriptions, scheduler: Scheduler) -> None:
+        self._lookup = lookup
+        self._subscriptions = subscriptions
+        self._scheduler = scheduler
 
     def stream(
         self,
@@ -56,7 +62,6 @@ class Streaming(Hooking):
             ConfigurationError: it cannot be sampled; no such rate; nothing that can be called.
             ServiceGone: it was deregistered.
         """
-        self._check_open()
         _check("hz", hz, LEAST_HZ, MOST_HZ)
         _check("keep", keep, 1, _MOST_KEPT)
         if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -66,23 +71,21 @@ class Streaming(Hooking):
             problem = f"if_ must be a function of the value, not {if_!r}"
             raise ConfigurationError(where="trade.stream", problem=problem)
         pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
-        source = target if isinstance(target, Handle) else self.find(target)
+        source = target if isinstance(target, Handle) else self._lookup.find(target)
         check_sampled(source)
         client = speaking.get()
-        opened_by = client if client is not None and client.owner == self.address else None
-        stream = self._parts.subscriptions.open(
-            source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by
-        )
+        opened_by = client if client is not None and client.owner == self._lookup.home.address else None
+        stream = self._subscriptions.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
         if pushed is not None:
-            _Push(self, stream, pushed, self._parts.scheduler)
+            _Push(self._lookup, stream, pushed, self._scheduler)
         return stream
 
 
 class _Push:
     """Calls something with each value of a stream, one at a time."""
 
-    def __init__(self, home: Streaming, stream: Stream, target: Target, scheduler: Scheduler) -> None:
-        self._home = home
+    def __init__(self, lookup: Lookup, stream: Stream, target: Target, scheduler: Scheduler) -> None:
+        self._lookup = lookup
         self._stream = stream
         self._target = target
         self._problem = ""
@@ -114,7 +117,7 @@ class _Push:
             handle = target.handle
             if handle is None:
                 assert target.constraint is not None  # noqa: S101
-                handle = self._home.find(target.constraint, wait_s=0)
+                handle = self._lookup.find(target.constraint, wait_s=0)
             handle(value, *target.args, **target.kwargs)
 
     def _failed(self, error: BaseException) -> None:

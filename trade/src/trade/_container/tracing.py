@@ -1,15 +1,16 @@
-"""The part of a container that looks at calls and log lines of the whole system."""
+"""Looking at calls and log lines of the whole system."""
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Final, Protocol
 
 from msgspec import Struct
 
 from trade._calls.batch import Outcome
+from trade._calls.handle import Bound, Handle
 from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, ServiceKey
-from trade._registry.constraints import where
+from trade._registry.constraints import Constraint, where
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
 from trade.errors import AccessDenied, NoSuchCall
@@ -46,11 +47,18 @@ class Trace(Struct, frozen=True, kw_only=True):
         return next((span.began for span in self.spans), None) or min((call.began for call in self.calls), default=0.0)
 
 
+class SystemLookup(Protocol):
+    """Finds services of the system and calls them, as a container does."""
+
+    def services(self, constraint: Constraint | None = None) -> list[Handle]: ...
+    def call_all(self, which: Constraint | Iterable[Handle | Bound], /) -> list[Outcome]: ...
+
+
 class LogReader:
     """Reads on where it was: each line of the system once."""
 
-    def __init__(self, home: "Tracing", container: str) -> None:
-        self._home = home
+    def __init__(self, lookup: SystemLookup, container: str) -> None:
+        self._lookup = lookup
         self._where = where(name="log_lines", group=DOMAIN, container=container)
         self._read: dict[ServiceKey, int] = {}
         self._known: dict[str, int] = {}
@@ -62,8 +70,8 @@ class LogReader:
         Raises:
             AccessDenied: the policy does not let this container read group ``trade``.
         """
-        handles = self._home.services(self._where)
-        outcomes = self._home.call_all([handle.bind(self._read.get(handle.key, 0)) for handle in handles])
+        handles = self._lookup.services(self._where)
+        outcomes = self._lookup.call_all([handle.bind(self._read.get(handle.key, 0)) for handle in handles])
         new: dict[tuple[str, int], LogLine] = {}
         for outcome in granted(outcomes):
             lines: list[LogLine] = outcome.result
@@ -77,8 +85,11 @@ class LogReader:
         return sorted(new.values(), key=lambda line: (line.at, line.process, line.number))
 
 
-class Tracing(Lookup):
+class Tracing:
     """Notes of calls and log lines, from everywhere."""
+
+    def __init__(self, lookup: Lookup) -> None:
+        self._lookup = lookup
 
     def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:
         """Have containers note every call they make and serve, or no more; what was noted stays.
@@ -95,7 +106,7 @@ class Tracing(Lookup):
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
         """
-        outcomes = self.call_all(where(name="set_tracing", group=DOMAIN, container=container), on)
+        outcomes = self._lookup.call_all(where(name="set_tracing", group=DOMAIN, container=container), on)
         return sorted(outcome.handle.container for outcome in granted(outcomes))
 
     def spans(self, *, container: str = "*") -> list[Span]:
@@ -132,10 +143,10 @@ class Tracing(Lookup):
         Raises:
             AccessDenied: the policy does not let this container ``read`` group ``trade``.
         """
-        return LogReader(self, container).read()
+        return LogReader(self._lookup, container).read()
 
     def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
-        outcomes = self.call_all(where(name="spans", group=DOMAIN, container=container), calls)
+        outcomes = self._lookup.call_all(where(name="spans", group=DOMAIN, container=container), calls)
         return sorted(itertools.chain.from_iterable(one.result for one in granted(outcomes)), key=_when)
 
 

@@ -104,8 +104,18 @@ class EstopController:
 
     # --- asking
 
-    def estop(self, reason: str, limit_s: float, estop_id: str = "") -> EstopReport:
-        """See `Container.estop`."""
+    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S, estop_id: str = "") -> EstopReport:
+        """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
+
+        It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
+        that all of it is at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
+
+        Args:
+            reason: why, for people.
+            limit_s: how long to try, in seconds; also if nobody is found.
+            estop_id: names it, in letters, digits, ``.``, ``_`` and ``-``; given again, it is the same e-stop. Empty: a
+                new one.
+        """
         check_limit(limit_s)
         if estop_id and not is_chunk(estop_id):
             raise ConfigurationError(where="estop", problem=f"{estop_id!r} is no id; use letters, digits, . _ -")
@@ -162,8 +172,8 @@ class EstopController:
         if report.missing or report.failed:
             _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
 
-    def open(self) -> list[Estop]:
-        """See `Container.estops`."""
+    def estops(self) -> list[Estop]:
+        """The e-stops that are open anywhere in the system, oldest first."""
         told: dict[str, Estop] = {}
         for teller, estops in self._told():
             for estop in as_told(estops, teller):
@@ -172,13 +182,25 @@ class EstopController:
         told.update((estop.id, estop) for estop in self._estops.open())
         return sorted(told.values(), key=lambda estop: (estop.at, estop.id))
 
-    def clear(self, ids: Sequence[str], limit_s: float) -> EstopReport:
-        """See `Container.estop_clear`."""
+    def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
+        """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
+
+        What somebody else's e-stop stopped while it was in use holds until `resume`, too (S08). A container that does
+        not hear this, being away, keeps them open until they are cleared again.
+
+        Args:
+            ids: as `estops` tells them.
+            limit_s: how long to try, in seconds.
+
+        Raises:
+            NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
+            AccessDenied: the policy does not let this container administer the system.
+        """
         check_limit(limit_s)
         if isinstance(ids, str) or not ids:
             problem = "name the e-stops to clear in a list; trade.estops() tells which are open"
             raise ConfigurationError(where="estop_clear", problem=problem)
-        there = [estop.id for estop in self.open()]
+        there = [estop.id for estop in self.estops()]
         if unknown := [name for name in ids if name not in there]:
             raise NoSuchEstop(ids=unknown, open=there)
         self._access.require(self._own.identity, "administer", DOMAIN, f"e-stop {', '.join(ids)}")

@@ -6,7 +6,7 @@ twelfth of that of all other functions of the middleware.
 
 from trade._context.call_context import current_call
 from trade._estop.broadcast import EstopReport
-from trade._estop.controller import LIMIT_S, EstopController
+from trade._estop.controller import EstopController
 from trade._protocol.messages import Estop
 from trade._services.decorator import service
 
@@ -27,14 +27,14 @@ class EstopServices:
         """Stop everything in the whole system, and let nothing move until that is cleared; who did, who is missing."""
         call = current_call()
         asked = f"asked by {call.caller}" if call is not None else ""
-        return self._estopping.estop(f"{reason} ({asked})" if reason else asked, LIMIT_S)
+        return self._estopping.estop(f"{reason} ({asked})" if reason else asked)
 
     @service(effect="read")
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""
-        return self._estopping.open()
+        return self._estopping.estops()
 
     @service
     def estop_clear(self, ids: list[str]) -> EstopReport:
         """Clear e-stops by their ids; nothing moves by itself."""
-        return self._estopping.clear(ids, LIMIT_S)
+        return self._estopping.estop_clear(ids)

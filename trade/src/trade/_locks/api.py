@@ -80,7 +80,33 @@ class LockApi:
         on_lost: OnLost | None = None,
         on_request: OnRequest | None = None,
     ) -> Lock:
-        """See `Container.lock`."""
+        """Services for oneself alone, on all their containers or on none: ``with container.lock(...):``.
+
+        Nothing is taken before the context is entered (or `Lock.acquire` called).
+
+        Args:
+            which: the actuating services that match, as they are when it is taken, or handles. If nothing matches yet,
+                it waits for that, and then for the whole of a robot's group. Of ``A | B`` it takes a part of each, or
+                nothing. What such a constraint selects and the lock does not hold is not commanded under it.
+            purpose: what for, as others are told who would like to have them.
+            wait_s: how long to wait for others, and for what is not there yet, in seconds; 0 tries. Inside a call it
+                ends before that call's deadline.
+            lease_s: how long it outlives its owner, in seconds.
+            priority: who waits with a higher one comes first.
+            delegates: identities that may use it, too.
+            partial: take a robot's group even if members of it are not there, and of ``A | B`` what there is; then
+                `Lock.missing` says what is not.
+            on_lost: called with the error, on a thread of its own, when it is lost.
+            on_request: called with who and why, on a thread of its own, when somebody asks for it.
+
+        Raises:
+            NoSuchService: nothing matches within ``wait_s``.
+            LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
+            IncompleteGroup: the robot file says that more belongs to the group, or nothing of an alternative is there.
+            ConfigurationError: there is nothing to lock in what matches: it only reads.
+            AccessDenied: the policy does not let this container lock one of them.
+            NotStopped: one of them could not be stopped when it had to be.
+        """
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="lock", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
         if not 0.1 <= lease_s <= 60:
@@ -136,7 +162,10 @@ class LockApi:
         return found
 
     def locks(self) -> list[LockInfo]:
-        """See `Container.locks`."""
+        """Every lock in the system: what, whose, what for, since when, who waits.
+
+        Containers that do not answer within 2 s are left out, and named in the log.
+        """
         known = self.known()
         if known.silent:
             who = ", ".join(address.who for address in known.silent)
@@ -160,11 +189,28 @@ class LockApi:
         return LockOverview(sorted(found, key=lambda info: (info.resources, info.container)), silent)
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
-        """See `Container.request_release`."""
+        """Ask the owners of locks on these services to give them back; they hear of who asks, and why.
+
+        Returns:
+            Who was asked.
+        """
         return self._everywhere("request_release", which, reason)
 
-    def resume(self, which: Constraint | Iterable[Handle], wait_s: float = RESUME_WAIT_S) -> list[str]:
-        """See `Container.resume`."""
+    def resume(self, which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
+        """Let services move again after a stop by somebody else.
+
+        Args:
+            which: handles, or a constraint: the actuating services that match.
+            wait_s: how long to wait for what a constraint matches to be there, in seconds.
+
+        Returns:
+            The resources that were stopped.
+
+        Raises:
+            NoSuchService: nothing matches within ``wait_s`` seconds.
+            LockedByOther: it is the owner of their lock who resumes.
+            AccessDenied: without a lock of one's own it is for who administers them, says the policy.
+        """
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="resume", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
         if isinstance(which, Constraint):
@@ -197,7 +243,14 @@ class LockApi:
             self._home.await_services(which, whole, min(wait_s, _SETTLE_S))
 
     def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
-        """See `Container.break_lock`."""
+        """Take the locks on these services away from their owners; what moves under them stops.
+
+        Returns:
+            Those that were broken.
+
+        Raises:
+            AccessDenied: the policy does not let this container administer one of them.
+        """
         handles = selected(which, self._home.services)
         self._require("administer", handles, which)
         wanted = resources_of(handles)

@@ -127,7 +127,7 @@ class StopLineService:
             self._audit.refused(f"trade.{request.ask}", denied, who=identity)
             raise denied
         if request.ask == "open":
-            return StopAnswer(who=own, open=tuple(told(estop) for estop in self._estopping.open()))
+            return StopAnswer(who=own, open=tuple(told(estop) for estop in self._estopping.estops()))
         self._say(sock, StopAnswer(who=own, taken=True))
         if request.ask == "stop":
             self._audit.note("stop", "stop line", about=request.group, who=identity, why=request.reason)

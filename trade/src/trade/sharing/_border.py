@@ -15,7 +15,7 @@ from msgspec import structs
 from trade._calls.handle import Handle
 from trade._calls.handle_codec import handle_codec
 from trade._container.container import Container
-from trade._container.federating import Exposed, Federating, MemberSystem, inside, shown
+from trade._container.federating import Exposed, MemberSystem, inside, shown
 from trade._context.call_context import CallContext, holding, running
 from trade._context.claims import Claim, Selection
 from trade._context.sessions import speaking
@@ -23,7 +23,7 @@ from trade._estop.deadman import NOBODYS
 from trade._locks.api import LEASE_S
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._locks.remote_locks import SharedResource, Wanted
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Behalf, Estop, ProviderInfo
 from trade._registry.registry import Change
 from trade._resources.grants import LockRequest
@@ -94,11 +94,11 @@ class BorderDirection:
     reverse: "BorderDirection"
 
     def __init__(self, home: Container, abroad: Container, groups: Sequence[str]) -> None:
-        self._home: Federating = home
-        self._abroad: Federating = abroad
+        self._home = home
+        self._abroad = abroad
         self._groups = tuple(groups)
         self._names = home.settings.system, abroad.settings.system
-        self._visitors = GuestSessions(abroad, home, self._names[1])
+        self._visitors = GuestSessions(abroad.federating, home, self._names[1])
         self._offered: dict[Exposed, _Offered] = {}
         self._origins: dict[Exposed, Exposed] = {}
         """Places abroad -> at home."""
@@ -147,7 +147,11 @@ class BorderDirection:
 
     def _reconcile(self) -> None:
         """Let what is offered abroad be what is there and in the list."""
-        there = {place: self._told(info) for place, info in self._home.offers().items() if self._is_shared(place, info)}
+        there = {
+            place: self._told(info)
+            for place, info in self._home.federating.offers().items()
+            if self._is_shared(place, info)
+        }
         for place, offered in list(self._offered.items()):
             if place not in there or there[place].services != offered.info.services:
                 self._withdraw(place, offered)
@@ -157,7 +161,7 @@ class BorderDirection:
                 if known is None:
                     self._offer(place, info)
                 elif structs.replace(info, revision=known.info.revision) != known.info:
-                    self._abroad.tell_anew(known.provider, info)
+                    self._abroad.federating.tell_anew(known.provider, info)
                     known.info = info
             except TradeError as refused:
                 self._complain(place, str(refused))
@@ -178,7 +182,7 @@ class BorderDirection:
             place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place)
         )
         offered = _Offered(info)
-        offered.place = self._abroad.pass_on(offered.provider, info, home)
+        offered.place = self._abroad.federating.pass_on(offered.provider, info, home)
         self._origins[offered.place] = place
         self._offered[place] = offered
         self._refused.pop(place, None)
@@ -197,7 +201,7 @@ class BorderDirection:
         """First what it moves abroad's clients' way: nobody there could stop it afterwards."""
         del self._offered[place]
         with contextlib.suppress(ConfigurationError, ChannelClosed):  # somebody did it before, or all of it is gone
-            self._abroad.withdraw(offered.provider)
+            self._abroad.federating.withdraw(offered.provider)
         self._visitors.leave(place)
         self._origins.pop(offered.place, None)
 
@@ -265,12 +269,15 @@ class BorderDirection:
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:
         """Let them move again at home, if a client from abroad may say so; which were stopped."""
         with self._speaking(call, None):
-            return self._home.function(address, "resume")(list(names))
+            return self._function(address, "resume")(list(names))
 
     def request_release(self, call: CallContext, address: Address, names: Sequence[str], reason: str) -> list[str]:
         """Ask who has them at home; who was asked."""
         with self._speaking(call, None):
-            return self._home.function(address, "request_release")(list(names), reason)
+            return self._function(address, "request_release")(list(names), reason)
+
+    def _function(self, address: Address, name: str) -> Handle:
+        return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
 
     # --- e-stops
 

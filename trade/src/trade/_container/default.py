@@ -1,0 +1,65 @@
+"""The default container of the process, and functions that use it."""
+
+import functools
+import inspect
+import threading
+from collections.abc import Callable
+from typing import Concatenate, ParamSpec, TypeVar
+
+from trade._container.container import Container
+from trade._settings import Settings
+from trade.errors import ConfigurationError
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+_lock = threading.RLock()
+_default: Container | None = None
+
+
+def start(settings: Settings | None = None) -> Container:
+    """Start the default container with settings of one's own.
+
+    Raises:
+        errors.ConfigurationError: it runs already; start it before the first other use of ``trade``.
+    """
+    global _default  # noqa: PLW0603 - the one default
+    with _lock:
+        if _default is not None:
+            problem = (
+                "the default container runs already; call trade.start before anything else, or trade.close() first"
+            )
+            raise ConfigurationError(problem=problem)
+        _default = Container(settings)
+        return _default
+
+
+def container() -> Container:
+    """The default container, started if need be."""
+    running = _default
+    if running is not None:
+        return running
+    with _lock:
+        return _default if _default is not None else start()
+
+
+def close() -> None:
+    """Leave the system: close the default container. The next use starts a new one. Idempotent."""
+    global _default
+    with _lock:
+        running, _default = _default, None
+    if running is not None:
+        running.close()
+
+
+def of_default(method: Callable[Concatenate[Container, _P], _R]) -> Callable[_P, _R]:
+    """A method of `Container` as a function of ``trade``: that of the default container."""
+
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        return method(container(), *args, **kwargs)
+
+    functools.update_wrapper(call, method)
+    own = inspect.signature(method)
+    call.__signature__ = own.replace(parameters=list(own.parameters.values())[1:])
+    call.__module__, call.__qualname__ = "trade", method.__name__
+    return call
