@@ -28,7 +28,7 @@ def info(revision: int = 1, *names: str, group: str = "rosie") -> ProviderInfo:
 class Told:
     def __init__(self, registry: Registry) -> None:
         self.changes: list[tuple[list[str], list[str], list[str]]] = []
-        registry.listen(self.hear)
+        registry.changes.subscribe(self.hear)
 
     def hear(self, change: Change) -> None:
         joined, left, replaced = ([record.name for record in records] for records in change[:3])
@@ -307,7 +307,7 @@ def test_what_was_told_adds_up_to_what_is_there(events: list[tuple[str, Address,
         told.update(joined)
         told.difference_update(left)
 
-    registry.listen(hear)
+    registry.changes.subscribe(hear)
     for event, address, provider, revision in events:
         match event:
             case "put":

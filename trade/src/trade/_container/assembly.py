@@ -51,6 +51,7 @@ from trade._telemetry.load import LoadMeter, resident_bytes
 from trade._telemetry.otlp import open_export
 from trade._telemetry.prometheus import open_metrics
 from trade._telemetry.spans import Spans, new_spans
+from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade._transport.base import Transport
 from trade._transport.zenoh import ZenohTransport
@@ -82,8 +83,8 @@ class Components:
         self._access = home.access
         self._address = home.address
         self._session = str(home.address)
-        self.session_end_listeners: Final[list[Callable[[str], None]]] = []
-        """Told of every session that ends."""
+        self.session_end: Final = Event[str]()
+        """A session has ended, with that name."""
         self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
         """What else there is to measure, as whoever drives something tells it."""
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
@@ -145,11 +146,11 @@ class Components:
         self.targets = Targets(
             address, self._session, access, self.registry, self.providers, self.caller, self.codec, self.audit
         )
-        self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
+        self.registry.changes.subscribe(self.targets.changed)  # before anybody is told: who is told may call
 
     def _build_notifications_and_hooks(self) -> None:
-        self.registry.listen(self.notifier.changed)
-        self.session_end_listeners.append(self.notifier.session_ended)
+        self.registry.changes.subscribe(self.notifier.changed)
+        self.session_end.subscribe(self.notifier.session_ended)
         self.hooks = Hooks(
             self._home,
             self.codec,
@@ -158,8 +159,8 @@ class Components:
             lambda: self.registry.select(where.local),
             self._denied_hook,
         )
-        self.registry.listen(self.hooks.changed)
-        self.session_end_listeners.append(self.hooks.session_ended)
+        self.registry.changes.subscribe(self.hooks.changed)
+        self.session_end.subscribe(self.hooks.session_ended)
 
     def _build_telemetry(self, leaving: contextlib.ExitStack) -> None:
         exported = open_export(self._settings, self._address, leaving)
@@ -169,12 +170,12 @@ class Components:
     def _build_streams(self, leaving: contextlib.ExitStack) -> None:
         home = self._home
         self.streams = Streams(home, self.transport, self.providers.service, self.scheduler, self.caller.new_id)
-        self.registry.listen(self.streams.changed)
-        self.session_end_listeners.append(self.streams.session_ended)
+        self.registry.changes.subscribe(self.streams.changed)
+        self.session_end.subscribe(self.streams.session_ended)
         leaving.callback(self.streams.close)
         self.subscriptions = Subscriptions(home, self.transport, self.scheduler, self.codec, self.registry.removed)
-        self.registry.listen(self.subscriptions.changed)
-        self.session_end_listeners.append(self.subscriptions.session_ended)
+        self.registry.changes.subscribe(self.subscriptions.changed)
+        self.session_end.subscribe(self.subscriptions.session_ended)
         leaving.callback(self.subscriptions.close)
 
     def _build_estop(self, leaving: contextlib.ExitStack) -> None:
@@ -217,7 +218,7 @@ class Components:
                 self._address, self._settings, self._access, self.audit, self.estop, self.stop_known
             )
             leaving.callback(self.stop_line.close)
-            self.registry.listen(self._mind_stops)
+            self.registry.changes.subscribe(self._mind_stops)
             if self._settings.bridge:
                 self.stop_line.listen_on_host()
 
@@ -308,8 +309,7 @@ class Components:
         self.locks.session_ended(session, reason)
         self.deadman.session_ended(session)
         self.dispatcher.session_ended(session)
-        for tell in list(self.session_end_listeners):
-            tell(session)
+        self.session_end.emit(session)
 
     def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""

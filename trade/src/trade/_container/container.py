@@ -37,6 +37,7 @@ from trade._registry.registry import Record, Registry
 from trade._security.authorizer import Authorizer, verb_of
 from trade._settings import Settings
 from trade._threads import fork_guard
+from trade._threads.event import Event
 from trade._transport.base import ChannelClosed, Transport
 from trade.errors import ConfigurationError
 
@@ -371,9 +372,9 @@ class Container:
         return self._parts.registry
 
     @property
-    def session_end_listeners(self) -> list[Callable[[str], None]]:
-        """Called with every session that ends; none of them keeps anybody waiting."""
-        return self._parts.session_end_listeners
+    def session_end(self) -> Event[str]:
+        """A session has ended, with that name."""
+        return self._parts.session_end
 
     @property
     def name(self) -> str:

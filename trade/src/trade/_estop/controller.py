@@ -94,7 +94,7 @@ class EstopController:
         """
         self._provider = provider
         self._beside = lines
-        self._registry.listen(self._heard)
+        self._registry.changes.subscribe(self._heard)
         self._line.listen(self._estops.take)
 
     @property

@@ -12,6 +12,7 @@ from trade._registry.constraints import Constraint
 from trade._registry.index import Index
 from trade._registry.revision_tracker import RevisionTracker
 from trade._threads.condition import InterruptibleCondition
+from trade._threads.event import Event
 from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]
@@ -139,19 +140,13 @@ class Registry:
         self._lock = threading.RLock()
         self._changed = InterruptibleCondition()
         self._telling = threading.RLock()
-        self._listeners: list[Callable[[Change], None]] = []
+        self.changes: Final = Event[Change]()
+        """What has joined, left or been replaced."""
         self.appear(own)
         self.speaks(own, PROTOCOL)
 
-    def listen(self, listener: Callable[[Change], None]) -> None:
-        self._listeners.append(listener)
-
-    def ignore(self, listener: Callable[[Change], None]) -> None:
-        """Tell it no more."""
-        self._listeners.remove(listener)
-
     def between_changes(self, action: Callable[[], None]) -> None:
-        """Do something that no change may come between; listeners are told before or after it."""
+        """Do something that no change may come between; subscribers are told before or after it."""
         with self._telling:
             action()
 
@@ -326,8 +321,7 @@ class Registry:
 
     def _tell(self, change: Change) -> None:
         if any(change):
-            for listener in list(self._listeners):
-                listener(change)
+            self.changes.emit(change)
 
     # --- asking
 

@@ -112,12 +112,10 @@ class BorderDirection:
 
     def begin(self) -> None:
         """Offer what is there, and what comes. Returns when what is there is offered."""
-        self._abroad.session_end_listeners.append(self._visitors.ended)
-        self._leaving.callback(self._abroad.session_end_listeners.remove, self._visitors.ended)
+        self._leaving.callback(self._abroad.session_end.subscribe(self._visitors.ended))
         self._leaving.callback(self._visitors.close)
         self._leaving.callback(self._withdraw_all)
-        self._home.registry.listen(self._note)
-        self._leaving.callback(self._home.registry.ignore, self._note)
+        self._leaving.callback(self._home.registry.changes.subscribe(self._note))
         self._reconcile()
         self._thread.start()
         self._leaving.callback(self._end_thread)
