@@ -296,7 +296,7 @@ def test_off_nothing_stands_around_a_service_and_no_file_is_made(
     served: LocalService | None = there._parts.providers.service(handle.key)
     assert served is not None
     handle(0.5)
-    assert served.around is None
+    assert served.interceptors == ()
     assert list(tmp_path.glob("**/*.sqlite")) == []
 
 

@@ -447,15 +447,15 @@ def test_a_call_goes_on_when_the_last_hook_is_detached_as_it_begins(
     class Detached(LocalService):
         """Its hooks are there at the first look at them, and gone at the second."""
 
-        looks: Iterator[Any] = iter([hooked.around])
+        looks: Iterator[Any] = iter([hooked.interceptors])
 
         @property
-        def around(self) -> Any:  # type: ignore[override]
-            return next(self.looks, None)
+        def interceptors(self) -> Any:  # type: ignore[override]
+            return next(self.looks, ())
 
     service = object.__new__(Detached)
     for name in LocalService.__slots__:
-        if name != "around":
+        if name != "interceptors":
             setattr(service, name, getattr(hooked, name))
     context = CallContext(7, hooked.label, "ui", here.session, time.monotonic_ns() + 10**10)
     assert service.call(("tea", 1), {}, context) == ["tea"]

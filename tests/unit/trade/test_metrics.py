@@ -179,7 +179,7 @@ def test_off_nothing_is_counted_and_nothing_stands_around_a_service(here: Contai
     handle = here.find(where(name="reach"), wait_s=20)
     served: LocalService | None = there._parts.providers.service(handle.key)
     assert served is not None
-    assert served.around is None
+    assert served.interceptors == ()
     assert there.metrics_port == 0
 
 

@@ -110,13 +110,13 @@ def test_untraced_nothing_stands_around_a_service_and_nothing_is_noted(
 ) -> None:
     reach = _served(there, here.find(where(name="reach"), wait_s=20))
     here.call(where(name="reach"), 0.1)
-    assert reach.around is None
+    assert reach.interceptors == ()
     assert here._parts.caller.spans is None
     assert here.spans() == []
     here.set_tracing(True)
-    assert reach.around is not None
+    assert reach.interceptors
     here.set_tracing(False)
-    assert reach.around is None
+    assert reach.interceptors == ()
     assert here._parts.caller.spans is None
 
 

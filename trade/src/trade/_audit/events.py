@@ -4,14 +4,14 @@ Off, nothing of it stands in the way of a call. On, a call puts one record into 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from msgspec import Struct
 
 from trade._context.call_context import CallContext
-from trade._context.interceptor import Interceptor, ServedService
+from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.sessions import foreign
 from trade._counters import CallCounters
 from trade._protocol.keys import DOMAIN, Address
@@ -187,7 +187,7 @@ class Audit:
             return
         rule = _rule(domain, service.info.name, service.effect, reads=self._reads)
         if rule is not None:
-            service.around = service.audited = Audited(self._tell, rule, None, self.calls, service.label)
+            service.interceptors = (Audited(self._tell, rule, self.calls, service.label), *service.interceptors)
 
 
 class _Rule(NamedTuple):
@@ -234,83 +234,54 @@ def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
     return _Rule(kind, name not in _TABLE_TELLS, about=True)
 
 
-class Audited:
-    """What is around a service whose calls are told of: what was there without that, and an event at the end."""
+class Audited(Interceptor):
+    """Counts the calls of a service, and tells of each when it has ended."""
 
-    __slots__ = ("_around", "_calls", "_label", "_rule", "_tell", "_timed")
+    __slots__ = ("_calls", "_rule", "_tell", "_timed")
 
-    def __init__(
-        self, tell: Tell | None, rule: _Rule, around: Interceptor | None, calls: CallCounters | None, label: str
-    ) -> None:
+    def __init__(self, tell: Tell | None, rule: _Rule, calls: CallCounters | None, label: str) -> None:
         self._tell = tell
         self._rule = rule
-        self._around = around
         self._calls = calls
-        self._label = label
         self._timed = None if calls is None else calls.of(label)
 
-    def over(self, around: Interceptor | None) -> "Audited":
-        """The same, with something else between it and the service."""
-        return Audited(self._tell, self._rule, around, self._calls, self._label)
-
-    def run(self, service: ServedService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
         """Call the service and tell of that. Its errors pass."""
-        began_ns, outer_id = time.monotonic_ns(), context.outer_id  # when it has ended, it belongs to nobody
+        began_ns, outer_id = time.monotonic_ns(), call.context.outer_id  # when it has ended, it belongs to nobody
         try:
-            if self._around is None:
-                result = service.call(args, kwargs, context, bare=True)
-            else:
-                result = self._around.run(service, args, kwargs, context)
+            result = proceed()
         except BaseException as error:
             if self._timed is not None:
                 self._timed.add(time.monotonic_ns() - began_ns, failed=True)
-            self.failed(service, context, error, began_ns, args, kwargs, outer_id)
+            self._failed(call, error, began_ns, outer_id)
             raise
         if self._timed is not None:
             self._timed.add(time.monotonic_ns() - began_ns, failed=False)
         if self._rule.always:
-            self._say(service, context, self._rule.kind, "ok", "", began_ns, args, kwargs, outer_id)
+            self._say(call, self._rule.kind, "ok", "", began_ns, outer_id)
         return result
 
-    def failed(
-        self,
-        service: ServedService,
-        context: CallContext,
-        error: BaseException,
-        began_ns: int = 0,
-        args: Sequence[Any] = (),
-        kwargs: dict[str, Any] | None = None,
-        outer_id: int = 0,
-    ) -> None:
-        """Tell of a call that ended with an error, or never began."""
+    def rejected(self, call: ServedCall, error: BaseException) -> None:
+        """Tell of a call that never began."""
+        self._failed(call, error, 0, call.context.outer_id)
+
+    def _failed(self, call: ServedCall, error: BaseException, began_ns: int, outer_id: int) -> None:
         refused = isinstance(error, _REFUSALS)
         if refused and self._calls is not None:
             self._calls.refuse(type(error).__name__)
         if refused or self._rule.always:
             kind: Kind = "refused" if refused else self._rule.kind
-            told = isinstance(error, TradeError) and not service.signature.has_secrets
-            why = str(error) if told else ""
-            self._say(service, context, kind, type(error).__name__, why, began_ns, args, kwargs or {}, outer_id)
+            told = isinstance(error, TradeError) and not call.service.signature.has_secrets
+            self._say(call, kind, type(error).__name__, str(error) if told else "", began_ns, outer_id)
 
-    def _say(
-        self,
-        service: ServedService,
-        context: CallContext,
-        kind: Kind,
-        outcome: str,
-        why: str,
-        began_ns: int,
-        args: Sequence[Any],
-        kwargs: dict[str, Any],
-        outer_id: int,
-    ) -> None:
+    def _say(self, call: ServedCall, kind: Kind, outcome: str, why: str, began_ns: int, outer_id: int) -> None:
         if self._tell is None:
             return
         about: Any = ""
-        if self._rule.about and (args or kwargs):
-            about = args[0] if args else next(iter(kwargs.values()))
-        now_ns = time.monotonic_ns()
+        if self._rule.about and (call.args or call.kwargs):
+            about = call.args[0] if call.args else next(iter(call.kwargs.values()))
+        now_ns, context = time.monotonic_ns(), call.context
         who, session = foreign(context.session) or context.caller, context.session
         took_ns = now_ns - began_ns if began_ns else 0
-        at_ns, ids = time.time_ns(), (context.id, outer_id or context.outer_id)
-        self._tell(Event(at_ns, now_ns, kind, service.label, about, who, session, *ids, outcome, why, took_ns))
+        at_ns, ids = time.time_ns(), (context.id, outer_id)
+        self._tell(Event(at_ns, now_ns, kind, call.service.label, about, who, session, *ids, outcome, why, took_ns))

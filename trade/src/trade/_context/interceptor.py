@@ -1,7 +1,12 @@
-"""What is around a service while it is called: audit, spans and hooks are interceptors, one inside the other."""
+"""What is around a service while it is called: a list of interceptors, the outermost first.
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+Audit comes first and sees what the others do; then spans, then hooks. Each calls the next one, and the last of them
+the service.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from trade._context.call_context import CallContext
 from trade._protocol.messages import ServiceInfo
@@ -12,6 +17,8 @@ class ServiceSignature(Protocol):
 
     has_secrets: bool
 
+    def named(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]: ...
+
 
 class ServedService(Protocol):
     """A service of this container, as an interceptor sees it."""
@@ -19,18 +26,31 @@ class ServedService(Protocol):
     label: str
     info: ServiceInfo
     effect: str
-    around: "Interceptor | None"
-    audited: Any
+    interceptors: "tuple[Interceptor, ...]"
 
     @property
     def signature(self) -> ServiceSignature: ...
 
-    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
-        """Call it; ``bare``: without interceptors."""
-        ...
+    def too_late(self, expires_ns: int | None) -> bool: ...
 
 
-class Interceptor(Protocol):
-    """What is called before and after a service."""
+class ServedCall(NamedTuple):
+    """One call of a service of this container."""
 
-    def run(self, service: Any, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any: ...
+    service: ServedService
+    args: Sequence[Any]
+    kwargs: dict[str, Any]
+    context: CallContext
+
+
+class Interceptor(ABC):
+    """What is called in place of a service, with what calls that: ``proceed()``."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
+        """Call what is inside, and do what comes before and after that. Errors of the service pass."""
+
+    def rejected(self, call: ServedCall, error: BaseException) -> None:  # noqa: B027 - most have nothing to do then
+        """A call does not begin: its arguments, which it has not, are wrong."""

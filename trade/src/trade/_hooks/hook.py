@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol
 
@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext, holding, running
+from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, ServiceKey
@@ -156,7 +157,7 @@ class AttachedHook:
             self._tell_suspended(self)
 
 
-class HookInterceptor:
+class HookInterceptor(Interceptor):
     """The hooks of one service here."""
 
     def __init__(
@@ -170,17 +171,18 @@ class HookInterceptor:
         self._before = [hook for hook in hooks if hook.side == "before"]
         self._after = [hook for hook in hooks if hook.side == "after"]
 
-    def run(self, service: LocalService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
         """Call the service with its hooks around it. Its own errors pass."""
         began_ns = time.monotonic_ns()
-        called = self._called(service, args, kwargs, context)
+        service, _, _, context = call
+        called = self._called(call)
         if self._before and service.effect != "stop":
             self._tell(self._before, called, context)
             if service.too_late(context.expires_ns):
                 raise DeadlineExceeded(service=service.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
         result, error = None, ""
         try:
-            result = service.call(args, kwargs, context, bare=True)
+            result = proceed()
         except BaseException as raised:
             error = _error_text(service, raised)
             raise
@@ -204,10 +206,8 @@ class HookInterceptor:
                 if not hook.suspended:
                     hook.tell(self._home, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
 
-    def _called(
-        self, service: LocalService, args: Sequence[Any], kwargs: Mapping[str, Any], context: CallContext
-    ) -> HookEvent:
-        named = service.signature.named(args, kwargs)
+    def _called(self, call: ServedCall) -> HookEvent:
+        context, named = call.context, call.service.signature.named(call.args, call.kwargs)
         return HookEvent(
             service=self._handle,
             args={name: self._plain(value) for name, value in named.items()},
@@ -225,7 +225,7 @@ class HookInterceptor:
             return repr(value)
 
 
-def _error_text(service: LocalService, error: BaseException) -> str:
+def _error_text(service: ServedService, error: BaseException) -> str:
     """Its message may show what is secret."""
     kind = type(error).__name__
     return kind if service.signature.has_secrets else f"{kind}: {error}"
@@ -351,12 +351,14 @@ class Hooks:
             mine = [hook for hook in hooks if _hookable(record) and self._concerns(hook, record)]
             for hook in mine:
                 hook.services[record.key] = record.label
-            around = None
-            if mine:
-                around = HookInterceptor(self._home, self._codec, self._scheduler, self._home.handle(record.key), mine)
-            traced = self._spans if traceable(record.key) else None
-            around = around if traced is None else SpanRecorder(traced, around)
-            service.around = around if service.audited is None else service.audited.over(around)
+            service.interceptors = (*_lasting(service), *self._interceptors(record, mine))
+
+    def _interceptors(self, record: Record, hooks: Sequence[AttachedHook]) -> Iterator[Interceptor]:
+        if self._spans is not None and traceable(record.key):
+            yield SpanRecorder(self._spans)
+        if hooks:
+            handle = self._home.handle(record.key)
+            yield HookInterceptor(self._home, self._codec, self._scheduler, handle, hooks)
 
     def _concerns(self, hook: AttachedHook, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None
@@ -380,6 +382,11 @@ class Hooks:
             )
             for hook in list(self._attached.values())
         ]
+
+
+def _lasting(service: LocalService) -> list[Interceptor]:
+    """What was around it from its beginning: audit."""
+    return [one for one in service.interceptors if not isinstance(one, SpanRecorder | HookInterceptor)]
 
 
 def _hookable(record: Record) -> bool:

@@ -3,14 +3,14 @@
 import asyncio
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import CoroutineType
 from typing import Any, Final
 
 from msgspec import Raw, structs
 
-from trade._audit.events import Audited
 from trade._context.call_context import CallContext, running
-from trade._context.interceptor import Interceptor
+from trade._context.interceptor import Interceptor, ServedCall
 from trade._context.sessions import foreign
 from trade._protocol.messages import ErrorInfo, ServiceInfo
 from trade._protocol.remote_errors import pack_error, unpack_error
@@ -34,10 +34,9 @@ class LocalService:
     __slots__ = (
         "_loop",
         "admitted",
-        "around",
-        "audited",
         "effect",
         "info",
+        "interceptors",
         "label",
         "method",
         "resources",
@@ -66,10 +65,8 @@ class LocalService:
         self.serial = serial
         self.resources = resources
         """What it needs for itself, or stops."""
-        self.around: Interceptor | None = None
-        """What is called before and after it."""
-        self.audited: Audited | None = None
-        """Of that, what tells of each call for the record."""
+        self.interceptors: tuple[Interceptor, ...] = ()
+        """What is called around it, the outermost first."""
         self.admitted: dict[str, Policy] = {}
         """Who may call it, and by which policy that was decided."""
         self._loop = loop
@@ -79,16 +76,23 @@ class LocalService:
         try:
             args, kwargs = self.signature.decode(self.label, raw)
         except TradeError as error:
-            if self.audited is not None:
-                self.audited.failed(self, context, error)
+            for interceptor in self.interceptors:
+                interceptor.rejected(ServedCall(self, (), {}, context), error)
             raise
         return self.call(args, kwargs, context)
 
-    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
-        """Call with the arguments as they are; ``bare``: without what is called before and after it."""
-        around = self.around  # it may end at any time
-        if around is not None and not bare:
-            return around.run(self, args, kwargs, context)
+    def call(
+        self,
+        args: Sequence[Any],
+        kwargs: dict[str, Any],
+        context: CallContext,
+        inside: tuple[Interceptor, ...] | None = None,
+    ) -> Any:
+        """Call with the arguments as they are, through all interceptors, or those ``inside`` the running one."""
+        interceptors = self.interceptors if inside is None else inside  # there may be others at any time
+        if interceptors:
+            proceed = partial(self.call, args, kwargs, context, interceptors[1:])
+            return interceptors[0].run(ServedCall(self, args, kwargs, context), proceed)
         if not self.resources or self.effect != "actuate":
             self._look(context)
             return self.run_admitted(args, kwargs, context)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from msgspec import Struct, structs
 
 from trade._context.call_context import CallContext
-from trade._context.interceptor import Interceptor, ServedService
+from trade._context.interceptor import Interceptor, ServedCall
 from trade._context.outgoing import Request
 from trade._protocol.keys import DOMAIN, Address, ServiceKey
 from trade._protocol.messages import Token
@@ -156,24 +156,22 @@ class Spans:
         return kept if calls is None else [span for span in kept if not frozenset(span.ids).isdisjoint(calls)]
 
 
-class SpanRecorder:
-    """What is around a service while it is traced: what was there without that, and a span."""
+class SpanRecorder(Interceptor):
+    """Notes a span of each call while the service is traced."""
 
-    def __init__(self, spans: Spans, around: Interceptor | None) -> None:
+    def __init__(self, spans: Spans) -> None:
         self._spans = spans
-        self._around = around
 
-    def run(self, service: ServedService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
         """Call the service and note that. Its errors pass."""
+        context = call.context
         structs.force_setattr(context, "events", [])
         calls = ancestors(context)  # it forgets them when it ends
         locks = self._spans.locks(context.tokens) if context.tokens else ()
         began, began_ns = time.time(), time.monotonic_ns()
         failed: BaseException | None = None
         try:
-            if self._around is None:
-                return service.call(args, kwargs, context, bare=True)
-            return self._around.run(service, args, kwargs, context)
+            return proceed()
         except BaseException as error:
             failed = error
             raise
