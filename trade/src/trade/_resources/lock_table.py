@@ -15,7 +15,8 @@ from msgspec import structs
 from trade._audit.events import Audit
 from trade._context.sessions import EndedSessions, foreign, within
 from trade._protocol.messages import Token
-from trade._resources.grants import Grant, Granted, Leases, LockInfo, LockRequest, Waiter, withheld
+from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, Waiter, withheld
+from trade._resources.leases import Leases
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
