@@ -15,11 +15,11 @@ from msgspec import structs
 
 import trade._services.signature as signatures
 from trade import Container, Handle, Settings, service, where
+from trade._calls.arguments import encode_call
 from trade._discovery.host_folder import HostFolder, free_endpoint
 from trade._protocol.keys import TALLY, Address
 from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._registry.registry import Registry
-from trade._services.arguments import encode_call
 from trade._transport.base import Publisher
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument

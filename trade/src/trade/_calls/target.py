@@ -9,6 +9,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw
 
+from trade._calls.arguments import encode_arguments, encode_call, given
 from trade._calls.caller import Caller
 from trade._calls.peer import Peer
 from trade._calls.run import Run
@@ -23,7 +24,6 @@ from trade._protocol.remote_errors import unpack_error
 from trade._protocol.schema import read_schema
 from trade._protocol.schema_types import type_from_schema
 from trade._registry.registry import Record
-from trade._services.arguments import encode_arguments, encode_call, given
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import SerialQueue, Turn
 from trade._telemetry.spans import traceable

@@ -17,7 +17,6 @@ from msgspec.structs import astuple
 from trade._protocol.codec import Codec
 from trade._protocol.messages import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
 from trade._protocol.schema import NOT_FINITE, problem_text, value_at
-from trade._services.arguments import too_many
 from trade._services.decorator import ServiceMark
 from trade._services.description import describe, described, field_of
 from trade._services.secret import MASK, is_secret, mask
@@ -211,6 +210,10 @@ class Signature:
         named = [*zip(self._positional, args, strict=False), *kwargs.items()]
         name = next(name for name, value in named if not _finite(value))
         return InvalidArgument(service=service, argument=name, problem=NOT_FINITE, signature=self.info.signature)
+
+
+def too_many(places: int, given: int) -> str:
+    return f"takes at most {places} positional argument{'' if places == 1 else 's'}, got {given}"
 
 
 def _hints(where: str, function: Callable[..., Any]) -> dict[str, Any]:

@@ -9,9 +9,10 @@ from msgspec import structs
 
 from trade._protocol.codec import Codec
 from trade._protocol.messages import EMPTY, MOST_BYTES, Call, ServiceInfo, encode_message
+from trade._services.signature import too_many
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
 
-__all__ = ["encode_arguments", "encode_call", "given", "too_many"]
+__all__ = ["encode_arguments", "encode_call", "given"]
 
 
 def encode_arguments(
@@ -67,10 +68,6 @@ def _by_name(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Map
         if name in named:
             raise InvalidArgument(service=service, argument=name, problem="given twice", signature=info.signature)
     return {**named, **kwargs}
-
-
-def too_many(places: int, given: int) -> str:
-    return f"takes at most {places} positional argument{'' if places == 1 else 's'}, got {given}"
 
 
 def _unsendable(codec: Codec, info: ServiceInfo, service: str, values: Any, bad: Exception) -> NotSerialisable:
