@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from tests.system.attack import ARM, Attack
 from trade import Container, Resource, service, where
+from trade._protocol.messages import Call
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem, memory_system
 
@@ -211,9 +212,9 @@ def _told_of_sending(actor: Container) -> Iterator[list[str]]:
     caller: Any = actor._parts.caller
     ask, start = caller.ask, caller.start
 
-    def noted(send: Callable[..., Any], *told: Any, **more: Any) -> Any:
-        sent.append(told[2])
-        return send(*told, **more)
+    def noted(send: Callable[..., Any], call: Call, *told: Any) -> Any:
+        sent.append(call.service)
+        return send(call, *told)
 
     caller.ask, caller.start = partial(noted, ask), partial(noted, start)
     yield sent

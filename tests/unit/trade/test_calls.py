@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from trade._calls.caller import Caller
-from trade._calls.peer import Peer
+from trade._calls.peer import Peer, Route
 from trade._protocol.keys import Address
-from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Reply, Status, decode_call, encode_message
+from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_call, encode_message
 from trade._transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 
 OWN = Address("me", "here", "e0")
@@ -87,16 +87,22 @@ def transport() -> PaperTransport:
 
 @pytest.fixture
 def caller(transport: PaperTransport) -> Iterator[Caller]:
-    caller = Caller(transport, OWN, "session")
+    caller = Caller(transport, OWN)
     caller.lost(OTHER, back=True)
     yield caller
     caller.close()
 
 
 def ask(caller: Caller, *, deadline_s: float = 60, to: Address = OTHER) -> Reply:
-    publisher = caller.publishers.get(to, "rosie", "Arm-1", stop=False)
-    deadline_ns = time.monotonic_ns() + int(deadline_s * SECOND_NS)
-    return caller.ask(caller.peer(to), publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, ())
+    return caller.ask(go(caller), route(caller, to), time.monotonic_ns() + int(deadline_s * SECOND_NS))
+
+
+def go(caller: Caller) -> Call:
+    return caller.new_call("go", EMPTY_ARGUMENTS)
+
+
+def route(caller: Caller, to: Address = OTHER) -> Route:
+    return Route(caller.peer(to), caller.publishers.get(to, "rosie", "Arm-1", stop=False))
 
 
 def answered(transport: PaperTransport) -> Callable[[bytes], None]:
@@ -212,13 +218,12 @@ def test_a_call_to_a_lost_container_is_not_sent_until_it_is_back(caller: Caller,
 
 
 def test_a_call_whose_publisher_went_with_its_provider_is_not_sent(caller: Caller, transport: PaperTransport) -> None:
-    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
+    gone = route(caller)
     caller.publishers.forget(OTHER, "rosie", "Arm-1")
     deadline_ns = time.monotonic_ns() + 60 * SECOND_NS
-    peer = caller.peer(OTHER)
-    assert caller.ask(peer, publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, ()).status == Status.UNSENT
+    assert caller.ask(go(caller), gone, deadline_ns).status == Status.UNSENT
     started: list[Reply] = []
-    caller.start(peer, publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, (), started.append)
+    caller.start(go(caller), gone, deadline_ns, started.append)
     assert [reply.status for reply in started] == [Status.UNSENT]
 
 
@@ -229,11 +234,8 @@ def test_closing_ends_blocked_and_started_calls_and_refuses_more(caller: Caller,
     blocked = threading.Thread(target=lambda: ended.append(ask(caller).status))
     blocked.start()
     assert sent.acquire(timeout=20)
-    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
     deadline_ns = time.monotonic_ns() + 60 * SECOND_NS
-    caller.start(
-        caller.peer(OTHER), publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, (), lambda r: ended.append(r.status)
-    )
+    caller.start(go(caller), route(caller), deadline_ns, lambda reply: ended.append(reply.status))
     caller.close()
     blocked.join(20)
     assert ended == [Status.CLOSED] * 2
@@ -245,15 +247,13 @@ def test_a_failing_receiver_of_an_answer_disturbs_no_other(
     caller: Caller, transport: PaperTransport, caplog: pytest.LogCaptureFixture
 ) -> None:
     transport.on_call = answered(transport)
-    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
     deadline_ns, heard = time.monotonic_ns() + 60 * SECOND_NS, threading.Event()
-    peer = caller.peer(OTHER)
 
     def fail(_: Reply) -> None:
         raise ValueError("no")
 
-    caller.start(peer, publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, (), fail)
-    caller.start(peer, publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, (), lambda _: heard.set())
+    caller.start(go(caller), route(caller), deadline_ns, fail)
+    caller.start(go(caller), route(caller), deadline_ns, lambda _: heard.set())
     assert heard.wait(20)
     assert "the receiver of an answer failed" in caplog.text
 

@@ -15,7 +15,7 @@ from msgspec import structs
 
 import trade._services.signature as signatures
 from trade import Container, Handle, Settings, service, where
-from trade._calls.arguments import encode_call
+from trade._calls.arguments import ArgumentEncoder
 from trade._discovery.host_folder import HostFolder, free_endpoint
 from trade._protocol.keys import TALLY, Address
 from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
@@ -277,9 +277,10 @@ def test_large_arguments_are_copied_once_into_their_message() -> None:
     data = bytes(MANY_BYTES)
     info = ServiceInfo(name="keep", signature="keep(data: bytes)")
     codec = signatures.Codec(lambda value: value, lambda code, inside: inside)
+    encoder = ArgumentEncoder(codec, info, "robot.keep")
     call = Call(PROTOCOL, 1, "keep", "c/0", "", None, (), cast(Any, (data,)))
     with traced():
-        assert peak_bytes(lambda: encode_call(codec, info, "robot.keep", call)) < 1.9 * MANY_BYTES
+        assert peak_bytes(lambda: encoder.encode_call(call)) < 1.9 * MANY_BYTES
 
 
 MANY = 200

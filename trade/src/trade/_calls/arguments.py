@@ -3,7 +3,7 @@
 # pyright: reportUnknownVariableType=false
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from msgspec import structs
 
@@ -12,72 +12,69 @@ from trade._protocol.messages import EMPTY, MOST_BYTES, Call, ServiceInfo, encod
 from trade._services.signature import too_many
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
 
-__all__ = ["encode_arguments", "encode_call", "given"]
+_UNSENDABLE: Final = (TypeError, ValueError, OverflowError, RecursionError)
 
 
-def encode_arguments(
-    codec: Codec, info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]
-) -> bytes:
-    """Positional ones as an array, with keywords as a map of all by name.
+class ArgumentEncoder:
+    """Encodes the arguments of one service. Raises InvalidArgument, NotSerialisable, TooLarge."""
 
-    Raises InvalidArgument, NotSerialisable, TooLarge.
-    """
-    values: Any = args if not kwargs else _by_name(info, service, args, kwargs)
-    try:
-        data = codec.encode(values)
-    except (TypeError, ValueError, OverflowError, RecursionError) as bad:
-        raise _unsendable(codec, info, service, values, bad) from None
-    if len(data) > MOST_BYTES:
-        raise _too_large(service, len(data))
-    return data
+    __slots__ = ("_codec", "_info", "_label")
 
+    def __init__(self, codec: Codec, info: ServiceInfo, label: str) -> None:
+        self._codec = codec
+        self._info = info
+        self._label = label
 
-def given(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-    """Arguments as a message has them. Raises InvalidArgument."""
-    return args if not kwargs else _by_name(info, service, args, kwargs)
+    def values(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Arguments as a message has them: positional ones as an array, with keywords a map of all by name."""
+        return args if not kwargs else self._by_name(args, kwargs)
 
-
-def encode_call(codec: Codec, info: ServiceInfo, service: str, call: Call) -> bytes:
-    """A whole message with the arguments as values in it: large ones are copied once, not twice.
-
-    Raises NotSerialisable, TooLarge.
-    """
-    values: Any = call.args
-    try:
-        data = codec.encode(call)
-    except (TypeError, ValueError, OverflowError, RecursionError) as bad:
-        raise _unsendable(codec, info, service, values, bad) from None
-    if len(data) > MOST_BYTES:
-        frame = len(encode_message(structs.replace(call, args=EMPTY))) - len(memoryview(EMPTY))
-        if len(data) - frame > MOST_BYTES:
-            raise _too_large(service, len(data) - frame)
-    return data
-
-
-def _too_large(service: str, size: int) -> TooLarge:
-    return TooLarge(service=service, what="arguments", size_bytes=size, limit_bytes=MOST_BYTES)
-
-
-def _by_name(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    places = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
-    if len(args) > len(places):
-        problem = too_many(len(places), len(args))
-        raise InvalidArgument(service=service, argument="", problem=problem, signature=info.signature)
-    named = dict(zip(places, args, strict=False))
-    for name in kwargs:
-        if name in named:
-            raise InvalidArgument(service=service, argument=name, problem="given twice", signature=info.signature)
-    return {**named, **kwargs}
-
-
-def _unsendable(codec: Codec, info: ServiceInfo, service: str, values: Any, bad: Exception) -> NotSerialisable:
-    names = [parameter.name for parameter in info.parameters]
-    named: Any = (
-        values if isinstance(values, dict) else dict(zip([*names, *map(str, range(len(values)))], values, strict=False))
-    )
-    for name, value in named.items():
+    def encode(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bytes:
+        """Arguments as they are now, as bytes."""
+        values: Any = args if not kwargs else self._by_name(args, kwargs)
         try:
-            codec.encode(value)
-        except (TypeError, ValueError, OverflowError, RecursionError) as own:
-            return NotSerialisable(service=service, what=f"argument {name!r}", problem=str(own))
-    return NotSerialisable(service=service, what="the arguments", problem=str(bad))
+            data = self._codec.encode(values)
+        except _UNSENDABLE as bad:
+            raise self._unsendable(values, bad) from None
+        if len(data) > MOST_BYTES:
+            raise self._too_large(len(data))
+        return data
+
+    def encode_call(self, call: Call) -> bytes:
+        """A whole message with the arguments as values in it: large ones are copied once, not twice."""
+        try:
+            data = self._codec.encode(call)
+        except _UNSENDABLE as bad:
+            raise self._unsendable(call.args, bad) from None
+        if len(data) > MOST_BYTES:
+            frame = len(encode_message(structs.replace(call, args=EMPTY))) - len(memoryview(EMPTY))
+            if len(data) - frame > MOST_BYTES:
+                raise self._too_large(len(data) - frame)
+        return data
+
+    def _too_large(self, size: int) -> TooLarge:
+        return TooLarge(service=self._label, what="arguments", size_bytes=size, limit_bytes=MOST_BYTES)
+
+    def _by_name(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        places = [parameter.name for parameter in self._info.parameters if not parameter.keyword_only]
+        if len(args) > len(places):
+            raise self._invalid("", too_many(len(places), len(args)))
+        named = dict(zip(places, args, strict=False))
+        for name in kwargs:
+            if name in named:
+                raise self._invalid(name, "given twice")
+        return {**named, **kwargs}
+
+    def _invalid(self, argument: str, problem: str) -> InvalidArgument:
+        return InvalidArgument(service=self._label, argument=argument, problem=problem, signature=self._info.signature)
+
+    def _unsendable(self, values: Any, bad: Exception) -> NotSerialisable:
+        names = [parameter.name for parameter in self._info.parameters]
+        places = [*names, *map(str, range(len(values)))]
+        named: Any = values if isinstance(values, dict) else dict(zip(places, values, strict=False))
+        for name, value in named.items():
+            try:
+                self._codec.encode(value)
+            except _UNSENDABLE as own:
+                return NotSerialisable(service=self._label, what=f"argument {name!r}", problem=str(own))
+        return NotSerialisable(service=self._label, what="the arguments", problem=str(bad))

@@ -10,18 +10,17 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from msgspec import Raw, structs
 
-from trade._calls.peer import NEVER, CallPublishers, OnReply, Peer, Pending, ReplySlot
+from trade._calls.peer import NEVER, CallPublishers, OnReply, Peer, Pending, ReplySlot, Route
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, reply_key
 from trade._protocol.messages import (
     CANCEL,
     EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,
-    Behalf,
     Call,
     CancelArguments,
     Malformed,
@@ -37,17 +36,16 @@ from trade._transport.base import ChannelClosed, Message, Publisher, Transport
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0
 
-Encode = Callable[[Call], bytes]
-"""Makes a message of a call whose arguments may still be values; raises what the caller is to know of them."""
-
 
 class Caller:
     """Every outgoing call of one container."""
 
-    def __init__(self, transport: Transport, own: Address, session: str) -> None:
+    def __init__(self, transport: Transport, own: Address) -> None:
         self._transport = transport
-        self._own = own
-        self._session = session
+        self.own: Final = own
+        """The container that calls."""
+        self.session: Final = str(own)
+        """In which it calls, unless it acts for a client."""
         self._ends_on = f"reply/{own.identity}/"
         self.new_id: Callable[[], int] = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._peers: dict[Address, Peer] = {}
@@ -69,11 +67,6 @@ class Caller:
         self._spawn("trade-deadlines", self._watch_deadlines)
 
     @property
-    def own(self) -> Address:
-        """The container that calls."""
-        return self._own
-
-    @property
     def closed(self) -> bool:
         """Whether no more calls are sent."""
         return self._closed
@@ -86,40 +79,31 @@ class Caller:
 
     # --- calling
 
-    def ask(
-        self,
-        peer: Peer,
-        publisher: Publisher,
-        service: str,
-        args: Any,
-        deadline_ns: int,
-        expires_ns: int | None,
-        chain: tuple[str, ...],
-        behalf: Behalf | None = None,
-        encode: Encode = encode_message,
-        session: str = "",
-    ) -> Reply:
-        """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
-        call_id = self.new_id()
+    def new_call(self, service: str, args: Raw) -> Call:
+        """A call that inherits nothing and may be late. What is sent gets its reply channel then."""
+        return Call(PROTOCOL, self.new_id(), service, "", self.session, None, (), args)
+
+    def ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
+        """Send a call and wait for the answer; it always comes, if only from ourselves at the deadline."""
         try:
             box = self._borrow()
         except ChannelClosed:
-            return _ended(call_id, Status.UNSENT)
+            return _ended(call.id, Status.UNSENT)
+        peer, publisher = route.peer, route.publisher
         try:
-            speaker = session or self._session
-            call = Call(PROTOCOL, call_id, service, box.name, speaker, expires_ns, chain, args, behalf)
-            data = encode(call)
+            call.reply = box.name
+            data = route.encode(call)
             box.sent = (publisher, data)
-            box.waiting = (call_id, peer, deadline_ns)
+            box.waiting = (call.id, peer, deadline_ns)
             if deadline_ns < self._next_deadline_ns:
                 self._sooner.set()
             if peer.lost or self._closed:
-                return _ended(call_id, Status.UNSENT)
+                return _ended(call.id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
             publisher.put(data)
-            return self._await_reply(box, call_id, peer, sent_ns)
+            return self._await_reply(box, call.id, peer, sent_ns)
         except ChannelClosed:  # the publisher went with its provider, or everything does
-            return _ended(call_id, Status.UNSENT)
+            return _ended(call.id, Status.UNSENT)
         finally:
             box.waiting = box.sent = None
             self._free.append(box)
@@ -144,39 +128,25 @@ class Caller:
         return message.key.startswith(self._ends_on if reply.status >= Status.TIMED_OUT else peer.answers_on)
 
     def start(
-        self,
-        peer: Peer,
-        publisher: Publisher,
-        service: str,
-        args: Any,
-        deadline_ns: int,
-        expires_ns: int | None,
-        chain: tuple[str, ...],
-        on_reply: OnReply,
-        on_progress: OnReply | None = None,
-        behalf: Behalf | None = None,
-        encode: Encode = encode_message,
-        session: str = "",
-    ) -> int:
-        """Call without waiting; answer and progress go there on a thread of ours. Returns the call's id."""
+        self, call: Call, route: Route, deadline_ns: int, on_reply: OnReply, on_progress: OnReply | None = None
+    ) -> None:
+        """Send a call without waiting; answer and progress go there on a thread of ours."""
         try:
-            shared = self._shared_box()
+            call.reply = self._shared_box().name
         except ChannelClosed:
-            on_reply(_ended(0, Status.UNSENT))
-            return 0
-        call_id, speaker = self.new_id(), session or self._session
-        data = encode(Call(PROTOCOL, call_id, service, shared.name, speaker, expires_ns, chain, args, behalf))
-        self._pending[call_id] = Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
+            on_reply(_ended(call.id, Status.UNSENT))
+            return
+        peer, publisher, data = route.peer, route.publisher, route.encode(call)
+        self._pending[call.id] = Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()
         if peer.lost or self._closed:
-            self._finish(_ended(call_id, Status.UNSENT))
-            return call_id
+            self._finish(_ended(call.id, Status.UNSENT))
+            return
         try:
             publisher.put(data)
         except ChannelClosed:
-            self._finish(_ended(call_id, Status.UNSENT))
-        return call_id
+            self._finish(_ended(call.id, Status.UNSENT))
 
     def cancel(self, peer: Peer, call_id: int, service: str, deadline_ns: int) -> None:
         """Ask the callee to end a call, or never to begin it; does not wait."""
@@ -184,8 +154,8 @@ class Caller:
         if call_id not in self._pending or now >= deadline_ns:
             return
         asked = Raw(encode_message(CancelArguments(call_id, service, min(86_400.0, (deadline_ns - now) / 1e9))))
-        publisher = self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=True)
-        self.start(peer, publisher, CANCEL, asked, now + int(_CANCEL_S * 1e9), None, (), lambda _: None)
+        route = Route(peer, self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=True))
+        self.start(self.new_call(CANCEL, asked), route, now + int(_CANCEL_S * 1e9), lambda _: None)
 
     # --- sending again
 
@@ -198,7 +168,7 @@ class Caller:
         sent += [pending.sent for pending in list(self._pending.values()) if pending.peer is peer]
         due = [one for one in sent if one is not None]
         if due:
-            clock = self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=False)
+            clock = Route(peer, self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=False))
             soon = time.monotonic_ns() + int(_CANCEL_S * 1e9)
 
             def clock_heard(reply: Reply) -> None:
@@ -206,7 +176,7 @@ class Caller:
                     for publisher, data in due:
                         self._put_again(peer, publisher, decode_call(data))
 
-            self.start(peer, clock, CLOCK, EMPTY_ARGUMENTS, soon, None, (), clock_heard)
+            self.start(self.new_call(CLOCK, EMPTY_ARGUMENTS), clock, soon, clock_heard)
 
     def _put_again(self, peer: Peer, publisher: Publisher, call: Call) -> None:
         deadline_ns = self._deadline_of(call.id)
@@ -248,10 +218,10 @@ class Caller:
 
     def _new_reply_slot(self) -> ReplySlot:
         with self._lock:
-            index = f"{self._own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
-            key = reply_key("*", self._own.identity, self._own.container, index)
-            own = reply_key(self._own.identity, self._own.identity, self._own.container, index)
-            box = ReplySlot(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
+            index = f"{self.own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
+            key = reply_key("*", self.own.identity, self.own.container, index)
+            own = reply_key(self.own.identity, self.own.identity, self.own.container, index)
+            box = ReplySlot(f"{self.own.container}/{index}", own, self._transport.subscribe(key))
             self._every.append(box)
             return box
 

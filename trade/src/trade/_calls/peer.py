@@ -6,8 +6,11 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from msgspec import Struct
+
+from trade._calls.arguments import ArgumentEncoder
 from trade._protocol.keys import Address, call_key
-from trade._protocol.messages import Reply
+from trade._protocol.messages import Call, Reply, encode_message
 from trade._transport.base import Channel, Publisher, Transport
 
 NEVER: Final = math.inf
@@ -44,6 +47,19 @@ class Peer:
         """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
         low, slack = self._low_ns, (time.monotonic_ns() - self._at_ns) * _DRIFT
         return int(deadline_ns + low - slack) if low > -NEVER else None
+
+
+class Route(Struct, frozen=True):
+    """How calls reach one provider of another container; made once for all of them."""
+
+    peer: Peer
+    publisher: Publisher
+    arguments: ArgumentEncoder | None = None
+    """Encodes arguments that are values; None: they are bytes already."""
+
+    def encode(self, call: Call) -> bytes:
+        """Raises InvalidArgument, NotSerialisable, TooLarge."""
+        return encode_message(call) if self.arguments is None else self.arguments.encode_call(call)
 
 
 OnReply = Callable[[Reply], None]

@@ -9,9 +9,9 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw
 
-from trade._calls.arguments import encode_arguments, encode_call, given
+from trade._calls.arguments import ArgumentEncoder
 from trade._calls.caller import Caller
-from trade._calls.peer import Peer
+from trade._calls.peer import Peer, Route
 from trade._calls.run import Run
 from trade._context.active_calls import ActiveCall
 from trade._context.call_context import CallContext, handed_down, holding, patience_s, running
@@ -19,7 +19,16 @@ from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, in_ns, new_requ
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address
-from trade._protocol.messages import EMPTY_ARGUMENTS, UNREADABLE, Call, ErrorInfo, Reply, ServiceInfo, Status
+from trade._protocol.messages import (
+    EMPTY_ARGUMENTS,
+    PROTOCOL,
+    UNREADABLE,
+    Call,
+    ErrorInfo,
+    Reply,
+    ServiceInfo,
+    Status,
+)
 from trade._protocol.remote_errors import unpack_error
 from trade._protocol.schema import read_schema
 from trade._protocol.schema_types import type_from_schema
@@ -54,26 +63,19 @@ class LocalTarget:
     """A service of this container: called directly, with the validation and the copies a wire would make."""
 
     def __init__(
-        self,
-        service: LocalService,
-        record: Record,
-        codec: Codec,
-        own: Address,
-        session: str,
-        new_id: Callable[[], int],
-        hands: ThreadPool,
+        self, service: LocalService, record: Record, codec: Codec, caller: Caller, threads: ThreadPool
     ) -> None:
         self._service = service
         self._record = record
-        self._thread_pool = hands
+        self._thread_pool = threads
         self._thread_name = f"trade-run-{service.label}"
-        self._codec = codec
+        self._arguments = ArgumentEncoder(codec, service.info, service.label)
         self._label = service.label
         self.is_stop = service.effect == "stop"
-        self._own = own
-        self._identity = own.identity
-        self._session = session
-        self._new_id = new_id
+        self._own = caller.own
+        self._identity = caller.own.identity
+        self._session = caller.session
+        self._new_id = caller.new_id
 
     def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """A call that begins now; most inherit nothing and wait for nothing, and need no request."""
@@ -84,13 +86,13 @@ class LocalTarget:
         context = CallContext(self._new_id(), self._label, self._identity, self._session, expires_ns)
         if not self._service.strict:
             return self._service.call(args, kwargs, context)
-        taken = self._taken(args, kwargs)
+        taken = self._arguments.encode(args, kwargs)
         self._check_time(expires_ns, deadline_s or DEFAULT_DEADLINE_S)
         return self._copied(taken, context)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
         """A call that was asked for already."""
-        taken = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
+        taken = self._arguments.encode(args, kwargs) if self._service.strict else (args, kwargs)
         if self._service.serial is None:
             return self._run(taken, request, None)
         return self._take_turn(self._service.serial, taken, request, None)
@@ -98,7 +100,7 @@ class LocalTarget:
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run, *, here: bool) -> None:
         """The same on a thread of its own, or on this one (``here``), with the arguments as they are now."""
         service = self._service
-        taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
+        taken = self._arguments.encode(args, kwargs) if service.strict else (args, kwargs)
 
         def report(_: ActiveCall, value: Any) -> None:
             run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
@@ -113,10 +115,6 @@ class LocalTarget:
             run.end(outcome)
         else:
             self._thread_pool.begin(partial(run.end, outcome), self._thread_name)
-
-    def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
-        """The arguments as they are now, whatever becomes of them."""
-        return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
 
     def _take_turn(self, serial: SerialQueue, taken: _Taken, request: Request, ongoing: ActiveCall | None) -> Any:
         if serial.mine:
@@ -179,12 +177,13 @@ class RemoteTarget:
         self._label = record.label
         self._record = record
         self._info: ServiceInfo = record.info
-        self._codec = codec
         self._caller = caller
         self._peer: Peer = caller.peer(address)
         self.is_stop = record.info.effect == "stop"
-        self._publisher = caller.publishers.get(address, key.domain, key.provider, stop=self.is_stop)
-        self._clock = caller.publishers.get(address, DOMAIN, PROVIDER, stop=False)
+        self._arguments = ArgumentEncoder(codec, record.info, record.label)
+        publisher = caller.publishers.get(address, key.domain, key.provider, stop=self.is_stop)
+        self._route = Route(self._peer, publisher, self._arguments)
+        self._clock = Route(self._peer, caller.publishers.get(address, DOMAIN, PROVIDER, stop=False))
         self._decode = result_decoder(codec, known or record.info)
         self._decode_any = codec.decoder(Any)
         self._traceable = traceable(key)
@@ -197,11 +196,11 @@ class RemoteTarget:
         """A call that was asked for already."""
         values = self._values(args, kwargs, request)
         if not self._may_go:
-            reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
+            reply = self._caller.ask(self._clock_call(request), self._clock, request.deadline_ns)
             if reply.status != Status.OK:
                 raise self._not_begun(reply, request)
-        reply = self._ask(self._publisher, self._info.name, values, self._expiry(request), request)
-        return self._unpack(reply, request)
+        call = self._call(values, request)
+        return self._unpack(self._caller.ask(call, self._route, request.deadline_ns), request)
 
     def begin(
         self,
@@ -219,10 +218,9 @@ class RemoteTarget:
             if run.cancelling:
                 run.fail(Cancelled(service=self._label))
                 return
-            call_id = self._start(
-                self._publisher, self._info.name, values, self._expiry(request), request, finish, note
-            )
-            run.on_cancel(lambda: self._caller.cancel(self._peer, call_id, self._label, request.deadline_ns))
+            call = self._call(values, request)
+            self._caller.start(call, self._route, request.deadline_ns, finish, note)
+            run.on_cancel(partial(self._caller.cancel, self._peer, call.id, self._label, request.deadline_ns))
 
         def note(reply: Reply) -> None:
             try:
@@ -239,7 +237,7 @@ class RemoteTarget:
         if self._may_go:
             go()
         else:
-            self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
+            self._caller.start(self._clock_call(request), self._clock, request.deadline_ns, clock_heard)
 
     @property
     def _may_go(self) -> bool:
@@ -253,38 +251,22 @@ class RemoteTarget:
         elif request.deadline_s <= 0:
             raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
         if self._may_go:
-            return given(self._info, self._label, args, kwargs)
-        return Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
+            return self._arguments.values(args, kwargs)
+        return Raw(self._arguments.encode(args, kwargs))
 
-    def _message(self, call: Call) -> bytes:
-        return encode_call(self._codec, self._info, self._label, call)
+    def _call(self, values: Any, request: Request) -> Call:
+        """The message; its deadline is in the clock of the callee."""
+        expires_ns = None if self.is_stop else self._peer.expiry_ns(request.deadline_ns)
+        return self._message(self._info.name, values, expires_ns, request)
 
-    def _expiry(self, request: Request) -> int | None:
-        return None if self.is_stop else self._peer.expiry_ns(request.deadline_ns)
+    def _clock_call(self, request: Request) -> Call:
+        return self._message(CLOCK, EMPTY_ARGUMENTS, None, request)
 
-    def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
-        chain = request.chain
-        behalf, session = request.presence(self._record, self._caller.own)
-        return self._caller.ask(
-            self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message, session
-        )
-
-    def _start(
-        self,
-        publisher: Any,
-        service: str,
-        args: Any,
-        expires_ns: int | None,
-        request: Request,
-        then: Callable[[Reply], None],
-        on_progress: Callable[[Reply], None] | None = None,
-    ) -> int:
-        peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
-        encode = self._message
-        behalf, session = request.presence(self._record, self._caller.own)
-        return self._caller.start(
-            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, encode, session
-        )
+    def _message(self, service: str, values: Any, expires_ns: int | None, request: Request) -> Call:
+        caller, chain = self._caller, request.chain
+        behalf, client = request.presence(self._record, caller.own)
+        session = client or caller.session
+        return Call(PROTOCOL, caller.new_id(), service, "", session, expires_ns, chain, values, behalf)
 
     def _unpack(self, reply: Reply, request: Request) -> Any:
         error = None if reply.status == Status.OK else self._failure(reply, request)

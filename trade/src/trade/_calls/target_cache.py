@@ -7,7 +7,7 @@ from trade._calls.caller import Caller
 from trade._calls.handle import Handle
 from trade._calls.target import LocalTarget, RemoteTarget, container_closed
 from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
+from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, ServiceKey
 from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Change, Record, Registry, gone_to
 from trade._security.authorizer import Authorizer
@@ -27,8 +27,6 @@ class Targets:
 
     def __init__(
         self,
-        own: Address,
-        session: str,
         access: Authorizer,
         registry: Registry,
         providers: Providers,
@@ -37,8 +35,7 @@ class Targets:
         audit: Audit,
     ) -> None:
         self._audit = audit
-        self._own = own
-        self._session = session
+        self._own = caller.own
         self._access = access
         self._registry = registry
         self._providers = providers
@@ -78,7 +75,7 @@ class Targets:
         try:
             self._access.require_call(who, key.domain, key.name, record.info.effect, record.label)
         except AccessDenied as denied:
-            self._audit.refused(record.label, denied, who=who, session=self._session)
+            self._audit.refused(record.label, denied, who=who, session=self._caller.session)
             raise
 
     def _make(self, record: Record) -> Target | None:
@@ -90,9 +87,7 @@ class Targets:
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None
-        return LocalTarget(
-            service, record, self._codec, self._own, self._session, self._caller.new_id, self._thread_pool
-        )
+        return LocalTarget(service, record, self._codec, self._caller, self._thread_pool)
 
     def _our_own(self, record: Record) -> ServiceInfo | None:
         """How this container describes a function of the middleware that another one has, too.

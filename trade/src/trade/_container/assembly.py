@@ -116,7 +116,7 @@ class Components:
         home, address = self._home, self._address
         self.codec = handle_codec(lambda handle: handle.key, home.handle)
         self.registry = Registry(address, self._access.may_offer, self._access.may_have_stops)
-        self.caller = Caller(self.transport, address, self._session)
+        self.caller = Caller(self.transport, address)
         leaving.callback(self.caller.close)
         self.scheduler = Scheduler("trade-clock")
         leaving.callback(self.scheduler.close)
@@ -143,9 +143,7 @@ class Components:
         self.providers = Providers(
             self.announcer, self.registry, address, self.codec, self.event_loop, self.locks, access, self.audit
         )
-        self.targets = Targets(
-            address, self._session, access, self.registry, self.providers, self.caller, self.codec, self.audit
-        )
+        self.targets = Targets(access, self.registry, self.providers, self.caller, self.codec, self.audit)
         self.registry.changes.subscribe(self.targets.changed)  # before anybody is told: who is told may call
 
     def _build_notifications_and_hooks(self) -> None:
