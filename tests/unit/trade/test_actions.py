@@ -149,7 +149,7 @@ def test_progress_is_sent_at_most_every_fifty_milliseconds(
     answer = there._parts.dispatcher._answer
 
     def note(*args: Any) -> None:
-        sent.append(args[3])
+        sent.append(args[1])
         answer(*args)
 
     monkeypatch.setattr(there._parts.dispatcher, "_answer", note)

@@ -137,7 +137,7 @@ def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None
 
 
 def begun(once: CallDeduplicator, one: Call) -> ActiveCall:
-    ongoing = ActiveCall(None, "me", one, None)
+    ongoing = ActiveCall("me", one, None)
     assert once.begin(one, ongoing) is ongoing
     return ongoing
 
@@ -167,7 +167,7 @@ def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(mo
     assert len(once._calls) <= 1024
     assert once.find("me", call(0)) is running
     assert running.answer is None
-    forgotten = ActiveCall(None, "me", call(1), None)
+    forgotten = ActiveCall("me", call(1), None)
     once.begin(call(1), forgotten)
     assert forgotten.answer is not None  # known only by its number: whether it ran is not said
     assert b"OutcomeUnknown" in bytes(forgotten.answer[1])

@@ -105,7 +105,7 @@ class LocalTarget:
         def report(_: ActiveCall, value: Any) -> None:
             run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
 
-        ongoing = ActiveCall(service, self._identity, None, report)
+        ongoing = ActiveCall(self._identity, None, report)
         run.on_cancel(ongoing.cancel)
         if service.serial is None:
             outcome = partial(self._run, taken, request, ongoing)

@@ -201,9 +201,8 @@ class Components:
         leaving.callback(self.migration_target.close)
 
     def _build_dispatch(self, leaving: contextlib.ExitStack) -> None:
-        access, lookup = self._access, self.providers.lookup
         self.dispatcher = Dispatcher(
-            self.transport, self._address, lookup, self.event_loop, access, self.audit, access.callers()
+            self.transport, self._address, self.providers, self.event_loop, self._access, self.audit
         )
         leaving.callback(self.dispatcher.close)
 

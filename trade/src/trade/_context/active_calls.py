@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from msgspec import Raw
 
@@ -30,41 +30,19 @@ _rare = threading.Lock()
 """Guards what few calls have: an event, something to do when they are cancelled."""
 
 
-class ProgressSignature(Protocol):
-    """Of what a service reports while it runs."""
-
-    def encode_progress(self, service: str, value: Any) -> bytes: ...
-
-
-class Reporting(Protocol):
-    """A service, as far as its progress goes."""
-
-    label: str
-
-    @property
-    def signature(self) -> ProgressSignature: ...
-
-
 class ActiveCall:
     """One call from its arrival on."""
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "queued_ns", "report", "said", "service", "size"),
+        *("cancelled", "queued_ns", "report", "said", "size"),
     )
 
-    def __init__(
-        self,
-        service: Reporting | None,
-        caller: str,
-        call: Call | None,
-        report: "Callable[[ActiveCall, Any], None] | None",
-    ) -> None:
-        self.service = service
+    def __init__(self, caller: str, call: Call | None, report: "Callable[[ActiveCall, Any], None] | None") -> None:
         self.caller = caller
         self.call = call
         self.report = report
-        """Takes what the provider says of its progress, and keeps nobody waiting."""
+        """Takes what the provider says of its progress without waiting: `Dispatcher._report`, or the local target's."""
         self.said: Raw | None = None
         """The latest that was said of it and is not sent yet."""
         self.cancelled = False
@@ -183,7 +161,7 @@ class CallDeduplicator:
         with self._lock:
             found = self._calls.get((caller, call_id))
             if found is None:
-                never = ActiveCall(None, caller, None, None)
+                never = ActiveCall(caller, None, None)
                 never.answer = cancelled(service)
                 now = time.monotonic_ns()
                 self._calls[caller, call_id] = never
@@ -228,18 +206,23 @@ def _is_for(call: Call | None, session: str) -> bool:
 
 
 def _unknown(service: str) -> Answer:
-    return Status.ERROR, Raw(encode_message(pack_error(OutcomeUnknown(service=service, deadline_s=0.0))))
+    return failed(OutcomeUnknown(service=service, deadline_s=0.0))
 
 
 def cancelled(service: str) -> Answer:
     """What a call that was cancelled before it began is answered."""
-    return Status.ERROR, Raw(encode_message(pack_error(Cancelled(service=service))))
+    return failed(Cancelled(service=service))
+
+
+def failed(error: BaseException) -> Answer:
+    """What a call that was not run is answered."""
+    return Status.ERROR, Raw(encode_message(pack_error(error)))
 
 
 class ProgressReporter:
     """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread.
 
-    What was said last goes out before the answer, whenever that comes.
+    What was said last goes out before the answer, whenever that comes. What sends it is `Dispatcher._send_progress`.
     """
 
     EVERY_S: Final = 0.05

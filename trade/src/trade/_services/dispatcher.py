@@ -7,14 +7,23 @@ The last idle one that takes a call starts another; at the cap it answers Busy, 
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
+from functools import partial
 from typing import Any, Final
 
 import msgspec
-from msgspec import Raw
+from msgspec import Raw, Struct
 
 from trade._audit.events import Audit
-from trade._context.active_calls import ActiveCall, Answer, CallDeduplicator, ProgressReporter, cancelled, end_calls
+from trade._context.active_calls import (
+    ActiveCall,
+    Answer,
+    CallDeduplicator,
+    ProgressReporter,
+    cancelled,
+    end_calls,
+    failed,
+)
 from trade._context.call_context import CallContext, outer_of
 from trade._context.sessions import foreign
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, calls_to, is_chunk, reply_key
@@ -31,10 +40,10 @@ from trade._protocol.messages import (
     decode_call,
     encode_message,
 )
-from trade._protocol.remote_errors import pack_error
 from trade._security.authorizer import Authorizer
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
+from trade._services.providers import Providers
 from trade._services.serial_queue import SerialQueue
 from trade._threads.channel_workers import WorkerPool
 from trade._transport.base import ChannelClosed, Message, Publisher, Transport
@@ -65,8 +74,16 @@ _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
-Lookup = Callable[[str, str], LocalService | None]
-"""From ``domain/provider`` and the service's name to the service; raises ServiceGone if that has moved."""
+class IncomingCall(Struct, frozen=True, gc=False):
+    """A call that came in, and what its key says."""
+
+    call: Call
+    caller: str
+    """Identity of who asks."""
+    replier: Publisher
+    """Where to answer."""
+    place: str = ""
+    """The ``domain/provider`` it is for; empty once only an answer is left to send."""
 
 
 class Dispatcher:
@@ -76,11 +93,10 @@ class Dispatcher:
         self,
         transport: Transport,
         own: Address,
-        lookup: Lookup,
+        providers: Providers,
         loop: AsyncLoop,
         access: Authorizer,
         audit: Audit,
-        callers: Sequence[str] = (),
     ) -> None:
         self._transport = transport
         self._audit = audit
@@ -88,7 +104,7 @@ class Dispatcher:
         self._loop = loop
         self._own = own
         self._here = f"{own}/"
-        self._lookup = lookup
+        self._providers = providers
         self._repliers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
         self._leaving = False
@@ -99,7 +115,7 @@ class Dispatcher:
         self.callers = set[str]()
         """Who is heard by channels of its own; nobody: all are heard by the same."""
         self._worker_pools: list[WorkerPool] = []
-        if callers:
+        if callers := access.callers():
             self.hear(callers)
         else:
             self._add_worker_pools(ANYBODY)
@@ -129,44 +145,44 @@ class Dispatcher:
         return all(pool.draining for pool in self._worker_pools)
 
     def _serve(self, message: Message) -> None:
-        taken = self._take(message)
-        if taken is None:
+        incoming = self._take(message)
+        if incoming is None:
             return
-        call, caller, provider, replier = taken
         try:
-            service = self._lookup(provider, call.service)
+            service = self._providers.lookup(incoming.place, incoming.call.service)
         except ServiceGone as gone:  # it has moved
-            self._refuse(replier, caller, call, Status.ERROR, Raw(encode_message(pack_error(gone))))
+            self._refuse(incoming, *failed(gone))
             return
         urgent = message.key.startswith("stop/")
         if service is None or (service.effect == "stop") is not urgent:
-            if urgent and call.service == CANCEL and provider == _SYSTEM:
-                self._answer(replier, caller, call, *self._cancel(caller, call))
+            if urgent and incoming.call.service == CANCEL and incoming.place == _SYSTEM:
+                self._answer(incoming, *self._cancel(incoming))
             else:
-                self._refuse(replier, caller, call, Status.GONE)
-            return
-        if (denied := self._denied(caller, provider, service)) is not None:
-            self._note(service.label, denied, caller, call)
-            self._refuse(replier, caller, call, Status.ERROR, Raw(encode_message(pack_error(denied))))
-            return
-        if urgent:
-            self._answer(replier, caller, call, *_run(caller, call, service, None))
-            return
-        ongoing = ActiveCall(service, caller, call, self._report)
-        first = self._deduplicator.begin(call, ongoing)
-        if first is not ongoing or ongoing.answer is not None:
-            self._again(first, replier, caller, call)
-        elif service.serial is None:
-            self._perform(ongoing, service, replier, call)
+                self._refuse(incoming, Status.GONE)
+        elif (denied := self._denied(incoming, service)) is not None:
+            self._note(service.label, denied, incoming)
+            self._refuse(incoming, *failed(denied))
+        elif urgent:
+            self._answer(incoming, *_run(incoming, service, None))
         else:
-            self._queue(service.serial, ongoing, service, replier, call)
+            self._begin(incoming, service)
 
-    def _denied(self, caller: str, place: str, service: LocalService) -> AccessDenied | None:
+    def _begin(self, incoming: IncomingCall, service: LocalService) -> None:
+        ongoing = ActiveCall(incoming.caller, incoming.call, partial(self._report, service))
+        first = self._deduplicator.begin(incoming.call, ongoing)
+        if first is not ongoing or ongoing.answer is not None:
+            self._again(first, incoming)
+        elif service.serial is None:
+            self._perform(ongoing, service, incoming)
+        else:
+            self._queue(service.serial, ongoing, service, incoming)
+
+    def _denied(self, incoming: IncomingCall, service: LocalService) -> AccessDenied | None:
         """Why a caller may not call a service; decided once for each policy."""
-        policy = self._access.policy
+        policy, caller = self._access.policy, incoming.caller
         if policy is None or service.admitted.get(caller) is policy:
             return None
-        domain = place.partition("/")[0]
+        domain = incoming.place.partition("/")[0]
         denied = self._access.denied_call(policy, caller, domain, service.info.name, service.effect, service.label)
         if denied is None:
             if len(service.admitted) >= _MOST_CALLERS:
@@ -174,98 +190,94 @@ class Dispatcher:
             service.admitted[caller] = policy
         return denied
 
-    def _perform(self, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call) -> None:
-        if service.too_late(call.expires_ns):
+    def _perform(self, ongoing: ActiveCall, service: LocalService, incoming: IncomingCall) -> None:
+        if service.too_late(incoming.call.expires_ns):
             answer: Answer = (Status.EXPIRED, EMPTY)
-            self._note(service.label, DeadlineExceeded(service=service.label, deadline_s=0.0), ongoing.caller, call)
+            self._note(service.label, DeadlineExceeded(service=service.label, deadline_s=0.0), incoming)
         elif ongoing.cancelled:
             answer = cancelled(service.label)
         else:
-            answer = _run(ongoing.caller, call, service, ongoing)
-        self._end(ongoing, service, replier, call, answer)
+            answer = _run(incoming, service, ongoing)
+        self._end(ongoing, service, incoming, answer)
 
-    def _end(self, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
+    def _end(self, ongoing: ActiveCall, service: LocalService, incoming: IncomingCall, answer: Answer) -> None:
         if ongoing.said is not None:
             self._progress_reporter.send(ongoing)
-        also = self._deduplicator.end(ongoing, call, answer, keep=service.effect != "read")
-        self._answer(replier, ongoing.caller, call, *answer)
+        also = self._deduplicator.end(ongoing, incoming.call, answer, keep=service.effect != "read")
+        self._answer(incoming, *answer)
         for again in also or ():
-            self._answer(self._replier(ongoing.caller, again.reply), ongoing.caller, again, *answer)
+            self._answer(self._to_answer(incoming.caller, again), *answer)
 
-    def _queue(
-        self, serial: SerialQueue, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call
-    ) -> None:
+    def _queue(self, serial: SerialQueue, ongoing: ActiveCall, service: LocalService, incoming: IncomingCall) -> None:
         def begin() -> None:
             if not self._leaving:
                 with serial.held():
-                    self._perform(ongoing, service, replier, call)
+                    self._perform(ongoing, service, incoming)
 
         def drop() -> None:
             if serial.withdraw(begin):
-                self._end(ongoing, service, replier, call, cancelled(service.label))
+                self._end(ongoing, service, incoming, cancelled(service.label))
 
         ongoing.on_cancel(drop)
         ongoing.queued_ns = time.monotonic_ns()
         if not serial.submit(begin):
-            self._note(service.label, self._too_much(service.label), ongoing.caller, call)
-            self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
+            self._note(service.label, self._too_much(service.label), incoming)
+            self._end(ongoing, service, incoming, (Status.BUSY, EMPTY))
 
     # --- calls that came before, and calls about calls
 
-    def _again(self, first: ActiveCall, replier: Publisher, caller: str, call: Call) -> None:
+    def _again(self, first: ActiveCall, incoming: IncomingCall) -> None:
         """It runs or has run: it gets that answer, and never runs again."""
-        answer = self._deduplicator.attach(first, call)
+        answer = self._deduplicator.attach(first, incoming.call)
         if answer is not None:
-            self._answer(replier, caller, call, *answer)
+            self._answer(incoming, *answer)
 
-    def _refuse(self, replier: Publisher, caller: str, call: Call, status: int, body: Raw = EMPTY) -> None:
+    def _refuse(self, incoming: IncomingCall, status: int, body: Raw = EMPTY) -> None:
         """It does not run now; but it may have before."""
-        first = self._deduplicator.find(caller, call)
+        first = self._deduplicator.find(incoming.caller, incoming.call)
         if first is not None:
-            self._again(first, replier, caller, call)
+            self._again(first, incoming)
         else:
-            self._answer(replier, caller, call, status, body)
+            self._answer(incoming, status, body)
 
-    def _cancel(self, caller: str, call: Call) -> Answer:
+    def _cancel(self, incoming: IncomingCall) -> Answer:
         try:
-            asked = _decode_cancel(call.args)
+            asked = _decode_cancel(incoming.call.args)
         except UNREADABLE as bad:
-            return Status.ERROR, Raw(encode_message(pack_error(bad)))
-        self._deduplicator.cancel(caller, asked.id, asked.service, asked.keep_s)
+            return failed(bad)
+        self._deduplicator.cancel(incoming.caller, asked.id, asked.service, asked.keep_s)
         return Status.OK, EMPTY
 
-    def _report(self, ongoing: ActiveCall, value: Any) -> None:
-        if ongoing.service is not None:
-            service = ongoing.service
-            self._progress_reporter.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
+    def _report(self, service: LocalService, ongoing: ActiveCall, value: Any) -> None:
+        self._progress_reporter.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
     def _send_progress(self, ongoing: ActiveCall, body: Raw) -> None:
         call = ongoing.call
         if call is None:  # it has ended
             return
         try:
-            self._answer(self._replier(ongoing.caller, call.reply), ongoing.caller, call, Status.PROGRESS, body)
+            self._answer(self._to_answer(ongoing.caller, call), Status.PROGRESS, body)
         except ChannelClosed:
             _logger.debug("no word of the progress of %s: the container is closing", call.service)
 
     def _busy(self, message: Message) -> None:
-        taken = self._take(message)
-        if taken is not None:
-            call, caller, place, replier = taken
-            label = f"{place.partition('/')[0]}.{call.service}"
-            self._note(label, self._too_much(label), caller, call)
-            self._refuse(replier, caller, call, Status.BUSY)
+        incoming = self._take(message)
+        if incoming is not None:
+            label = f"{incoming.place.partition('/')[0]}.{incoming.call.service}"
+            self._note(label, self._too_much(label), incoming)
+            self._refuse(incoming, Status.BUSY)
 
     def _too_much(self, label: str) -> Busy:
         return Busy(service=label, container=self._own.container)
 
-    def _note(self, label: str, error: TradeError, caller: str, call: Call) -> None:
+    def _note(self, label: str, error: TradeError, incoming: IncomingCall) -> None:
         """Have it in the record that a call was refused."""
-        who, outer_id = foreign(call.session) or caller, outer_of(call.id, call.behalf)
+        call = incoming.call
+        who, outer_id = foreign(call.session) or incoming.caller, outer_of(call.id, call.behalf)
         self._audit.refused(label, error, who=who, session=call.session, call_id=call.id, outer_id=outer_id)
 
-    def _take(self, message: Message) -> tuple[Call, str, str, Publisher] | None:
-        """The call, who makes it, the ``domain/provider`` it is for, where to answer: else it is not run."""
+    def _take(self, message: Message) -> IncomingCall | None:
+        """The call of a message; None: it is no call, and dropped."""
         try:
             call = decode_call(message.payload or b"")
             kind, caller, place = message.key.split("/", 2)
@@ -280,17 +292,20 @@ class Dispatcher:
             if self.malformed == 1:
                 _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", message.key, bad)
             return None
-        return call, caller, place[len(self._here) :], replier
+        return IncomingCall(call, caller, replier, place[len(self._here) :])
 
-    def _answer(self, replier: Publisher, caller: str, call: Call, status: int, body: Raw) -> None:
+    def _answer(self, incoming: IncomingCall, status: int, body: Raw) -> None:
         if self._closed:
             return
-        data = encode_message(Reply(PROTOCOL, call.id, status, time.monotonic_ns(), body))
+        data = encode_message(Reply(PROTOCOL, incoming.call.id, status, time.monotonic_ns(), body))
         try:
-            replier.put(data)
+            incoming.replier.put(data)
         except ChannelClosed:  # it was let go in between
             if not self._closed:
-                self._replier(caller, call.reply).put(data)
+                self._replier(incoming.caller, incoming.call.reply).put(data)
+
+    def _to_answer(self, caller: str, call: Call) -> IncomingCall:
+        return IncomingCall(call, caller, self._replier(caller, call.reply))
 
     def _replier(self, caller: str, reply: str) -> Publisher:
         key = f"{caller}/{reply}"
@@ -341,7 +356,8 @@ class Dispatcher:
             replier.close()
 
 
-def _run(caller: str, call: Call, service: LocalService, ongoing: ActiveCall | None) -> Answer:
+def _run(incoming: IncomingCall, service: LocalService, ongoing: ActiveCall | None) -> Answer:
+    call, caller = incoming.call, incoming.caller
     expires = None if service.effect == "stop" else call.expires_ns
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:
