@@ -14,8 +14,7 @@ from typing import Any
 
 from tests.support.lock_log import Ask, Done, Held, Log, Seen, now
 from trade import Container, Handle, Settings, where
-from trade._context.call_context import holding
-from trade._context.claims import Claim
+from trade._context.outgoing import Claim, holding
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
 from trade._transport.base import ChannelClosed

@@ -8,7 +8,7 @@ from msgspec import Meta, Raw, Struct
 
 from tests.endurance.fuzz._target import Target
 from trade import Constraint, Handle, Secret, service
-from trade._calls.handle_codec import handle_codec
+from trade._calls.handle import handle_codec
 from trade._discovery.listener import _place as place_of
 from trade._locks.inherited import InheritedLock
 from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops

@@ -85,7 +85,7 @@ def command(request: pytest.FixtureRequest, robot: Robot) -> Any:
         return relay(handle)
 
     def inherited(lock: Any, handle: Handle) -> object:
-        from trade._context.call_context import handed_down
+        from trade._context.outgoing import handed_down
         from trade._locks.inherited import VARIABLE, InheritedLock
 
         passed = InheritedLock(lock.environment()[VARIABLE], robot.other.address)

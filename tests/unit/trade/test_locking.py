@@ -155,7 +155,7 @@ def test_a_cancelled_async_with_leaves_nothing_locked(robot: Robot) -> None:
 
 
 def test_the_locks_around_a_task_are_forgotten_even_if_giving_back_is_cancelled(robot: Robot) -> None:
-    from trade._context.call_context import holding
+    from trade._context.outgoing import holding
 
     async def main() -> None:
         lock = robot.me.lock(WHOLE)

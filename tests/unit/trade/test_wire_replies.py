@@ -8,7 +8,7 @@ import pytest
 
 from tests.unit.trade.forged_messages import FUTURE, FakeCallee
 from trade import Container
-from trade._calls.handle_codec import handle_codec
+from trade._calls.handle import handle_codec
 from trade._calls.target import result_decoder
 from trade._protocol.messages import PROTOCOL, Reply, ServiceInfo, Status, encode_message
 from trade._protocol.schema import schema_message

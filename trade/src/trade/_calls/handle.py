@@ -2,14 +2,18 @@
 
 import asyncio
 import logging
-from collections.abc import Mapping
+import operator
+from collections.abc import Callable, Mapping
 from contextvars import Context
 from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
+import msgspec
+
 from trade._calls.run import Run
+from trade._protocol.codec import Codec
 from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import Scalar
+from trade._protocol.messages import Scalar, encode_message
 from trade._protocol.schema import read_schema
 from trade._registry.registry import Record
 from trade.errors import ConfigurationError
@@ -19,10 +23,12 @@ __all__ = ["Bound", "Handle"]
 _logger = logging.getLogger("trade")
 
 LONGEST_DEADLINE_S: Final = 86_400.0
+HANDLE_EXT: Final = 1
+"""The number of the MessagePack extension in which handles travel."""
 
 
 class CallHost(Protocol):
-    """What a handle asks of the container that made it."""
+    """What a handle asks of the container that made it. Implemented by `trade.Container`."""
 
     @property
     def address(self) -> Address: ...
@@ -273,3 +279,29 @@ class Bound:
     def __repr__(self) -> str:
         given = [*map(repr, self.args), *(f"{name}={value!r}" for name, value in self.kwargs.items())]
         return f"<Bound {self.handle.label}({', '.join(given)}) in {self.handle.container}>"
+
+
+def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[ServiceKey], Handle]) -> Codec:
+    """What turns values into bytes and back; handles travel as the key of their service.
+
+    Args:
+        key_of: what is written of a handle; raises TypeError if it must not leave.
+        handle_of: the handle that a key means here; raises msgspec.ValidationError if it means none.
+    """
+
+    def to_data(value: Any) -> Any:
+        if isinstance(value, Handle):
+            return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(value)))
+        if isinstance(value, float):  # of a kind of its own, as those of arrays
+            return float(value)
+        if hasattr(value, "__index__"):
+            return operator.index(value)
+        hint = "; send value.tolist()" if hasattr(value, "tolist") else ""
+        raise TypeError(f"{type(value).__qualname__} is no plain data{hint}")
+
+    def from_data(code: int, data: memoryview) -> Any:
+        if code != HANDLE_EXT:
+            raise msgspec.ValidationError(f"Unknown extension {code}")
+        return handle_of(msgspec.msgpack.decode(data, type=ServiceKey))
+
+    return Codec(to_data, from_data, (Handle,))

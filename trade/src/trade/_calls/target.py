@@ -14,8 +14,8 @@ from trade._calls.caller import Caller
 from trade._calls.peer import Peer, Route
 from trade._calls.run import Run
 from trade._context.active_calls import ActiveCall
-from trade._context.call_context import CallContext, handed_down, holding, patience_s, running
-from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, in_ns, new_request
+from trade._context.call_context import CallContext, patience_s, running
+from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, handed_down, holding, in_ns, new_request
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address

@@ -7,13 +7,12 @@ from typing import Final, Protocol
 
 from trade._audit.events import open_audit
 from trade._calls.caller import Caller
-from trade._calls.handle import CallHost, Handle
-from trade._calls.handle_codec import handle_codec
+from trade._calls.handle import CallHost, Handle, handle_codec
 from trade._calls.target_cache import Targets
 from trade._container.connect import join
 from trade._container.policy_reload import begin_watching
 from trade._container.shutdown import Shutdown
-from trade._context.call_context import handed_down
+from trade._context.outgoing import handed_down
 from trade._counters import Measure
 from trade._discovery.announcer import Announcer
 from trade._discovery.dialer import Dialer

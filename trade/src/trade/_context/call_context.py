@@ -1,18 +1,16 @@
 """What a provider may know of the call it serves: who asks, until when, on whose behalf; and what it may say of it."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
 from trade._context.active_calls import ActiveCall
-from trade._context.claims import Claim
 from trade._context.sessions import client_of
-from trade._protocol.keys import Address
 from trade._protocol.messages import Behalf, Token
-from trade.errors import Cancelled, LockLost
+from trade.errors import Cancelled
 
 __all__ = ["CallContext", "current_call", "progress"]
 
@@ -139,39 +137,6 @@ class CallContext(Struct, frozen=True, gc=False):
         left_s = self.remaining_s
         return wait_s if left_s is None else min(wait_s, left_s - min(_ANSWER_S, left_s / 5))
 
-
-class Held(Protocol):
-    """A lock that the running code holds or uses."""
-
-    @property
-    def owner(self) -> Address:
-        """The container whose lock it is; calls of others in this process do not carry it."""
-        ...
-
-    @property
-    def held(self) -> bool:
-        """Whether it holds now."""
-        ...
-
-    @property
-    def claim(self) -> Claim:
-        """What it selects, and what of that it holds."""
-        ...
-
-    def tokens(self) -> Iterable[Token]:
-        """What shows it to those it was granted by; raises LockLost if it holds no more."""
-        ...
-
-    def refused(self, by: Address, error: LockLost) -> None:
-        """Told that a container refused a call made under it."""
-        ...
-
-
-holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
-"""The locks around the running code, outermost first."""
-
-handed_down: Final[dict[Address, Held]] = {}
-"""Locks that other processes passed on to this one, by the container whose calls carry them."""
 
 running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
 

@@ -1,21 +1,79 @@
-"""A call on its way out: until when, and what it inherits from where it is made."""
+"""A call on its way out: until when, and what it inherits from where it is made: locks, a session, an outer call."""
 
+from collections.abc import Iterable, Sequence
+from contextvars import ContextVar
 from time import monotonic_ns
-from typing import Final
+from typing import Final, Protocol
 
 from msgspec import Struct
 
-from trade._context.call_context import CallContext, Held, handed_down, holding, running
-from trade._context.claims import require_held
+from trade._context.call_context import CallContext, running
 from trade._context.sessions import Session, speaking
 from trade._protocol.keys import DOMAIN, Address
 from trade._protocol.messages import Behalf, Token
+from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
-from trade.errors import Cancelled, LockLost
+from trade.errors import Cancelled, LockLost, NotLocked
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
 _NOBODY: Final = Behalf()
+
+
+class Claim(Struct, frozen=True):
+    """What a lock selects, and what of that it holds."""
+
+    constraint: Constraint | None = None
+    """None: it is of what it holds, and of nothing else."""
+    held: dict[str, frozenset[str]] = {}
+    """Resources, by the address of the container that judges them."""
+
+    def with_held(self, address: Address, names: Iterable[str]) -> "Claim":
+        """The same, and these are held, too."""
+        there = str(address)
+        return Claim(self.constraint, {**self.held, there: self.held.get(there, frozenset()).union(names)})
+
+    def covers(self, record: Record) -> bool:
+        """Whether all that a service uses is held."""
+        return self.held.get(str(record.key.address), frozenset()).issuperset(record.used)
+
+    def selects(self, record: Record) -> bool:
+        """Whether it is meant for a service, held or not."""
+        return self.constraint is not None and self.constraint.matches(record)
+
+
+class Held(Protocol):
+    """A lock that the running code holds or uses: a `Lock`, or an `InheritedLock`."""
+
+    @property
+    def owner(self) -> Address:
+        """The container whose lock it is; calls of others in this process do not carry it."""
+        ...
+
+    @property
+    def held(self) -> bool:
+        """Whether it holds now."""
+        ...
+
+    @property
+    def claim(self) -> Claim:
+        """What it selects, and what of that it holds."""
+        ...
+
+    def tokens(self) -> Iterable[Token]:
+        """What shows it to those it was granted by; raises LockLost if it holds no more."""
+        ...
+
+    def refused(self, by: Address, error: LockLost) -> None:
+        """Told that a container refused a call made under it."""
+        ...
+
+
+holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
+"""The locks around the running code, outermost first."""
+
+handed_down: Final[dict[Address, Held]] = {}
+"""Locks that other processes passed on to this one, by the container whose calls carry them."""
 
 
 class Inherited(Struct, gc=False):
@@ -64,7 +122,7 @@ class Inherited(Struct, gc=False):
         if effect != "stop":
             tokens = tuple(token for lock in locks if effect == "actuate" or lock.held for token in lock.tokens())
         if commands:
-            require_held(locks, record)
+            _require_held(locks, record)
         if outer is None:
             return Behalf((), (), tokens) if tokens else None
         inherited = outer.behalf or _NOBODY
@@ -119,3 +177,12 @@ def new_request(deadline_s: float | None) -> Request:
 
 def in_ns(deadline_s: float | None) -> int:
     return _DEFAULT_DEADLINE_NS if deadline_s is None else int(deadline_s * 1e9)
+
+
+def _require_held(locks: Sequence[Held], record: Record) -> None:
+    """What one of the locks around a command selects, one of them has to hold. Raises NotLocked."""
+    if any(lock.claim.covers(record) for lock in locks):
+        return
+    for lock in locks:
+        if lock.claim.selects(record):
+            raise NotLocked(service=record.label, selected_by=str(lock.claim.constraint))

@@ -11,8 +11,9 @@ import msgspec
 from msgspec import Struct
 
 from trade._calls.handle import Handle
-from trade._context.call_context import CallContext, holding, running
+from trade._context.call_context import CallContext, running
 from trade._context.interceptor import Interceptor, ServedCall, ServedService
+from trade._context.outgoing import holding
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, ServiceKey

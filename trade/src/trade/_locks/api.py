@@ -7,9 +7,9 @@ from typing import Final, NamedTuple, Protocol
 
 from trade._calls.handle import Handle
 from trade._calls.run import Run
-from trade._context.claims import Claim, Selection
+from trade._context.outgoing import Claim
 from trade._locks.lease_client import LeaseClient
-from trade._locks.lock import Lock, OnLost, OnRequest
+from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, under
 from trade._resources.grants import LockInfo, LockRequest

@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 
-from trade._context.claims import Claim
+from trade._context.outgoing import Claim
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
 from trade.errors import ConfigurationError, LockLost

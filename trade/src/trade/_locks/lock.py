@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from contextvars import Token as Reset
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from msgspec import structs
 
-from trade._context.call_context import Held, holding, patience_s
-from trade._context.claims import Claim, Selection
+from trade._context.call_context import patience_s
+from trade._context.outgoing import Claim, Held, holding
 from trade._locks.inherited import VARIABLE, passed_on
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
@@ -24,6 +24,16 @@ if TYPE_CHECKING:
     from trade._locks.lease_client import LeaseClient
 
 _logger = logging.getLogger("trade")
+
+
+class Selection(NamedTuple):
+    """What a lock is to be of, when it is taken."""
+
+    resources: dict[Address, list[str]]
+    """By the container that judges them."""
+    missing: tuple[str, ...] = ()
+    """What belongs to it and was not there."""
+
 
 Wanted = Callable[[], Selection]
 """Finds what to lock at the moment it is taken; waits until it is there."""

@@ -12,16 +12,15 @@ from weakref import WeakValueDictionary
 import msgspec
 from msgspec import structs
 
-from trade._calls.handle import Handle
-from trade._calls.handle_codec import handle_codec
+from trade._calls.handle import Handle, handle_codec
 from trade._container.container import Container
 from trade._container.federating import Exposed, MemberSystem, inside, shown
-from trade._context.call_context import CallContext, holding, running
-from trade._context.claims import Claim, Selection
+from trade._context.call_context import CallContext, running
+from trade._context.outgoing import Claim, holding
 from trade._context.sessions import speaking
 from trade._estop.deadman import NOBODYS
 from trade._locks.api import LEASE_S
-from trade._locks.lock import Lock, OnLost, OnRequest
+from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._locks.remote_locks import SharedResource, Wanted
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Behalf, Estop, ProviderInfo
