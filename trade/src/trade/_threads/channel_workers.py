@@ -22,7 +22,10 @@ _MOMENT_S: Final = 0.005
 
 
 class WorkerPool:
-    """Threads on one channel; at least one of them always waits for the next message."""
+    """Threads on one channel; at least one of them always waits for the next message.
+
+    Those of a container work at calls with `Dispatcher._serve`, and refuse them at the cap with `Dispatcher._busy`.
+    """
 
     def __init__(
         self, name: str, channel: Channel, work: Callable[[Message], None], refuse: Callable[[Message], None]
