@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.waiting import wait_until
-from trade import Container, Handle, current_call, service, where
+from trade import Container, Handle, Run, current_call, service, where
 from trade._protocol.keys import reply_key
 from trade._services import dispatcher
 from trade._threads import channel_workers
@@ -42,6 +42,17 @@ class Crowd:
     def wait_for(self, count: int) -> None:
         for _ in range(count):
             assert self.inside.acquire(timeout=20)
+
+
+def entered(enter: Handle, crowd: Crowd) -> Run:
+    """A call that runs. At the cap a call is refused while the thread of the one before it is busy."""
+    for _ in range(100):
+        run = enter.start()
+        wait_until(lambda run=run: run.done() or crowd.inside.acquire(blocking=False))
+        if not run.done():
+            return run
+        assert isinstance(run.exception(), Busy)
+    raise AssertionError("no call was let in")
 
 
 @pytest.fixture
@@ -87,8 +98,7 @@ def test_a_container_at_its_cap_still_drains(
     monkeypatch.setattr(channel_workers, "MOST_THREADS", 2)
     there.register(crowd, "robot")
     enter = found(here, "enter")
-    run = enter.start()
-    crowd.wait_for(1)
+    run = entered(enter, crowd)
     refused = [enter.start() for _ in range(200)]
     assert all(isinstance(one.exception(20), Busy) for one in refused)
     assert there.healthy()
