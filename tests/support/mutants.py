@@ -93,10 +93,10 @@ def _uses_uncounted(patch: Patch) -> None:
 
 def _no_priority(patch: Patch) -> None:
     """Whoever locks waits like everybody else, whatever priority it was given."""
-    from trade._locks.api import LockApi
+    from trade._locks import api
 
-    lock = LockApi.lock
-    patch(LockApi, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
+    request = api.LockRequest
+    patch(api, "LockRequest", lambda **terms: request(**{**terms, "priority": 0}))
 
 
 def _busiest(patch: Patch) -> None:

@@ -206,7 +206,7 @@ def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
 
 def test_a_range_that_is_more_than_the_device_is_set_to_is_told_as_trade_up_tells_it(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
-        sim.devices[0].table.set("max_position_limit", 2500)
+        sim.devices[0].memory.set("max_position_limit", 2500)
         pan, tilt = of_devices(robot_file)
         assert not writes(list(sim.log.entries))
     assert (pan.level, tilt.level) == ("error", "ok")

@@ -104,4 +104,4 @@ def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
             one.close()
         with caplog.at_level(logging.INFO), Container(settings("mind", connect=[endpoint])) as mind:
             wait_until(lambda: len(mind.addresses()) == 2)
-            assert len(driver.addresses()) == 2
+            wait_until(lambda: len(driver.addresses()) == 2)
