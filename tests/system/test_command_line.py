@@ -93,7 +93,7 @@ def test_loads_are_of_the_second_before_and_the_command_itself_is_left_out(rosie
         (["call", "rosie.head.move_to", '["left", 0]'], "InvalidArgument: rosie.head.move_to argument 'positions_rad'"),
         (["call", "rosie.head.move_to"], "argument 'positions_rad': missing"),
         (["call", "rosie.head.move_to", "[0.1, 0.1]", "haste=3"], "there is no such argument"),
-        (["call", "rosie.head.mvoe_to", "[0.1]", "--wait", "0"], "did you mean rosie.head.move_to"),
+        (["call", "rosie.head.mvoe_to", "[0.1]", "--wait", "0"], "Did you mean rosie.head.move_to"),
         (["call", "rosie.neck.move_to", "0.1"], "TooManyServices: 2 services match"),
     ],
 )

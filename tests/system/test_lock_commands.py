@@ -190,8 +190,8 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
         (["lock", "nowhere", "--wait", "0", "--", "true"], 1, "NoSuchService: no service matches group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
-        (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
-        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
+        (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: no other container was found in system test-"),
+        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NobodyFound: no other container was found in system test-"),
     ],
 )
 def test_wrong_words_are_answered_in_one_line(
@@ -209,15 +209,15 @@ def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
 ) -> None:
     said = trade_command("--connect", nobody_there, *words)
     assert (said.returncode, said.stdout) == (1, "")
-    assert said.stderr.startswith("NobodyFound: nobody was found in system test-")
-    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+    assert said.stderr.startswith("NobodyFound: no other container was found in system test-")
+    assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
 
 
 def test_a_call_of_nobody_says_where_nobody_answers(trade_command: Command, nobody_there: str) -> None:
     said = trade_command("--connect", nobody_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
     assert said.returncode == 1
     assert said.stderr.startswith("NoSuchService: no service matches")
-    assert f"nobody answers at {nobody_there} (TRADE_CONNECT)" in said.stderr
+    assert f"no container answers at {nobody_there} (TRADE_CONNECT)" in said.stderr
     assert "TRADE_SYSTEM" not in said.stderr
 
 
@@ -226,7 +226,7 @@ def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], tra
     for words in (["resume", "rosie.nekc"], ["unlock", "rosie.nekc", "--break", "it hangs"]):
         said = trade_command(*words)
         assert said.returncode == 1
-        assert "did you mean rosie.neck" in said.stderr
+        assert "Did you mean rosie.neck" in said.stderr
 
 
 def test_where_there_is_a_link_and_nobody_it_may_be_another_system(
@@ -294,7 +294,7 @@ def test_S09_who_finds_nobody_cannot_tell_whether_an_estop_is_open(trade_command
 def test_S09_who_finds_nobody_where_it_is_to_connect_says_where(trade_command: Command, nobody_there: str) -> None:
     said = trade_command("--connect", nobody_there, "estop", "--clear", "--limit", "0.2")
     assert (said.returncode, said.stdout) == (1, "")
-    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+    assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
 
 
 def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Command) -> None:
@@ -306,7 +306,7 @@ def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Comm
         rosie.program.signal(signal.SIGCONT)
     assert (said.returncode, said.stdout) == (1, "")
     assert re.search(
-        "rosie did not answer; .*nobody can tell|nobody was found", said.stderr
+        "rosie did not answer; .*nobody can tell|no other container was found", said.stderr
     )  # it may seem gone by then
 
 
@@ -319,12 +319,12 @@ def test_S09_what_was_found_is_stopped_and_cleared_and_what_is_missing_is_told(
     said = trade_command(*both, "estop", "--limit", "2")
     assert said.returncode == 1
     assert re.search("stopped: .*rosie", said.stdout)
-    assert f"nobody answers at {nobody_there}" in said.stderr
+    assert f"no container answers at {nobody_there}" in said.stderr
     assert "was not told to stop" in said.stderr
     said = trade_command(*both, "estop", "--clear", "--limit", "2")
     assert said.returncode == 1
     assert "cleared: " in said.stdout
-    assert f"nobody answers at {nobody_there}" in said.stderr
+    assert f"no container answers at {nobody_there}" in said.stderr
     assert "stays open until it is cleared once more" in said.stderr
     assert move() == pytest.approx(0.05, abs=0.02)
 

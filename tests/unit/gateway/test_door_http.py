@@ -153,7 +153,7 @@ def test_errors_are_problems_that_name_the_error_and_what_to_do(door: Opened) ->
     assert refused.headers["content-type"] == "application/problem+json"
     assert refused.body["type"] == "urn:trade:InvalidArgument"
     assert refused.body["data"]["argument"] == "value"
-    assert "it is called as move(value: float)" in refused.body["detail"]
+    assert "Call it as move(value: float)" in refused.body["detail"]
     assert anna.call("robot.a.fly").title == "NoSuchService"
     assert anna.ask("POST", "/call/robot/move", {"args": [1.0]}).title == "TooManyServices"
     assert anna.ask("POST", "/call/robot.a/move", {"args": [1.0], "dead_line": 1}).title == "BadMessage"

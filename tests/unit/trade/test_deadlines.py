@@ -63,7 +63,7 @@ def test_an_overrun_is_an_unknown_outcome(here: Container, there: Container, gat
     inside = found(here, "pass_through").with_(deadline_s=0.5)
     here.find(where(name="clock", container="there"))()  # else the clock would be asked for first
     ways = {"call": inside, "start": lambda: inside.start().result(20), "acall": lambda: asyncio.run(inside.acall())}
-    with pytest.raises(OutcomeUnknown, match=r"no answer from robot.pass_through within 0.5 s; whether it ran is"):
+    with pytest.raises(OutcomeUnknown, match=r"no answer from robot.pass_through within 0.5 s. Whether it ran is"):
         ways[how]()
 
 

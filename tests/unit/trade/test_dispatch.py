@@ -80,7 +80,7 @@ def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
     assert stop() == 1
     runs = [enter.start() for _ in range(7)]  # the eighth thread drains the channel
     crowd.wait_for(7)
-    with pytest.raises(Busy, match=r"robot.enter did not run: container there has no free handler thread; try again"):
+    with pytest.raises(Busy, match=r"robot.enter did not run: container there has no free handler thread. Try again"):
         enter()
     with pytest.raises(BlockingIOError):
         enter.start().result(20)

@@ -242,7 +242,7 @@ def test_a_handle_works_before_its_registry_entry_came(here: Container, there: C
 
 def test_a_handle_of_nothing_is_refused(here: Container) -> None:
     nowhere = here.handle(ServiceKey(here.address, "x", "Nothing-9", "go"))
-    with pytest.raises(ServiceGone, match=r"x.go is gone: it is not known here; look it up again"):
+    with pytest.raises(ServiceGone, match=r"x.go is gone: it is not known here. Look it up again"):
         nowhere()
 
 
@@ -251,7 +251,7 @@ def test_a_handle_is_dead_after_its_provider_was_deregistered(here: Container) -
     (add, _) = here.register(counter, "a")
     assert add() == 1
     here.deregister(counter)
-    with pytest.raises(ServiceGone, match=r"a.add is gone: its provider was deregistered; look it up again"):
+    with pytest.raises(ServiceGone, match=r"a.add is gone: its provider was deregistered. Look it up again"):
         add()
     assert (add.alive, counter.count) == (False, 1)
 

@@ -159,7 +159,7 @@ def test_S14_what_could_not_be_stopped_is_given_to_nobody_until_it_is_resumed(ro
     with lock.use():
         robot.find("a", "go_on")(0.1)
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
-    with pytest.raises(NotStopped, match=r"could not be stopped at .* so nobody gets a lock on it"):
+    with pytest.raises(NotStopped, match=r"could not be stopped at .* so no client can lock it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
     assert [(info.resources, info.holder.owner) for info in robot.other.locks()] == [(("a",), "nobody")]
     robot["a"].resource.moving = False

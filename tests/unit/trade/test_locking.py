@@ -118,7 +118,7 @@ def test_S15_another_thread_needs_use_and_the_refusal_says_so(robot: Robot) -> N
             thread.start()
             thread.join(20)
     assert outcomes[0].own
-    assert "make the call inside `with lock.use():`" in str(outcomes[0])
+    assert "Make the call inside `with lock.use():`" in str(outcomes[0])
     assert outcomes[1] == 0.2
 
 
@@ -420,7 +420,7 @@ def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
 
 
 def test_S16_a_lock_of_what_is_not_there_tells_what_there_is(robot: Robot) -> None:
-    with pytest.raises(NoSuchService, match="did you mean robot") as refused:
+    with pytest.raises(NoSuchService, match="Did you mean robot") as refused:
         robot.me.lock(where(group="robt"), wait_s=0).acquire()
     assert robot.me.locks() == []
     assert not isinstance(refused.value, ConfigurationError)

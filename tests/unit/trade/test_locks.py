@@ -231,10 +231,10 @@ def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> Non
 def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_and_it_is_listed(table: Table) -> None:
     resource = _could_not_be_stopped(table, "ab")
     with pytest.raises(
-        NotStopped, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
+        NotStopped, match=r"a on .* could not be stopped at \d\d:\d\d:\d\d \(no answer\), so no client can"
     ):
         table.acquire("a")
-    with pytest.raises(NotStopped, match="look at it, then `trade resume a`"):
+    with pytest.raises(NotStopped, match="Check it, then run `trade resume a`"):
         table.acquire("a")
     [info] = table.table.withheld()
     assert (info.resources, info.holder.owner) == (("a",), "nobody")

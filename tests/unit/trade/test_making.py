@@ -162,14 +162,14 @@ def test_an_object_is_made_elsewhere_and_its_services_are_called(
 
 
 def test_without_a_word_in_its_settings_a_container_makes_nothing(memory: MemorySystem, events: list[str]) -> None:
-    with pytest.raises(NotInstantiable, match="it allows none at all; start it with `trade container --allow"):
+    with pytest.raises(NotInstantiable, match=r"It allows no class\. Start it with `trade container --allow"):
         memory.container("plain").system.instantiate("workshop:Lamp")
 
 
 @pytest.mark.parametrize(
     ("path", "kind", "complaint"),
     [
-        ("subprocess:Popen", NotInstantiable, "may not make a subprocess:Popen: it allows only workshop:"),
+        ("subprocess:Popen", NotInstantiable, "may not create a subprocess:Popen. It allows only workshop:"),
         ("workshop:Lantern", NoSuchClass, "workshop has no such class"),
         ("workshop:number", NoSuchClass, "workshop has no such class"),
         ("workshop:Popen", NoSuchClass, "it is defined as subprocess:Popen"),
@@ -187,7 +187,7 @@ def test_what_is_not_made_says_why(asker: Container, path: str, kind: type[Excep
 
 def test_a_constructor_that_fails_leaves_nothing(asker: Container) -> None:
     with pytest.raises(
-        CannotInstantiate, match="workshop:Lamp could not be made in container maker: ValueError: a lamp"
+        CannotInstantiate, match="workshop:Lamp could not be created in container maker: ValueError: a lamp"
     ):
         ask(asker, "instantiate", "workshop:Lamp", [-1])
     with pytest.raises(CannotInstantiate, match="TypeError"):

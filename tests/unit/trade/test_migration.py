@@ -29,7 +29,7 @@ def test_handles_from_before_say_where_it_went_and_do_not_follow(scene: Scene) -
     [moved, _] = scene.asker.migrate(count, to="new")
     scene.memory.settle()
     for stale in (count, here):
-        with pytest.raises(ServiceGone, match="has moved to container new; look it up again") as gone:
+        with pytest.raises(ServiceGone, match=r"has moved to container new\. Look it up again") as gone:
             stale()
         assert gone.value.moved_to == f"{moved.key.address}/hall/{moved.key.provider}"
 

@@ -55,7 +55,7 @@ def test_what_the_other_side_refuses_to_offer_is_offered_here_again(scene: Scene
     error = moved_in_vain(scene, count)
     assert error.withdrawn
     assert "old may not register" in str(error)
-    assert "it is offered again where it was, under new handles" in str(error)
+    assert "It is offered again where it was, under new handles" in str(error)
     scene.memory.settle()
     assert offered(scene) == ["old"]
     with pytest.raises(ServiceGone):

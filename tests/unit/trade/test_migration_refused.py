@@ -301,7 +301,7 @@ def test_what_a_provider_raises_is_told_and_changes_nothing(scene: Scene, method
     error = refused(scene, count)
     assert isinstance(error, CannotMigrate)
     assert f"{method}_state" in str(error)
-    assert "OSError: the disk is full; it goes on where it was" in str(error)
+    assert "OSError: the disk is full. It continues where it was" in str(error)
     assert goes_on(scene, count)
 
 

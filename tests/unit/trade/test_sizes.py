@@ -33,11 +33,11 @@ def test_arguments_beyond_the_limit_are_refused_and_not_a_byte_is_sent(offer: An
     store = Store()
     echo = offer(store)("echo")
     with pytest.raises(
-        TooLarge, match=r"robot.echo: arguments of 64.0 MiB .* cannot be sent, the limit is 64 MiB"
+        TooLarge, match=r"robot.echo: arguments of 64.0 MiB .* cannot be sent. The limit is 64 MiB"
     ) as e:
         echo(bytes(MOST_BYTES))
     assert e.value.size_bytes > e.value.limit_bytes == MOST_BYTES
-    with pytest.raises(ValueError, match="send it in parts"):
+    with pytest.raises(ValueError, match="Send smaller parts"):
         echo.start(bytes(MOST_BYTES))
     assert store.calls == 0
 

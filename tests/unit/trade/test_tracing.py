@@ -287,7 +287,7 @@ def test_a_caller_that_is_not_traced_leaves_a_gap_and_no_more(
 
 def test_a_call_nobody_noted_is_an_error(here: Container) -> None:
     here.set_tracing(True)
-    with pytest.raises(NoSuchCall, match="no container has noted a call 12"):
+    with pytest.raises(NoSuchCall, match="no container has traced call 12"):
         here.trace(12)
 
 

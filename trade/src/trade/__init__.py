@@ -1,7 +1,7 @@
 """TRADE: a service middleware for robots.
 
-Any object's ``@service`` methods become callable from anywhere in the system; services are found by what they are. The
-functions here use the process's default container, which starts itself on first use.
+The ``@service`` methods of any object become callable from anywhere in the system, and clients find services by their
+properties. The functions here use the process's default container, which starts on first use.
 """
 
 from msgspec import Meta
@@ -136,7 +136,7 @@ __all__ = [
 ]
 
 system = System(container)
-"""The switches of the default container."""
+"""The settings and controls of the default container."""
 
 
 register = _of_default(Container.register)

@@ -1,9 +1,33 @@
-"""The error tree: one root, branches by who must act.
+"""The error tree: one root, with branches by who must act::
+
+    TradeError
+    |-- CallerError            the caller must act
+    |   |-- NoSuchService, TooManyServices, ServiceGone                 finding a service
+    |   |-- InvalidArgument, NotSerialisable, TooLarge, LimitExceeded   what the caller passed
+    |   |-- DeadlineExceeded, OutcomeUnknown, Cancelled                 how the call ended
+    |   |-- MotionStopped, Stopped, NoSuchEstop                         stops
+    |   |-- LockedByOther, LockLost, NotLocked, IncompleteGroup         locks
+    |   |-- AccessDenied, SessionEnded, InUse                           rights, sessions and containers
+    |   |-- NoSuchNotification, NoSuchHook, NoSuchCall                  ids
+    |   `-- NotInstantiable, NoSuchClass                                objects created on request
+    |-- CallError              the other side of a call failed
+    |   |-- Busy, InvalidResult, RemoteError
+    |   |-- ContainerLost
+    |   |   `-- SourceLost
+    |   `-- CannotInstantiate, CannotMigrate, MigrationUnknown
+    |-- DeviceError            a device failed
+    |   |-- DeviceFault, ToleranceExceeded
+    |   `-- DeviceSilent
+    |       `-- BusGone, NotStopped
+    `-- SetupError             the installation or the configuration must change
+        |-- ConfigurationError
+        |   `-- WrongDevice
+        `-- CannotConnect, NobodyFound, CannotStart, LinkStays
 
 Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
-builtin a Python programmer would catch for it, so ``except TimeoutError`` finds a deadline that passed.
+builtin that a Python programmer would catch for it, so ``except TimeoutError`` catches a deadline that passed.
 
-One module on purpose, however long: whoever catches reads the tree as a whole.
+All errors are in one module, so that a reader sees the whole tree.
 """
 
 from collections.abc import Sequence
@@ -65,20 +89,20 @@ __all__ = [
 ]
 
 
-_WORTH_TELLING_S: Final = 0.1
-"""A shorter silence than this is one exchange of a bus: its length says nothing."""
+_SHORTEST_SILENCE_S: Final = 0.1
+"""A shorter silence is one exchange on a bus: messages omit its length."""
 _NO_MORE_TENTHS_S: Final = 10.0
 
 
 @dataclass(kw_only=True, eq=False)
 class TradeError(Exception):
-    """Root of everything this project raises on purpose."""
+    """The root of all errors that this project raises on purpose."""
 
     def __str__(self) -> str:
         return self.describe()
 
     def describe(self) -> str:
-        """The message: what happened, then what to do."""
+        """The message: what happened, why, and what to do."""
         return type(self).__name__
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -90,18 +114,18 @@ def _rebuild(cls: type[TradeError], data: dict[str, object]) -> TradeError:
 
 
 def _some(texts: Sequence[str]) -> str:
-    """The first five."""
+    """The first five, as a list in prose."""
     return ", ".join(list(texts)[:5]) + (", ..." if len(texts) > 5 else "")
 
 
-def _nobody_at(apart: Sequence[str]) -> str:
-    """At which endpoints nobody was found, and why."""
-    return "; ".join(f"nobody answers at {endpoint}" for endpoint in apart)
+def _unanswered(apart: Sequence[str]) -> str:
+    """The endpoints at which no container answers, with the reasons."""
+    return "; ".join(f"no container answers at {endpoint}" for endpoint in apart)
 
 
 def _for(seconds: float) -> str:
-    """How long something has lasted, if that is worth telling."""
-    if seconds < _WORTH_TELLING_S:
+    """The length of a silence; empty if it is too short to matter."""
+    if seconds < _SHORTEST_SILENCE_S:
         return ""
     return f" for {seconds:.1f} s" if seconds < _NO_MORE_TENTHS_S else f" for {seconds:.0f} s"
 
@@ -111,7 +135,7 @@ def _for(seconds: float) -> str:
 
 @dataclass(kw_only=True, eq=False)
 class CallerError(TradeError):
-    """The caller asked for something that cannot be given."""
+    """The caller asked for something that it cannot have."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -122,25 +146,25 @@ class NoSuchService(CallerError, LookupError):
     waited_s: float = 0.0
     near: Sequence[str] = ()
     groups: Sequence[str] = ()
-    """Some of those there are in the system."""
+    """Some of the groups in the system."""
     apart: Sequence[str] = ()
-    """Endpoints where nobody was found, each with the reason, if nobody else was found at all."""
+    """Endpoints where no container was found, each with the reason, if this container found no other one."""
     hidden: str = ""
-    """Why it would not be seen here if it was there, in words of the policy; empty: it would."""
+    """Why the policy would hide a matching service from this container; empty if it would not."""
 
     def describe(self) -> str:
-        return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
+        return f"no service matches {self.constraint} after {self.waited_s:.3g} s. {self._hint()}"
 
     def _hint(self) -> str:
         if self.hidden:
-            return f"{self.hidden}; so nothing of it is seen here, and whoever keeps the policy can change that"
+            return f"{self.hidden}, so such services are hidden here. Ask the policy's maintainer for access"
         if self.near:
-            return f"did you mean {' or '.join(self.near)}?"
+            return f"Did you mean {' or '.join(self.near)}?"
         if self.groups:
-            return f"there is {_some(self.groups)}; `trade services` lists what they offer"
+            return f"This system has {_some(self.groups)}; `trade services` lists their services"
         if self.apart:
-            return _nobody_at(self.apart)
-        return "nothing is offered in this system: is its provider up, with the same TRADE_SYSTEM?"
+            return f"This container has no link to another one: {_unanswered(self.apart)}"
+        return "No services are registered in this system. Is the provider running with the same TRADE_SYSTEM?"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -150,15 +174,15 @@ class TooManyServices(CallerError, LookupError):
     constraint: str
     matches: Sequence[str]
     differ: Sequence[str] = ()
-    """Keywords of ``where`` that tell some of them apart."""
+    """Keywords of ``where`` that distinguish some of them."""
 
     def describe(self) -> str:
         if self.differ:
-            remedy = f"add a constraint on what tells them apart ({', '.join(self.differ)})"
+            remedy = f"Add a constraint on what distinguishes them ({', '.join(self.differ)})"
         else:
-            remedy = "nothing that can be asked for tells them apart: register them in groups or with meta of their own"
+            remedy = "No constraint distinguishes them. Register them in different groups or with different meta"
         found = f"{len(self.matches)} services match {self.constraint}: {_some(self.matches)}"
-        return f"{found}; {remedy}, or take them all with trade.services(...)"
+        return f"{found}. {remedy}, or take them all with trade.services(...)"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -168,10 +192,10 @@ class ServiceGone(CallerError, LookupError):
     service: str
     reason: str = "its provider was deregistered"
     moved_to: str = ""
-    """Where its provider goes on, if it moved: ``identity/container/epoch/domain/provider``. Handles do not follow."""
+    """Where its provider is now, if it moved: ``identity/container/epoch/domain/provider``. Handles do not follow."""
 
     def describe(self) -> str:
-        return f"{self.service} is gone: {self.reason}; look it up again with trade.find(...)"
+        return f"{self.service} is gone: {self.reason}. Look it up again with trade.find(...)"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -185,13 +209,13 @@ class InvalidArgument(CallerError, ValueError, TypeError):
 
     def describe(self) -> str:
         where = f" argument {self.argument!r}" if self.argument else ""
-        tail = f"; it is called as {self.signature}" if self.signature else ""
+        tail = f". Call it as {self.signature}" if self.signature else ""
         return f"{self.service}{where}: {self.problem}{tail}"
 
 
 @dataclass(kw_only=True, eq=False)
 class LimitExceeded(CallerError, ValueError):
-    """A commanded value lies outside a configured limit; it was refused, not clipped."""
+    """A commanded value is outside a configured limit; it was refused, not clipped."""
 
     what: str
     value: float
@@ -209,19 +233,19 @@ class LimitExceeded(CallerError, ValueError):
 
 @dataclass(kw_only=True, eq=False)
 class NotSerialisable(CallerError, TypeError):
-    """A value cannot be sent: it is no plain data, struct, dataclass, enum or handle."""
+    """A value cannot be sent, because it is not plain data, a struct, a dataclass, an enum or a handle."""
 
     service: str
     what: str
     problem: str
 
     def describe(self) -> str:
-        return f"{self.service}: {self.what} cannot be sent: {self.problem}; use plain data, a struct or a handle"
+        return f"{self.service}: {self.what} cannot be sent: {self.problem}. Use plain data, a struct or a handle"
 
 
 @dataclass(kw_only=True, eq=False)
 class TooLarge(CallerError, ValueError):
-    """Arguments or a result are larger than a message may be; not a byte of them was sent."""
+    """Arguments or a result are larger than a message may be; nothing was sent."""
 
     service: str
     what: str
@@ -231,8 +255,8 @@ class TooLarge(CallerError, ValueError):
     def describe(self) -> str:
         size, limit = self.size_bytes / (1 << 20), self.limit_bytes / (1 << 20)
         return (
-            f"{self.service}: {self.what} of {size:.1f} MiB ({self.size_bytes} bytes) cannot be sent, the limit is "
-            f"{limit:.0f} MiB; send it in parts"
+            f"{self.service}: {self.what} of {size:.1f} MiB ({self.size_bytes} bytes) cannot be sent. The limit is "
+            f"{limit:.0f} MiB. Send smaller parts"
         )
 
 
@@ -256,14 +280,14 @@ class OutcomeUnknown(CallerError, TimeoutError):
 
     def describe(self) -> str:
         return (
-            f"no answer from {self.service} within {self.deadline_s:.3g} s; whether it ran is unknown. Look at its "
-            "state before trying again; handle.with_(deadline_s=...) waits longer"
+            f"no answer from {self.service} within {self.deadline_s:.3g} s. Whether it ran is unknown. Check its "
+            "state before you try again; handle.with_(deadline_s=...) waits longer"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class MotionStopped(CallerError, RuntimeError):
-    """A motion ended before its goal because somebody wanted it to; the joint holds where it stopped."""
+    """A motion was stopped before its goal; the joint holds where it stopped."""
 
     device: str
     reason: str
@@ -274,7 +298,7 @@ class MotionStopped(CallerError, RuntimeError):
 
 @dataclass(kw_only=True, eq=False)
 class Stopped(CallerError, RuntimeError):
-    """A stop by somebody else holds until it is resumed; nothing moves before that."""
+    """A stop by another client holds until it is resumed; nothing moves before that."""
 
     resource: str
     by: str
@@ -282,74 +306,74 @@ class Stopped(CallerError, RuntimeError):
     estop: bool = False
     """Whether an e-stop is open."""
     cleared: bool = False
-    """Whether an e-stop did it that is cleared by now: what it stopped waits for who resumes it."""
+    """Whether the stop was an e-stop that is cleared now; what it stopped still has to be resumed."""
 
     def describe(self) -> str:
         remedy = "`trade estop --clear`" if self.estop else f"trade.resume(...) or `trade resume {self.resource}`"
-        cleared = " That e-stop is cleared, and nobody has resumed what it stopped." if self.cleared else ""
+        cleared = " That e-stop is cleared, but what it stopped was not resumed yet." if self.cleared else ""
         said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
         return f"{said} When it is safe to move, call {remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchEstop(CallerError, LookupError):
-    """Nobody in the system knows an e-stop of that id as open; nothing was cleared."""
+    """No container in the system has an open e-stop of that id; nothing was cleared."""
 
     ids: Sequence[str]
     open: Sequence[str]
-    """Those that are."""
+    """The ids of the open ones."""
 
     def describe(self) -> str:
-        there = f"open {'is' if len(self.open) == 1 else 'are'} {_some(self.open)}" if self.open else "none is open"
-        return f"there is no open e-stop {', '.join(self.ids)}; {there}"
+        there = f"Open e-stops: {_some(self.open)}" if self.open else "No e-stop is open"
+        return f"there is no open e-stop {', '.join(self.ids)}. {there}"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchNotification(CallerError, LookupError):
-    """No notification of that id stands anywhere that is known here."""
+    """No known container has a notification of that id."""
 
     id: str
 
     def describe(self) -> str:
-        return f"there is no notification {self.id}: it has ended, or was cancelled; `trade notifications` lists them"
+        return f"there is no notification {self.id}. It has ended or was cancelled; `trade notifications` lists them"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchHook(CallerError, LookupError):
-    """No hook of that id is attached anywhere that is known here."""
+    """No known container has a hook of that id."""
 
     id: str
 
     def describe(self) -> str:
-        return f"there is no hook {self.id}: it was detached, or who attached it has ended; `trade hooks` lists them"
+        return f"there is no hook {self.id}. It was detached, or its owner has ended; `trade hooks` lists them"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchCall(CallerError, LookupError):
-    """No container has noted a call of that id."""
+    """No container has traced a call of that id."""
 
     id: int
 
     def describe(self) -> str:
         return (
-            f"no container has noted a call {self.id}: none that it touched is traced (`trade tracing on`), it has not "
-            "ended, or newer calls took its place"
+            f"no container has traced call {self.id}. Its containers are not traced (`trade tracing on`), it has not "
+            "ended, or newer calls have replaced it"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class NotInstantiable(CallerError, PermissionError):
-    """The settings of the container do not allow to make objects of that class; nothing was imported."""
+    """The container's settings do not allow it to create objects of that class; nothing was imported."""
 
     class_path: str
     container: str
     allowed: Sequence[str] = ()
 
     def describe(self) -> str:
-        allowed = f"only {_some(self.allowed)}" if self.allowed else "none at all"
+        allowed = f"only {_some(self.allowed)}" if self.allowed else "no class"
         return (
-            f"container {self.container} may not make a {self.class_path}: it allows {allowed}; start it with "
-            f"`trade container --allow {self.class_path}`, or TRADE_INSTANTIABLE"
+            f"container {self.container} may not create a {self.class_path}. It allows {allowed}. Start it with "
+            f"`trade container --allow {self.class_path}`, or set TRADE_INSTANTIABLE"
         )
 
 
@@ -363,14 +387,14 @@ class NoSuchClass(CallerError, LookupError):
 
     def describe(self) -> str:
         return (
-            f"there is no class {self.class_path} in container {self.container}: {self.reason}; is its package "
-            "installed there, and is it package.module:Class?"
+            f"container {self.container} has no class {self.class_path}: {self.reason}. Is its package installed "
+            "there, and is the path package.module:Class?"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class AccessDenied(CallerError, PermissionError):
-    """The access policy does not allow it; nothing was done."""
+    """The access policy forbids it; nothing was done."""
 
     who: str
     """The identity that asked."""
@@ -378,18 +402,18 @@ class AccessDenied(CallerError, PermissionError):
     what: str
     """The group, or the service."""
     rule: str
-    """Why, in words of the policy."""
+    """Why the policy forbids it."""
 
     def describe(self) -> str:
         return (
-            f"{self.who} may not {self.verb} {self.what}: {self.rule}; "
-            "`trade policy show` tells who may what, and whoever keeps the policy can change it"
+            f"{self.who} may not {self.verb} {self.what}: {self.rule}. "
+            "`trade policy show` lists all rights. Ask the policy's maintainer for access"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class LockedByOther(CallerError, PermissionError):
-    """Somebody else has it for themselves."""
+    """Another client has locked it."""
 
     resources: Sequence[str]
     owner: str
@@ -397,69 +421,69 @@ class LockedByOther(CallerError, PermissionError):
     since: float = 0.0
     """Seconds since the epoch, by the clock of the container that granted it."""
     own: bool = False
-    """The owner is this very container, in another thread or task."""
+    """Whether the owner is this same container, in another thread or task."""
 
     def describe(self) -> str:
         what = ", ".join(self.resources)
         aim = f" for {self.purpose!r}" if self.purpose else ""
         when = f" since {clock(self.since)}" if self.since else ""
         if self.own:
-            hint = "that is this container itself: make the call inside `with lock.use():`"
+            hint = "That is this container itself. Make the call inside `with lock.use():`"
         else:
-            hint = "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
-        return f"{what} is locked by {self.owner}{aim}{when}; {hint}"
+            hint = "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
+        return f"{what} is locked by {self.owner}{aim}{when}. {hint}"
 
 
 @dataclass(kw_only=True, eq=False)
 class InUse(CallerError, PermissionError):
-    """A container was to end only if nothing of it is locked and nothing moves; nothing was done."""
+    """A container was to end only if none of its resources is locked or moves; nothing was done."""
 
     container: str
     uses: Sequence[str]
 
     def describe(self) -> str:
-        return f"container {self.container} is in use: {'; '.join(self.uses)}; wait, or ask its user to let go"
+        return f"container {self.container} is in use: {'; '.join(self.uses)}. Wait, or ask the user to release it"
 
 
 @dataclass(kw_only=True, eq=False)
 class LockLost(CallerError, ConnectionError):
-    """A lock one had holds no more; nothing was done under it, and what moved under it was told to stop."""
+    """The caller's lock no longer holds; the call did not run, and any motion under the lock is stopped."""
 
     resources: Sequence[str]
     reason: str
 
     def describe(self) -> str:
-        return f"the lock of {', '.join(self.resources)} is lost: {self.reason}; take it anew with trade.lock(...)"
+        return f"the lock of {', '.join(self.resources)} is lost: {self.reason}. Take it again with trade.lock(...)"
 
 
 @dataclass(kw_only=True, eq=False)
 class SessionEnded(CallerError, ConnectionError):
-    """Whoever asks is not there any more: nothing was done, and what he had set moving was told to stop."""
+    """The caller's session has ended: the call did not run, and any motion of that session is stopped."""
 
     session: str
     reason: str
 
     def describe(self) -> str:
-        return f"session {self.session} has ended: {self.reason}; open another one with trade.open_session(...)"
+        return f"session {self.session} has ended: {self.reason}. Open another one with trade.open_session(...)"
 
 
 @dataclass(kw_only=True, eq=False)
 class IncompleteGroup(CallerError, LookupError):
-    """Members of a robot's group, or alternatives of a constraint, are not there: no lock over the whole of it."""
+    """Members of a robot's group, or alternatives of a constraint, are missing, so it cannot be locked as a whole."""
 
     group: str
     missing: Sequence[str]
 
     def describe(self) -> str:
         return (
-            f"{self.group} is not complete: {', '.join(self.missing)} missing; start what drives it, or lock what is "
-            "there with partial=True"
+            f"{self.group} is not complete: {', '.join(self.missing)} missing. Start the missing drivers, or lock the "
+            "rest with partial=True"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class NotLocked(CallerError, PermissionError):
-    """The lock around a command selects the service and does not hold it; nothing was sent."""
+    """The lock around a command selects the service but does not hold it; nothing was sent."""
 
     service: str
     selected_by: str
@@ -467,8 +491,8 @@ class NotLocked(CallerError, PermissionError):
 
     def describe(self) -> str:
         return (
-            f"{self.service} is selected by the lock of {self.selected_by}, which does not hold it: it was not there "
-            "when the lock was taken. Give it back and take the lock again"
+            f"{self.service} is selected by the lock of {self.selected_by}, which does not hold it: it joined after "
+            "the lock was taken. Release the lock and take it again"
         )
 
 
@@ -487,7 +511,7 @@ class Cancelled(CallerError):
 
 @dataclass(kw_only=True, eq=False)
 class CallError(TradeError):
-    """The far side of a call failed."""
+    """The other side of a call failed."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -499,93 +523,93 @@ class ContainerLost(CallError, ConnectionError):
 
     def describe(self) -> str:
         return (
-            f"container {self.container} was lost during a call of {self.service}; whether it ran is unknown. "
-            "Find the service again and look at its state"
+            f"container {self.container} was lost during a call of {self.service}. Whether it ran is unknown. "
+            "Find the service again and check its state"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class SourceLost(ContainerLost):
-    """The container whose service is listened to ended or became unreachable."""
+    """The container that publishes a stream ended or became unreachable."""
 
     def describe(self) -> str:
         return (
-            f"container {self.container} was lost while {self.service} was listened to; samples come again when it is "
-            "back. If it was restarted, find the service again and open another stream"
+            f"container {self.container} was lost during a stream of {self.service}. Samples resume when it is back. "
+            "If it was restarted, find the service again and open another stream"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class Busy(CallError, BlockingIOError):
-    """All handler threads of the container are taken; nothing ran."""
+    """All handler threads of the container are busy; nothing ran."""
 
     service: str
     container: str
 
     def describe(self) -> str:
-        return f"{self.service} did not run: container {self.container} has no free handler thread; try again shortly"
+        return f"{self.service} did not run: container {self.container} has no free handler thread. Try again shortly"
 
 
 @dataclass(kw_only=True, eq=False)
 class CannotInstantiate(CallError, RuntimeError):
-    """The class raised when it was imported or made; nothing was registered."""
+    """The class raised an exception on import or creation; nothing was registered."""
 
     class_path: str
     container: str
     problem: str
 
     def describe(self) -> str:
-        return f"{self.class_path} could not be made in container {self.container}: {self.problem}"
+        return f"{self.class_path} could not be created in container {self.container}: {self.problem}"
 
 
 @dataclass(kw_only=True, eq=False)
 class CannotMigrate(CallError, RuntimeError):
-    """A provider did not move to another container; it goes on where it was."""
+    """A provider did not move to another container; it continues where it was."""
 
     provider: str
     to: str
     problem: str
     withdrawn: bool = False
-    """It was withdrawn for a moment: handles from before are dead."""
+    """Whether it was withdrawn for a moment, which ended its earlier handles."""
 
     def describe(self) -> str:
-        after = "it is offered again where it was, under new handles" if self.withdrawn else "it goes on where it was"
-        return f"{self.provider} did not move to container {self.to}: {self.problem}; {after}"
+        after = "It is offered again where it was, under new handles" if self.withdrawn else "It continues where it was"
+        return f"{self.provider} did not move to container {self.to}: {self.problem}. {after}"
 
 
 @dataclass(kw_only=True, eq=False)
 class MigrationUnknown(CallError, ConnectionError):
-    """Contact was lost at the moment a provider moved; it is offered there, or nowhere, and never twice."""
+    """Contact was lost while a provider moved; it is offered in the new place or nowhere, never in both."""
 
     provider: str
     container: str
     """Where it was."""
     to: str
     withdrawn: str
-    """The name by which `System.register` offers it again where it was."""
+    """The name with which `System.register` offers it again where it was."""
 
     def describe(self) -> str:
         remedy = f"`trade call trade.register '\"{self.withdrawn}\"' --container {self.container}`"
         return (
-            f"container {self.to} was lost when {self.provider} moved there: it may be alive and offer it. If it has "
+            f"container {self.to} was lost while {self.provider} moved there. It may be alive and offer it. If it has "
             f"ended for good, {remedy} offers it again"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class InvalidResult(CallError, TypeError):
-    """The provider returned something else than its annotation says; a defect of the provider."""
+    """The provider's result does not match its return annotation; a defect of the provider."""
 
     service: str
     problem: str
 
     def describe(self) -> str:
-        return f"{self.service} ran, but its result breaks its own annotation: {self.problem}; mend the provider"
+        return f"{self.service} ran, but its result does not match its annotation: {self.problem}. Fix the provider"
 
 
 @dataclass(kw_only=True, eq=False)
 class RemoteError(CallError, RuntimeError):
-    """The provider raised an exception of a type this process does not know."""
+    """The provider raised an exception of a type that this process does not know."""
 
     service: str
     type_name: str
@@ -601,7 +625,7 @@ class RemoteError(CallError, RuntimeError):
 
 @dataclass(kw_only=True, eq=False)
 class DeviceError(TradeError):
-    """A device did not do what it was told."""
+    """A device did not carry out a command."""
 
     device: str
     bus: str
@@ -609,14 +633,14 @@ class DeviceError(TradeError):
 
 @dataclass(kw_only=True, eq=False)
 class DeviceSilent(DeviceError, TimeoutError):
-    """A device has not answered within its time; the last values are too old to be trusted."""
+    """A device did not answer in time; its last values are too old to trust."""
 
     waited_s: float
-    """How long it has not: since it was asked, or since it was last measured."""
+    """How long it has been silent: since the request, or since its last measurement."""
 
     def describe(self) -> str:
         return (
-            f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}; is it powered, plugged in, and set to "
+            f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}. Is it powered, plugged in, and set to "
             "the id and baud rate of the robot file? If it is simulated, this computer may be too busy"
         )
 
@@ -634,10 +658,10 @@ class DeviceFault(DeviceError, RuntimeError):
 
 @dataclass(kw_only=True, eq=False)
 class BusGone(DeviceSilent, ConnectionError):
-    """The port of a bus is gone: unplugged, down, or off the bus. It is opened again by itself when it comes back."""
+    """The port of a bus is gone: unplugged, down, or off the bus. The driver reopens it when it comes back."""
 
     reason: str = ""
-    """What its system or its adapter says."""
+    """What the operating system or the adapter reports."""
 
     def describe(self) -> str:
         why = self.reason or "plug its adapter in again"
@@ -649,21 +673,21 @@ class BusGone(DeviceSilent, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class NotStopped(DeviceSilent):
-    """It could not be stopped when it had to be: nobody gets a lock on it before somebody has looked and resumes it."""
+    """A required stop failed: no client can lock the device until a person has checked and resumed it."""
 
     reason: str
-    """Why, and when that was."""
+    """When the stop failed, and why."""
 
     def describe(self) -> str:
         return (
-            f"{self.device} on {self.bus}: could not be stopped {self.reason}, so nobody gets a lock on it; "
-            f"look at it, then `trade resume {self.device}`"
+            f"{self.device} on {self.bus} could not be stopped {self.reason}, so no client can lock it. "
+            f"Check it, then run `trade resume {self.device}`"
         )
 
 
 @dataclass(kw_only=True, eq=False)
 class ToleranceExceeded(DeviceError, RuntimeError):
-    """A joint is farther from its trajectory than it may be: where it begins, on the way, or where it ends."""
+    """A joint is farther from its trajectory than its tolerance allows: at the start, on the way, or at the end."""
 
     what: str
     """``start``, ``path`` or ``goal``."""
@@ -672,10 +696,10 @@ class ToleranceExceeded(DeviceError, RuntimeError):
 
     def describe(self) -> str:
         off = f"{self.device} is {abs(self.error_rad):.3g} rad off the {self.what} of its trajectory"
-        remedy = "it holds; look whether it is blocked or overloaded, give it more time, or allow more"
+        remedy = "It holds. Check whether it is blocked or overloaded, give it more time, or allow more"
         if self.what == "start":
-            remedy = "nothing was sent; begin where it is"
-        return f"{off}, {self.tolerance_rad:.3g} is allowed: {remedy}"
+            remedy = "Nothing was sent. Begin where it is"
+        return f"{off}; {self.tolerance_rad:.3g} rad is allowed. {remedy}"
 
 
 # --- the set-up
@@ -683,12 +707,12 @@ class ToleranceExceeded(DeviceError, RuntimeError):
 
 @dataclass(kw_only=True, eq=False)
 class SetupError(TradeError):
-    """Something about the installation or configuration must be changed."""
+    """The installation or the configuration must change."""
 
 
 @dataclass(kw_only=True, eq=False)
 class ConfigurationError(SetupError, ValueError):
-    """A setting, file or installation is wrong; the message says where and what would be right."""
+    """A setting, a file or the installation is wrong; the message says where, and what would be right."""
 
     problem: str
     where: str = ""
@@ -699,23 +723,23 @@ class ConfigurationError(SetupError, ValueError):
 
 @dataclass(kw_only=True, eq=False)
 class WrongDevice(ConfigurationError):
-    """A device answers that is not the one the robot file means."""
+    """The device that answers is not the one in the robot file."""
 
     problem: str = ""
     key: str
-    """Of the robot file: ``model``, ``firmware``, ``serial_number`` or ``homing_counts``."""
+    """The key of the robot file: ``model``, ``firmware``, ``serial_number`` or ``homing_counts``."""
     expected: str
     found: str
 
     def describe(self) -> str:
         says = self.problem or f"the robot file says {self.expected}, but the device says {self.found}"
-        remedy = f"attach that one, or correct {self.key} if this one has taken its place, and calibrate it"
-        return f"{self.where}.{self.key}: {says}; {remedy}"
+        remedy = f"Attach that device, or, if this one has replaced it, correct {self.key} and calibrate it"
+        return f"{self.where}.{self.key}: {says}. {remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
 class CannotConnect(SetupError, ConnectionError):
-    """Nobody at the endpoint lets this container in."""
+    """No container at the endpoint accepts this one."""
 
     endpoint: str
     reason: str
@@ -726,28 +750,28 @@ class CannotConnect(SetupError, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class NobodyFound(SetupError, ConnectionError):
-    """Nobody else was found in the system, or not all of it: what was asked cannot be told."""
+    """No other container was found in the system, or some are missing, so the request has no reliable answer."""
 
     system: str
     so: str = ""
-    """What cannot be told therefore, and what to do."""
+    """What is unknown therefore, and what to do."""
     others: bool = False
-    """Whether somebody was found."""
+    """Whether another container was found."""
     silent: Sequence[str] = ()
-    """Containers that are there, and have not answered."""
+    """Containers that are present but have not answered."""
     apart: Sequence[str] = ()
-    """Endpoints where nobody was found, each with the reason."""
+    """Endpoints where no container was found, each with the reason."""
 
     def describe(self) -> str:
-        said = [] if self.others else [f"nobody was found in system {self.system}"]
-        said += [_nobody_at(self.apart)] if self.apart else []
+        said = [] if self.others else [f"no other container was found in system {self.system}"]
+        said += [_unanswered(self.apart)] if self.apart else []
         said += [f"{_some(self.silent)} did not answer"] if self.silent else []
         return "; ".join([*said, self.so] if self.so else said)
 
 
 @dataclass(kw_only=True, eq=False)
 class CannotStart(SetupError, ConnectionError):
-    """No container was started on the host, or it does not come into this system."""
+    """No container was started on the host, or it did not join this system."""
 
     host: str
     container: str
@@ -755,7 +779,7 @@ class CannotStart(SetupError, ConnectionError):
     """``unknown host key``, ``changed host key``, ``not let in``, ``refused``, ``timeout``, ``unknown host``,
     ``no trade there``, ``it did not come up``, ``no answer``, ``not seen``, ``no ssh here`` or ``ssh failed``."""
     said: str
-    """By ssh, or by the command there."""
+    """The output of ssh, or of the command on the host."""
     remedy: str
 
     def describe(self) -> str:
@@ -765,12 +789,12 @@ class CannotStart(SetupError, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class LinkStays(SetupError, RuntimeError):
-    """A link cannot be cut while both of its containers run; the transport has no way to."""
+    """The transport cannot cut a link while both of its containers run."""
 
     to: str
 
     def describe(self) -> str:
         return (
-            f"the link to {self.to} stays while both containers run; it is dialled no more. To cut it, close one of "
-            "them, or give them different credentials and restart it"
+            f"the link to {self.to} stays while both containers run, but is not dialled again. To cut it, close one "
+            "of them, or give them different credentials and restart it"
         )

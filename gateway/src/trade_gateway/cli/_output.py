@@ -102,11 +102,11 @@ def complain(text: str) -> None:
 
 
 REMEDIES: Final = {
-    "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)": (
-        "wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`"
+    "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)": (
+        "Wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`"
     ),
-    "take it anew with trade.lock(...)": "take it anew with `trade lock`",
-    "look it up again with trade.find(...)": "`trade services` lists what there is",
+    "Take it again with trade.lock(...)": "Take it again with `trade lock`",
+    "Look it up again with trade.find(...)": "`trade services` lists all services",
     "take them all with trade.services(...)": "see all of them with `trade services`",
     "handle.with_(deadline_s=...) waits longer": "--deadline SECONDS waits longer",
     "give it a longer one": "--deadline SECONDS gives it more",
