@@ -88,7 +88,7 @@ def test_what_fails_is_logged_and_harms_nothing(
 
     hands.begin(fail, "work")
     assert eventually(lambda: idle(hands) == 1)
-    assert "what was begun failed" in caplog.text
+    assert "work in the thread pool failed" in caplog.text
     done_by(hands)
 
 

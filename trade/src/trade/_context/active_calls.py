@@ -1,4 +1,4 @@
-"""What a container runs and has run: every call id once, cancelled on request, telling how far it is."""
+"""The calls that a container runs or has run: each call id runs once, can be cancelled, and reports its progress."""
 
 import logging
 import threading
@@ -27,11 +27,11 @@ Key = tuple[str, int]
 """Who called, and the call's id."""
 
 _rare = threading.Lock()
-"""Guards what few calls have: an event, something to do when they are cancelled."""
+"""Guards what few calls have: an event and cancel callbacks."""
 
 
 class ActiveCall:
-    """One call from its arrival on."""
+    """One call, from its arrival on."""
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
@@ -42,43 +42,43 @@ class ActiveCall:
         self.caller = caller
         self.call = call
         self.report = report
-        """Takes what the provider says of its progress without waiting: `Dispatcher._report`, or the local target's."""
+        """Takes the provider's progress without waiting: `Dispatcher._report`, or the local target's."""
         self.said: Raw | None = None
-        """The latest that was said of it and is not sent yet."""
+        """The latest progress that is not sent yet."""
         self.cancelled = False
         self.answer: Answer | None = None
         self.also: list[Call] | None = None
-        """The same call, come again while it ran."""
+        """Repetitions of the same call that arrived while it ran."""
         self.size = 0
         self.queued_ns = 0
-        """When it was put in the queue of a serial provider; 0 if it was not."""
+        """When it entered the queue of a serial provider; 0 if it did not."""
         self._event: threading.Event | None = None
         self._on_cancel: list[Callable[[], object]] | None = None
 
     def cancel(self) -> None:
-        """Ask the provider to end it. Idempotent."""
+        """Asks the provider to end it. Idempotent."""
         with _rare:
             if self.cancelled:
                 return
             self.cancelled = True
-            told, self._on_cancel = self._on_cancel, None
+            callbacks, self._on_cancel = self._on_cancel, None
             if self._event is not None:
                 self._event.set()
-        for tell in told or ():
-            tell()
+        for callback in callbacks or ():
+            callback()
 
-    def on_cancel(self, tell: Callable[[], object]) -> Callable[[], None]:
-        """Call this when it is cancelled, at once if it was. Returns what takes that back."""
+    def on_cancel(self, callback: Callable[[], object]) -> Callable[[], None]:
+        """Calls this when the call is cancelled; at once if it was. Returns a function that unsubscribes."""
         with _rare:
             known = not self.cancelled
             if known:
-                self._on_cancel = [*(self._on_cancel or ()), tell]
+                self._on_cancel = [*(self._on_cancel or ()), callback]
         if not known:
-            tell()
+            callback()
 
         def forget() -> None:
             with _rare:
-                self._on_cancel = [one for one in self._on_cancel or () if one is not tell]
+                self._on_cancel = [one for one in self._on_cancel or () if one is not callback]
 
         return forget
 
@@ -93,7 +93,7 @@ class ActiveCall:
 
 
 def end_calls(cancels: Sequence[Callable[[], object]]) -> None:
-    """Ask calls to end, on a thread of their own: what they do then keeps nobody waiting."""
+    """Asks calls to end, on another thread, so that their callbacks do not delay the caller."""
     if cancels:
         threading.Thread(target=_end, args=(cancels,), name="trade-cancel", daemon=True).start()
 
@@ -103,28 +103,28 @@ def _end(cancels: Sequence[Callable[[], object]]) -> None:
         try:
             cancel()
         except Exception:
-            _logger.exception("a call that was to end failed to")
+            _logger.exception("a call could not be cancelled")
 
 
 class CallDeduplicator:
-    """Every call that runs, and the answers of those that commanded something, until they can come no more.
+    """Runs no call twice: it keeps running calls, and answers of commands until the calls can no longer be repeated.
 
-    What merely reads is forgotten when it has ended: to run it again changes nothing. A call under way is never
-    forgotten. Too many or too large answers: the oldest lose their text first, and are then known by their number only.
+    A call that only reads is forgotten when it ends: repeating it changes nothing. A running call is never forgotten.
+    If answers are too many or too large, the oldest lose their text first, and only their number stays known.
     """
 
     def __init__(self) -> None:
         self._calls: dict[Key, ActiveCall] = {}
         self._until: list[tuple[int, Key]] = []
-        """A heap of when which kept call may go."""
+        """A heap of times from which kept calls may be forgotten."""
         self._bodies: dict[Key, ActiveCall] = {}
         self._bytes = 0
         self._evicted: dict[Key, int] = {}
-        """Caller and the upper bits of its ids -> the highest id let go before its time; they count upwards."""
+        """Caller and upper bits of its ids -> the highest id that was evicted early; ids count upwards."""
         self._lock = threading.Lock()
 
     def begin(self, call: Call, ongoing: ActiveCall) -> ActiveCall:
-        """Note a call; returns the earlier one if it came before, which is then not to be run again."""
+        """Records a call; returns the earlier one if it is a repetition, which must not run again."""
         found = self._calls.setdefault((ongoing.caller, call.id), ongoing)
         if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
             ongoing.answer = _unknown(call.service)
@@ -135,14 +135,14 @@ class CallDeduplicator:
         return self._calls.get((caller, call.id))
 
     def attach(self, ongoing: ActiveCall, again: Call) -> Answer | None:
-        """The answer of a call that came again; None while it runs: the answer then goes to this one, too."""
+        """The answer to a repeated call; None while it runs: the answer then goes to the repetition, too."""
         with self._lock:
             if ongoing.answer is None:
                 ongoing.also = [*(ongoing.also or ()), again]
             return ongoing.answer
 
     def end(self, ongoing: ActiveCall, call: Call, answer: Answer, *, keep: bool) -> list[Call] | None:
-        """Note how it ended; returns the other arrivals to answer."""
+        """Records how it ended; returns the repetitions to answer."""
         with self._lock:
             ongoing.answer = answer
             ongoing.call = ongoing.report = None  # the arguments may be large
@@ -151,13 +151,13 @@ class CallDeduplicator:
                 now = time.monotonic_ns()
                 self._keep_body(key, ongoing, len(memoryview(answer[1])), call.service)
                 heappush(self._until, ((call.expires_ns or now) + GRACE_NS, key))
-                self._let_go(now)
+                self._evict(now)
             else:
                 self._calls.pop(key, None)
             return ongoing.also
 
     def cancel(self, caller: str, call_id: int, service: str, keep_s: float) -> None:
-        """Cancel a call of this caller: ask it to end, or see to it that it never begins when it is yet to come."""
+        """Cancels a call of this caller: asks it to end, or prevents it from starting if it has not arrived yet."""
         with self._lock:
             found = self._calls.get((caller, call_id))
             if found is None:
@@ -166,12 +166,12 @@ class CallDeduplicator:
                 now = time.monotonic_ns()
                 self._calls[caller, call_id] = never
                 heappush(self._until, (now + int(keep_s * 1e9) + GRACE_NS, (caller, call_id)))
-                self._let_go(now)
+                self._evict(now)
         if found is not None and found.answer is None:
             found.cancel()
 
     def made_for(self, session: str) -> list[ActiveCall]:
-        """Calls under way that are made for a session, or for a part of it: by itself, or on its behalf."""
+        """Running calls that are made by a session or a part of it, or on its behalf."""
         return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
 
     def _keep_body(self, key: Key, ongoing: ActiveCall, size: int, service: str) -> None:
@@ -183,8 +183,8 @@ class CallDeduplicator:
             self._bytes -= oldest.size
             oldest.answer = _unknown(service)
 
-    def _let_go(self, now_ns: int) -> None:
-        """Forget what can come no more, and what is nearest to that where there is too much."""
+    def _evict(self, now_ns: int) -> None:
+        """Forgets calls that can no longer be repeated, and above the limit those that are nearest to that."""
         while self._until and (self._until[0][0] < now_ns or len(self._calls) > MOST_CALLS):
             until_ns, key = heappop(self._until)
             self._calls.pop(key, None)
@@ -210,19 +210,19 @@ def _unknown(service: str) -> Answer:
 
 
 def cancelled(service: str) -> Answer:
-    """What a call that was cancelled before it began is answered."""
+    """The answer to a call that was cancelled before it began."""
     return failed(Cancelled(service=service))
 
 
 def failed(error: BaseException) -> Answer:
-    """What a call that was not run is answered."""
+    """The answer to a call that did not run."""
     return Status.ERROR, Raw(encode_message(pack_error(error)))
 
 
 class ProgressReporter:
-    """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread.
+    """Sends the latest progress of each call, at most every 50 ms, on its own thread.
 
-    What was said last goes out before the answer, whenever that comes. What sends it is `Dispatcher._send_progress`.
+    The last progress goes out before the answer. `Dispatcher._send_progress` sends it.
     """
 
     EVERY_S: Final = 0.05
@@ -235,8 +235,8 @@ class ProgressReporter:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def tell(self, ongoing: ActiveCall, body: Raw) -> None:
-        """Have this sent soon, unless something newer comes first."""
+    def report(self, ongoing: ActiveCall, body: Raw) -> None:
+        """Sends this soon, unless newer progress replaces it."""
         with self._lock:
             ongoing.said = body
             self._news.add(ongoing)
@@ -256,16 +256,16 @@ class ProgressReporter:
             self._ended.wait(self.EVERY_S)
 
     def send(self, ongoing: ActiveCall) -> None:
-        """Send what was said last of it, unless it has been or is of no use any more."""
+        """Sends the latest progress of a call, unless it was sent or the call has ended."""
         body = ongoing.said
         if body is None or ongoing.answer is not None:
             return
         self._send(ongoing, body)
-        if ongoing.said is body:  # only now: rather twice than never
+        if ongoing.said is body:  # only now: better twice than never
             ongoing.said = None
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
+        """Ends the thread. Idempotent."""
         self._ended.set()
         self._some.set()
         if self._thread is not None and self._thread is not threading.current_thread():

@@ -1,4 +1,4 @@
-"""What a provider may know of the call it serves: who asks, until when, on whose behalf; and what it may say of it."""
+"""The call context: the caller, the deadline and the session of the served call; it also reports progress."""
 
 import time
 from collections.abc import Callable
@@ -16,16 +16,16 @@ __all__ = ["CallContext", "current_call", "progress"]
 
 _MOST_EVENTS: Final = 100
 _ANSWER_S: Final = 0.3
-"""For an answer to be made, and to travel back through whatever lies between."""
+"""The time reserved for making an answer and for its way back."""
 
 
 def outer_of(call_id: int, behalf: Behalf | None) -> int:
-    """The id of the call that began it all, of a call with that id and what it inherited."""
+    """The id of the outermost call that led to a call with this id."""
     return behalf.calls[-1] if behalf is not None and behalf.calls else call_id
 
 
 class Permitted(Protocol):
-    """What a call was admitted under; see `trade.Permit`."""
+    """The permit that a call was admitted under; see `trade.Permit`."""
 
     def gate(self) -> None: ...
 
@@ -37,37 +37,37 @@ class CallContext(Struct, frozen=True, gc=False):
     """Unique in the system."""
     service: str
     caller: str
-    """Identity of who asks."""
+    """The caller's identity."""
     session: str
-    """The client's presence on whose behalf this runs; motion belongs to it."""
+    """The session on whose behalf this runs; its motion belongs to that session."""
     expires_ns: int | None
     """``time.monotonic_ns()`` of this process after which nothing may begin; None if being late is harmless."""
     chain: tuple[str, ...] = ()
-    """Services whose calls led to this one, outermost first."""
+    """The services whose calls led to this one, outermost first."""
 
     ongoing: ActiveCall | None = None
-    """The middleware's own notes on it."""
+    """The middleware's own record of it."""
     behalf: Behalf | None = None
-    """What it inherited; its own calls inherit it, too, while it runs."""
+    """What it inherited; the calls that it makes inherit it, too."""
     permit: Permitted | None = None
     """What it may do to the resources of its service."""
     events: list[tuple[int, str]] | None = None
-    """What was noted of it, and when by ``time.monotonic_ns()``; None if it is not traced."""
+    """Its trace events, with times of ``time.monotonic_ns()``; None if it is not traced."""
 
     @property
     def asker(self) -> str:
-        """Who asks, for people: its caller, and the client that this one acts for: ``page for anna``."""
+        """The caller, and the client that it acts for, as text for people: ``page for anna``."""
         client = client_of(self.session)
         return f"{self.caller} for {client}" if client else self.caller
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """For whom it runs, nearest first: what it moves stops when one of them ends."""
+        """The sessions for which it runs, nearest first: its motion stops when one of them ends."""
         return (self.session,) if self.behalf is None else (self.session, *self.behalf.sessions)
 
     @property
     def outer_id(self) -> int:
-        """The id of the call that began it all, in whatever process: one for everything that comes of it."""
+        """The id of the outermost call, in any process; all calls that it led to share it."""
         return outer_of(self.id, self.behalf)
 
     @property
@@ -77,11 +77,11 @@ class CallContext(Struct, frozen=True, gc=False):
 
     @property
     def cancelled(self) -> bool:
-        """Whether its caller wants it to end; to heed it is up to the provider."""
+        """Whether its caller has cancelled it; ending it is up to the provider."""
         return self.ongoing is not None and self.ongoing.cancelled
 
     def wait_cancelled(self, timeout_s: float | None = None) -> bool:
-        """Wait until its caller wants it to end, at most this long, and never beyond its deadline.
+        """Waits until its caller cancels it, at most this long, and never beyond its deadline.
 
         Returns:
             Whether it was cancelled.
@@ -90,24 +90,24 @@ class CallContext(Struct, frozen=True, gc=False):
         allowed_s = left_s if timeout_s is None else timeout_s if left_s is None else min(timeout_s, left_s)
         if self.ongoing is not None:
             return self.ongoing.wait_cancelled(allowed_s)
-        time.sleep(allowed_s or 0.0)  # nobody can cancel it
+        time.sleep(allowed_s or 0.0)  # it cannot be cancelled
         return False
 
     def on_cancel(self, tell: Callable[[], object]) -> None:
-        """Have this called, on another thread, once its caller wants it to end; at once if it does already."""
+        """Calls this, on another thread, when its caller cancels the call; at once if that has happened."""
         if self.ongoing is not None:
             self.ongoing.on_cancel(tell)
 
     def raise_if_cancelled(self) -> None:
-        """Raise Cancelled, the way to end a cancelled call, if its caller wants it to end."""
+        """Raises Cancelled, the way to end a cancelled call, if its caller has cancelled it."""
         if self.cancelled:
             raise Cancelled(service=self.service)
 
     def progress(self, value: Any) -> None:
-        """Tell the caller how far it is: the latest value counts. Never waits.
+        """Reports progress to the caller: the latest value counts. Never waits.
 
         Args:
-            value: plain data, a struct, a handle: what ``run.progress()`` then gives.
+            value: plain data, a struct or a handle, which ``run.progress()`` then returns.
         """
         ongoing = self.ongoing
         report = None if ongoing is None else ongoing.report
@@ -115,9 +115,9 @@ class CallContext(Struct, frozen=True, gc=False):
             report(ongoing, value)
 
     def event(self, text: str) -> None:
-        """Note what has just happened, for whoever traces it; never a secret. Untraced it does nothing.
+        """Adds an event to the call's trace, never a secret; does nothing if the call is not traced.
 
-        Of one call the first hundred are kept.
+        The first hundred events of a call are kept.
         """
         events = self.events
         if events is not None and len(events) < _MOST_EVENTS:
@@ -129,10 +129,10 @@ class CallContext(Struct, frozen=True, gc=False):
         return None if self.expires_ns is None else max(0.0, (self.expires_ns - time.monotonic_ns()) / 1e9)
 
     def patience_s(self, wait_s: float) -> float:
-        """How long it may wait for others so that its caller is told of it if that was in vain, in seconds.
+        """How long it may wait for others, in seconds, and still answer its caller in time.
 
         Args:
-            wait_s: how long it would wait if it had no deadline.
+            wait_s: how long it would wait without a deadline.
         """
         left_s = self.remaining_s
         return wait_s if left_s is None else min(wait_s, left_s - min(_ANSWER_S, left_s / 5))
@@ -142,12 +142,12 @@ running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
 
 
 def current_call() -> CallContext | None:
-    """The call the running code serves, or None outside of one (also in a plain call of the method)."""
+    """The call that the running code serves, or None outside of one (also in a plain call of the method)."""
     return running.get()
 
 
 def served_call() -> CallContext:
-    """The call the running code serves: for the middleware's own functions, which are only called as services."""
+    """The call that the running code serves, for the middleware's own functions, which only run as services."""
     call = running.get()
     assert call is not None  # noqa: S101
     return call
@@ -160,7 +160,7 @@ def patience_s(wait_s: float) -> float:
 
 
 def progress(value: Any) -> None:
-    """Inside a service: tell the caller how far it is; see `CallContext.progress`. Elsewhere it does nothing."""
+    """Reports progress to the caller, inside a service; see `CallContext.progress`. Elsewhere it does nothing."""
     call = running.get()
     if call is not None:
         call.progress(value)

@@ -1,6 +1,6 @@
-"""What is around a service while it is called: a list of interceptors, the outermost first.
+"""Interceptors around a served call, the outermost first.
 
-Audit comes first and sees what the others do; then spans, then hooks. Each calls the next one, and the last of them
+Audit comes first and sees what the others do; then spans, then hooks. Each one calls the next, and the last one calls
 the service.
 """
 
@@ -13,7 +13,7 @@ from trade._protocol.messages import ServiceInfo
 
 
 class ServiceSignature(Protocol):
-    """What an interceptor asks of a signature."""
+    """The part of a signature that interceptors use."""
 
     has_secrets: bool
 
@@ -21,7 +21,7 @@ class ServiceSignature(Protocol):
 
 
 class ServedService(Protocol):
-    """A service of this container, as an interceptor sees it."""
+    """A service of this container, as interceptors see it."""
 
     label: str
     info: ServiceInfo
@@ -44,13 +44,13 @@ class ServedCall(NamedTuple):
 
 
 class Interceptor(ABC):
-    """What is called in place of a service, with what calls that: ``proceed()``."""
+    """Code that runs in place of a service, and calls it with ``proceed()``."""
 
     __slots__ = ()
 
     @abstractmethod
     def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
-        """Call what is inside, and do what comes before and after that. Errors of the service pass."""
+        """Calls ``proceed()``, with its own work before and after. Errors of the service pass through."""
 
     def rejected(self, call: ServedCall, error: BaseException) -> None:  # noqa: B027 - most have nothing to do then
-        """A call does not begin: its arguments, which it has not, are wrong."""
+        """Handles a call that does not begin because its arguments are wrong."""

@@ -1,4 +1,4 @@
-"""A call on its way out: until when, and what it inherits from where it is made: locks, a session, an outer call."""
+"""An outgoing call: its deadline, and the locks, session and outer call that it inherits from its context."""
 
 from collections.abc import Iterable, Sequence
 from contextvars import ContextVar
@@ -21,24 +21,24 @@ _NOBODY: Final = Behalf()
 
 
 class Claim(Struct, frozen=True):
-    """What a lock selects, and what of that it holds."""
+    """What a lock selects, and which part of that it holds."""
 
     constraint: Constraint | None = None
-    """None: it is of what it holds, and of nothing else."""
+    """None: it selects exactly what it holds."""
     held: dict[str, frozenset[str]] = {}
-    """Resources, by the address of the container that judges them."""
+    """Resources, by the address of the container that grants them."""
 
     def with_held(self, address: Address, names: Iterable[str]) -> "Claim":
-        """The same, and these are held, too."""
+        """The same claim with further held resources."""
         there = str(address)
         return Claim(self.constraint, {**self.held, there: self.held.get(there, frozenset()).union(names)})
 
     def covers(self, record: Record) -> bool:
-        """Whether all that a service uses is held."""
+        """Whether it holds all resources of a service."""
         return self.held.get(str(record.key.address), frozenset()).issuperset(record.used)
 
     def selects(self, record: Record) -> bool:
-        """Whether it is meant for a service, held or not."""
+        """Whether it selects a service, held or not."""
         return self.constraint is not None and self.constraint.matches(record)
 
 
@@ -47,7 +47,7 @@ class Held(Protocol):
 
     @property
     def owner(self) -> Address:
-        """The container whose lock it is; calls of others in this process do not carry it."""
+        """The container that owns the lock; calls of other containers in this process do not carry it."""
         ...
 
     @property
@@ -57,15 +57,15 @@ class Held(Protocol):
 
     @property
     def claim(self) -> Claim:
-        """What it selects, and what of that it holds."""
+        """What it selects, and which part of that it holds."""
         ...
 
     def tokens(self) -> Iterable[Token]:
-        """What shows it to those it was granted by; raises LockLost if it holds no more."""
+        """Its proofs for the containers that granted it; raises LockLost if it no longer holds."""
         ...
 
     def refused(self, by: Address, error: LockLost) -> None:
-        """Told that a container refused a call made under it."""
+        """Handles the refusal of a call made under it."""
         ...
 
 
@@ -77,23 +77,23 @@ handed_down: Final[dict[Address, Held]] = {}
 
 
 class Inherited(Struct, gc=False):
-    """What a call has from where it is made; most have nothing."""
+    """What a call inherits from its context; most calls inherit nothing."""
 
     outer: CallContext | None
     """The call that makes it."""
     around: tuple[Held, ...]
-    """The locks it is made under."""
+    """The locks around it."""
     client: Session | None
-    """For whom it is made; none: the container itself."""
+    """The client that it is made for; None: the container itself."""
     asked_s: float
-    """Without the outer call's deadline, which a stop does not heed: it is sent and waited for however late that is."""
+    """Its deadline without that of the outer call, which a stop ignores: a stop is sent however late it is."""
     asked_ns: int
 
     def session(self, own: Address) -> str:
-        """The client's session, if that container acts for one; else nothing.
+        """The client's session, if that container acts for one; else empty.
 
         Raises:
-            SessionEnded: the client is gone.
+            SessionEnded: the client has disconnected.
         """
         if self.client is None or self.client.owner != own:
             return ""
@@ -101,15 +101,15 @@ class Inherited(Struct, gc=False):
         return self.client.name
 
     def behalf(self, record: Record, own: Address) -> Behalf | None:
-        """What the call passes on; the locks around it unless it stops, which needs none.
+        """What the call passes on: also the locks around it, unless it is a stop, which needs none.
 
         Raises:
-            LockLost: it actuates, and would do so under a lock that holds no more.
-            NotLocked: it actuates, and the locks around it select its service and do not hold it.
-            Cancelled: it actuates, and the call that makes it was cancelled.
+            LockLost: it actuates under a lock that no longer holds.
+            NotLocked: it actuates, and the locks around it select its service but do not hold it.
+            Cancelled: it actuates, and its outer call was cancelled.
         """
         effect = record.info.effect
-        commands = effect == "actuate" and record.key.domain != DOMAIN  # the middleware's own functions are nobody's
+        commands = effect == "actuate" and record.key.domain != DOMAIN  # the middleware's own functions have no owner
         outer, around = self.outer, self.around
         if own in handed_down:
             around = (handed_down[own], *around)
@@ -132,7 +132,7 @@ class Inherited(Struct, gc=False):
 
 
 class Request(Struct, gc=False):
-    """One call on its way out."""
+    """One outgoing call."""
 
     deadline_s: float
     deadline_ns: int
@@ -140,17 +140,17 @@ class Request(Struct, gc=False):
     inherited: Inherited | None = None
 
     def presence(self, record: Record, own: Address) -> tuple[Behalf | None, str]:
-        """On whose behalf it is made, and in which session if not the container's own.
+        """What it is made on behalf of, and its session if that is not the container's own.
 
         Raises:
-            LockLost, NotLocked: it would be made under a lock that holds no more, or that selects it and has it not.
-            SessionEnded, Cancelled: it would be made for a client that is gone, or by a call that was cancelled.
+            LockLost, NotLocked: a lock around it no longer holds, or selects its service without holding it.
+            SessionEnded, Cancelled: its client has disconnected, or its outer call was cancelled.
         """
         inherited = self.inherited
         return (None, "") if inherited is None else (inherited.behalf(record, own), inherited.session(own))
 
     def refused(self, by: Address, error: BaseException) -> None:
-        """The locks around it learn of a refusal at once, and not when they are renewed."""
+        """Informs the locks around it of a refusal at once, before their next renewal."""
         if isinstance(error, LockLost) and self.inherited is not None:
             for lock in (*self.inherited.around, *handed_down.values()):
                 lock.refused(by, error)
@@ -161,7 +161,7 @@ class Request(Struct, gc=False):
 
 
 def new_request(deadline_s: float | None) -> Request:
-    """A call that begins now."""
+    """A new outgoing call in the current context."""
     now, outer, around, client = monotonic_ns(), running.get(), holding.get(), speaking.get()
     asked_s, asked_ns = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s, now + in_ns(deadline_s)
     if outer is None and client is None and not around and not handed_down:
@@ -180,7 +180,7 @@ def in_ns(deadline_s: float | None) -> int:
 
 
 def _require_held(locks: Sequence[Held], record: Record) -> None:
-    """What one of the locks around a command selects, one of them has to hold. Raises NotLocked."""
+    """Raises NotLocked if the locks around a command select its service but none of them holds it."""
     if any(lock.claim.covers(record) for lock in locks):
         return
     for lock in locks:

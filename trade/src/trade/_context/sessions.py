@@ -1,4 +1,4 @@
-"""One client of a program that acts for many: what it sets moving is its own, and stops with it (S03)."""
+"""Sessions: a client of a program that acts for many. Its motion belongs to it and stops when it ends (S03)."""
 
 import contextlib
 from collections.abc import Callable, Generator, Iterable
@@ -15,28 +15,28 @@ _REMEMBERED: Final = 4096
 
 
 def within(session: str, whole: str) -> bool:
-    """Whether a session is that one or one of its parts."""
+    """Whether a session is that session or a part of it."""
     return session == whole or session.startswith(f"{whole}/")
 
 
 class EndedSessions:
-    """The last few that ended, and why."""
+    """The sessions that ended last, with the reasons."""
 
     def __init__(self) -> None:
         self._reasons: dict[str, str] = {}
 
     def ended(self, session: str, reason: str) -> None:
-        """Nobody of it is there any more."""
+        """Records that a session has ended."""
         self._reasons[session] = reason
         if len(self._reasons) > _REMEMBERED:
             del self._reasons[next(iter(self._reasons))]
 
     def back(self, session: str) -> None:
-        """It could not be reached, and is there again."""
+        """Records that an unreachable session is back."""
         self._reasons.pop(session, None)
 
     def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
-        """Which of these has ended, or the container it is of, as an error; None if all are there."""
+        """The error of the first of these that has ended, or whose container has; None if all exist."""
         if self._reasons:
             for session in sessions:
                 whole = "/".join(session.split("/")[:3])
@@ -46,13 +46,13 @@ class EndedSessions:
 
 
 speaking: ContextVar["Session | None"] = ContextVar("trade_session", default=None)
-"""The session that calls are made in now; none: the container's own."""
+"""The session of calls made now; None: the container's own."""
 
 
 def foreign(session: str) -> str:
-    """``clinic/anna via door``, if that session is one of another system's client; else nothing.
+    """``clinic/anna via door``, if the session belongs to a client of another system; else empty.
 
-    ``door`` says so, and answers for it: nobody here can see who is behind.
+    The identity ``door`` states this and is responsible for it: this system cannot verify the client.
     """
     identity, *chunks = session.split("/")
     system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
@@ -60,23 +60,23 @@ def foreign(session: str) -> str:
 
 
 def client_of(session: str) -> str:
-    """``anna``, if that session is one of a client for whom a container acts; else nothing."""
+    """``anna``, if a container acts for this client in the session; else empty."""
     client = session.split("/")[3:]
     return client[0].rpartition(".")[0] if client else ""
 
 
 class Session:
-    """A client's presence within a container's: a context manager; calls made inside are the client's.
+    """A client's session within a container's own: a context manager; calls made inside are the client's.
 
-    Locks taken inside are the client's, too. When it is closed, or the container ends, what was moved in it stops and
-    its locks fall; nothing else does. Made by `Container.open_session`.
+    Locks taken inside are the client's, too. When it is closed, or the container ends, its motion stops and its locks
+    are lost, but those of no other session. `Container.open_session` opens it.
     """
 
     def __init__(self, owner: Address, name: str, presence: Presence, ended: Callable[[str], None]) -> None:
         self.owner: Final = owner
         """The container that acts for the client."""
         self.name: Final = name
-        """As everybody sees it: ``identity/container/epoch/client``."""
+        """Its name in the whole system: ``identity/container/epoch/client``."""
         self._presence = presence
         self._ended = ended
         self._closed = False
@@ -93,7 +93,7 @@ class Session:
 
     @contextlib.contextmanager
     def use(self) -> Generator["Session", None, None]:
-        """Make calls in it, in any thread or task, without closing it afterwards."""
+        """Makes the calls inside in this session, in any thread or task; does not close it."""
         reset = speaking.set(self)
         try:
             yield self
@@ -101,7 +101,7 @@ class Session:
             speaking.reset(reset)
 
     def close(self) -> None:
-        """The client is gone: what it set moving stops. Does not wait for that. Idempotent."""
+        """Ends the session: its motion stops. Does not wait for that. Idempotent."""
         if not self._closed:
             self._closed = True
             self._presence.close()

@@ -249,7 +249,7 @@ class Dispatcher:
         return Status.OK, EMPTY
 
     def _report(self, service: LocalService, ongoing: ActiveCall, value: Any) -> None:
-        self._progress_reporter.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
+        self._progress_reporter.report(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
     def _send_progress(self, ongoing: ActiveCall, body: Raw) -> None:
         call = ongoing.call

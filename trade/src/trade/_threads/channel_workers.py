@@ -1,8 +1,8 @@
-"""Threads that take turns at one channel: the one that takes a call is replaced before it runs it.
+"""Worker threads for one channel (leader/followers): one thread always waits for the next message.
 
-Quick calls need few of them, however many calls there are: more would only wait for each other, and for the interpreter
-with all others of the process. So beyond a few a call that finds none but its own thread waits a moment for one to come
-back before another is started, and who comes back to enough others ends.
+Quick calls need only a few threads, however many calls arrive: more threads would wait for each other and for the
+interpreter lock. So, beyond a few threads, a call that finds no idle one waits a moment for one to return before the
+pool starts another. A thread that returns to enough idle ones ends.
 """
 
 import logging
@@ -22,9 +22,9 @@ _MOMENT_S: Final = 0.005
 
 
 class WorkerPool:
-    """Threads on one channel; at least one of them always waits for the next message.
+    """The worker threads of one channel; at least one of them always waits for the next message.
 
-    Those of a container work at calls with `Dispatcher._serve`, and refuse them at the cap with `Dispatcher._busy`.
+    A container's workers run calls with `Dispatcher._serve`; at the cap they refuse calls with `Dispatcher._busy`.
     """
 
     def __init__(
@@ -37,12 +37,12 @@ class WorkerPool:
         self._lock = threading.Lock()
         self._back = threading.Condition(self._lock)
         self._expecting = 0
-        """Threads that wait for another one to come back."""
+        """Threads that wait for another one to return."""
         self._threads: list[threading.Thread] = []
         self._spawned = 0
         self._idle = 0
         self.taken = 0
-        """Messages it has begun to work at, refused ones left out."""
+        """The number of messages that it has begun to process, without refused ones."""
         self._closed = False
         with self._lock:
             self._spawn()
@@ -53,7 +53,7 @@ class WorkerPool:
 
     @property
     def working(self) -> int:
-        """Threads that work at a message now."""
+        """The number of threads that process a message now."""
         with self._lock:
             return len(self._threads) - self._idle
 
@@ -81,7 +81,7 @@ class WorkerPool:
                 return
 
     def _leave_idle(self) -> bool:
-        """Whether this thread may run the call: somebody else must be left to take the next one."""
+        """Whether this thread may run the call: another one must remain to take the next call."""
         with self._lock:
             if self._idle == 1 and not self._get_another():
                 return False
@@ -90,7 +90,7 @@ class WorkerPool:
             return True
 
     def _get_another(self) -> bool:
-        """Whether somebody comes back in a moment, or can be spawned; with the lock held."""
+        """Whether another thread returns in a moment, or can be started. Requires the lock."""
         if _FEW <= len(self._threads) < MOST_THREADS:
             self._expecting += 1
             self._back.wait_for(lambda: self._idle > 1 or self._closed, _MOMENT_S)
@@ -103,7 +103,7 @@ class WorkerPool:
         return self._idle > 1
 
     def _join_idle(self) -> bool:
-        """Whether this thread, whose call has ended, is to take more."""
+        """Whether this thread, whose call has ended, takes more calls."""
         with self._lock:
             if self._idle >= _FEW:
                 self._threads.remove(threading.current_thread())
@@ -114,14 +114,14 @@ class WorkerPool:
             return True
 
     def close(self) -> None:
-        """Take no more calls. No thread goes back into the transport, where the end of the process would abort it."""
+        """Takes no more calls. No thread returns to the transport, where the end of the process would abort it."""
         with self._lock:
             self._closed = True
             self._back.notify_all()
         self._channel.close()
 
     def wait(self, most_s: float) -> None:
-        """Wait until every thread has ended, or for so long."""
+        """Waits until every thread has ended, at most ``most_s`` seconds."""
         deadline = time.monotonic() + most_s
         for thread in list(self._threads):
             if thread is not threading.current_thread():

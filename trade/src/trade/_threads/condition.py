@@ -1,7 +1,7 @@
-"""Waiting that an interrupt may end at any instant.
+"""A condition variable that Ctrl-C can interrupt safely.
 
-A condition of the standard library is left broken if Ctrl-C comes between its letting go of the lock and its wait: the
-user then sees a RuntimeError. A bare lock has no such instant.
+A condition of the standard library breaks if Ctrl-C arrives after it releases its lock and before it waits: the user
+then sees a RuntimeError. A bare lock has no such moment.
 """
 
 import contextlib
@@ -11,19 +11,19 @@ from collections.abc import Callable
 
 
 class InterruptibleCondition:
-    """Rung whenever something has changed; wakes everybody who waits for it."""
+    """Wakes all waiting threads whenever something has changed."""
 
     def __init__(self) -> None:
         self._gates: set[threading.Lock] = set()
 
     def notify_all(self) -> None:
-        """Have those who wait look again. From any thread, never waits."""
+        """Makes all waiting threads check again. Callable from any thread; never waits."""
         for gate in list(self._gates):
-            with contextlib.suppress(RuntimeError):  # rung already
+            with contextlib.suppress(RuntimeError):  # notified already
                 gate.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until it holds; looks now and after every ring. Returns whether it does."""
+        """Waits until ``ready`` holds, checked now and after every notification. Returns whether it holds."""
         until = None if timeout_s is None else time.monotonic() + timeout_s
         gate = threading.Lock()
         gate.acquire()

@@ -1,4 +1,4 @@
-"""What holds for the whole process: containers end with it, and do not survive a fork."""
+"""Process-wide rules: containers end with their process, and do not survive a fork."""
 
 import atexit
 import os
@@ -14,7 +14,7 @@ class _Container(Protocol):
 
 
 live: "weakref.WeakSet[_Container]" = weakref.WeakSet()
-"""The containers that run."""
+"""The running containers."""
 _started = False
 _forked = False
 
@@ -27,7 +27,7 @@ def _close_all() -> None:
 
 
 def note_start() -> None:
-    """A container starts: from now on this process cannot be forked."""
+    """Records that a container starts: from now on a fork of this process cannot have containers."""
     global _started  # noqa: PLW0603 - a fact about the process: the transport's runtime stays for good
     _started = True
 

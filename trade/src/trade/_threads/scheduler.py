@@ -1,7 +1,7 @@
-"""Threads that do things when they are due.
+"""A scheduler: threads that run tasks when they are due (leader/followers).
 
-One of them, the leader, waits for what is due next and does it itself; before that it has another one lead. So nothing
-changes hands, and what takes long holds up nothing else until all threads are busy.
+One thread, the leader, waits for the next task, makes another thread the leader, and runs the task itself. So no task
+passes between threads, and a slow task delays no other one until all threads are busy.
 """
 
 import heapq
@@ -16,15 +16,15 @@ _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 32
 _IDLE_S: Final = 10.0
-"""A thread that had nothing to do for so long ends."""
+"""A thread that has been idle for this long ends."""
 _END_S: Final = 2.0
 
 Callback = Callable[[], "int | None"]
-"""Done when it is due; returns when it is due again (``time.monotonic_ns()``), or None."""
+"""Runs when it is due; returns when it is due again (``time.monotonic_ns()``), or None."""
 
 
 class ScheduledTask:
-    """Something to be done at its time, and again if it says so; never twice at once."""
+    """A task that runs at its time, and again if it says so; never twice at once."""
 
     __slots__ = ("_act", "_asked_ns", "_running", "_scheduler", "_turn", "cancelled")
 
@@ -32,27 +32,27 @@ class ScheduledTask:
         self._scheduler = scheduler
         self._act = act
         self._asked_ns: int | None = None
-        """When it was wanted again while it ran."""
+        """The due time that was requested while it ran."""
         self._running = False
         self._turn = 0
-        """Its place in the queue; one with another number is old."""
+        """The number of its valid queue entry; entries with another number are outdated."""
         self.cancelled = False
 
     def at(self, due_ns: int) -> None:
-        """Have it done then, and no more when it was due before; while it runs: once more, then."""
+        """Runs it at that time instead of its earlier due time; if it runs now, once more at that time."""
         self._scheduler.enter(self, due_ns)
 
     def cancel(self) -> None:
-        """Do it no more; what runs finishes. Idempotent."""
+        """Runs it no more; a run under way finishes. Idempotent."""
         self.cancelled = True
 
 
 class Scheduler:
-    """The queue and its threads, of which there are none until something is due.
+    """The queue of tasks and its threads, which start with the first task.
 
     Args:
-        name: of its threads.
-        clock: ``time.monotonic_ns``; a test has its own.
+        name: the name of its threads.
+        clock: ``time.monotonic_ns``, or the clock of a test.
     """
 
     def __init__(self, name: str, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -62,27 +62,27 @@ class Scheduler:
         self._queue: list[tuple[int, int, ScheduledTask]] = []
         self._lock = threading.Lock()
         self._sooner = threading.Condition(self._lock)
-        """The leader waits here for the time, or for something that is due before."""
+        """The leader waits here until the next task is due, or for an earlier one."""
         self._followers = threading.Condition(self._lock)
         self._threads: set[threading.Thread] = set()
         self._leading = False
         self._following = 0
         self._called = False
-        """A thread was called to lead and has not got there yet."""
+        """Whether a thread was called to lead and does not lead yet."""
         self._closed = False
 
     def due(self, act: Callback) -> ScheduledTask:
-        """Something to be done once it is told when."""
+        """A task that runs once its time is set."""
         return ScheduledTask(self, act)
 
     def begin(self, act: Callback, due_ns: int) -> ScheduledTask:
-        """Have something done at a time of ``time.monotonic_ns()``; one that has passed means now."""
+        """Runs something at a time of ``time.monotonic_ns()``; a time in the past means now."""
         due = self.due(act)
         due.at(due_ns)
         return due
 
     def enter(self, due: ScheduledTask, due_ns: int) -> None:
-        """What `ScheduledTask.at` does."""
+        """Implements `ScheduledTask.at`."""
         with self._lock:
             if due._running:  # pyright: ignore[reportPrivateUsage] - two halves of one thing
                 due._asked_ns = due_ns  # pyright: ignore[reportPrivateUsage]
@@ -109,7 +109,7 @@ class Scheduler:
             thread = threading.Thread(target=self._main, name=f"{self._name}-{len(self._threads)}", daemon=True)
             try:
                 thread.start()
-            except RuntimeError:  # the process may have no more threads; whoever comes back or enters next tries again
+            except RuntimeError:  # the process may have no more threads; the next task tries again
                 _logger.exception("%s cannot have another thread", self._name)
             else:
                 self._called = True
@@ -123,7 +123,7 @@ class Scheduler:
             self._threads.discard(threading.current_thread())
 
     def _next(self) -> ScheduledTask | None:
-        """What is due, once it is; None if this thread is not needed. Under the lock, which waiting lets go of."""
+        """The next task, once due; None if this thread is not needed. Requires the lock, and releases it to wait."""
         while not self._closed:
             left_ns = self._queue[0][0] - self._clock() if self._queue else None
             if left_ns is not None and left_ns <= 0:
@@ -136,7 +136,7 @@ class Scheduler:
                 self._following += 1
                 called = self._followers.wait(_IDLE_S)
                 self._following -= 1
-                if not called and not self._called:  # it may have been called while its time ran out
+                if not called and not self._called:  # it may have been called while its time expired
                     return None
                 self._called = False
             else:
@@ -148,14 +148,14 @@ class Scheduler:
         return None
 
     def _do(self, due: ScheduledTask) -> None:
-        """Do it without the lock, and put it where it belongs next."""
+        """Runs the task without the lock, and schedules its next run."""
         due._running, due._asked_ns = True, None  # pyright: ignore[reportPrivateUsage]
         self._lock.release()
         again_ns: int | None = None
         try:
             again_ns = due._act()  # pyright: ignore[reportPrivateUsage]
         except BaseException:
-            _logger.exception("%s: something that was due failed and is not done again", self._name)
+            _logger.exception("%s: a scheduled task failed and is not repeated", self._name)
         finally:
             self._lock.acquire()
             due._running = False  # pyright: ignore[reportPrivateUsage]
@@ -164,7 +164,7 @@ class Scheduler:
                 self._push(due, min(wanted))
 
     def close(self) -> None:
-        """Do nothing more; waits a little for what runs. Idempotent."""
+        """Runs no more tasks; waits a little for running ones. Idempotent."""
         with self._lock:
             self._closed = True
             self._queue.clear()

@@ -1,8 +1,8 @@
 """A thread pool that reuses idle threads; it has no maximum, and its threads are daemons (decision 78).
 
-To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off. What
-is due (`Scheduler`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion
-does, and must hold up nobody.
+Starting a thread takes longer than most calls. A hook is such a call: it runs on another thread, so that it can be cut
+off. The `Scheduler` has its own, limited threads, because work in this pool may last for minutes, as a motion does, and
+must not delay anything else.
 """
 
 import logging
@@ -15,24 +15,24 @@ _logger = logging.getLogger("trade")
 
 _MOST_IDLE: Final = 8
 _PATIENCE_S: Final = 10.0
-"""How long one waits for work before it ends."""
+"""How long an idle thread waits for work before it ends."""
 
 Work = Callable[[], object]
 
 
 class ThreadPool:
-    """As many threads as there is work at once; a few wait for more."""
+    """One thread for each piece of work under way; a few idle threads wait for more."""
 
     def __init__(self) -> None:
         self._idle: list[_Worker] = []
         self._closed = False
 
     def begin(self, work: Work, name: str) -> None:
-        """Have this done now, on a thread of its own as far as it can tell; does not wait.
+        """Runs work now, on a thread that it does not share meanwhile; does not wait.
 
         Args:
             work: what to do, in a fresh context.
-            name: of the thread meanwhile.
+            name: the name of the thread meanwhile.
 
         Raises:
             RuntimeError: the process may have no more threads.
@@ -44,7 +44,7 @@ class ThreadPool:
         worker.give(work, name)
 
     def rejoin(self, worker: "_Worker") -> bool:
-        """Whether one that has done its work is to wait for more."""
+        """Whether a worker that has finished its work waits for more."""
         if self._closed or len(self._idle) >= _MOST_IDLE:
             return False
         self._idle.append(worker)
@@ -53,7 +53,7 @@ class ThreadPool:
         return True
 
     def leave(self, worker: "_Worker") -> bool:
-        """Whether one that waits may end; if not, work is on its way to it."""
+        """Whether an idle worker may end; if not, work is on its way to it."""
         try:
             self._idle.remove(worker)
         except ValueError:
@@ -61,7 +61,7 @@ class ThreadPool:
         return True
 
     def close(self) -> None:
-        """Those that wait end; work that is under way goes on. Idempotent."""
+        """Ends the idle threads; work under way continues. Idempotent."""
         self._closed = True
         for worker in list(self._idle):
             if self.leave(worker):
@@ -86,7 +86,7 @@ class _Worker:
         self._given.release()
 
     def dismiss(self) -> None:
-        """End; it waits."""
+        """Ends an idle worker."""
         self._given.release()
 
     def _main(self) -> None:
@@ -101,7 +101,7 @@ class _Worker:
             try:
                 Context().run(work)
             except Exception:
-                _logger.exception("what was begun failed")
+                _logger.exception("work in the thread pool failed")
             del work  # it may hold on to much
             if not self._pool.rejoin(self):
                 return
