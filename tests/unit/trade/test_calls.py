@@ -255,7 +255,7 @@ def test_a_failing_receiver_of_an_answer_disturbs_no_other(
     caller.start(go(caller), route(caller), deadline_ns, fail)
     caller.start(go(caller), route(caller), deadline_ns, lambda _: heard.set())
     assert heard.wait(20)
-    assert "the receiver of an answer failed" in caplog.text
+    assert "the callback of an answer failed" in caplog.text
 
 
 # --- the clock of another container

@@ -1,4 +1,4 @@
-"""The caller's half of a call: its arguments as bytes, or why they cannot be sent."""
+"""The encoder of a call's arguments, on the caller's side."""
 
 # pyright: reportUnknownVariableType=false
 
@@ -26,11 +26,11 @@ class ArgumentEncoder:
         self._label = label
 
     def values(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-        """Arguments as a message has them: positional ones as an array, with keywords a map of all by name."""
+        """Arguments in the form of the message: an array if all are positional, else a map by name."""
         return args if not kwargs else self._by_name(args, kwargs)
 
     def encode(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bytes:
-        """Arguments as they are now, as bytes."""
+        """The arguments as bytes, with their present values."""
         values: Any = args if not kwargs else self._by_name(args, kwargs)
         try:
             data = self._codec.encode(values)
@@ -41,7 +41,7 @@ class ArgumentEncoder:
         return data
 
     def encode_call(self, call: Call) -> bytes:
-        """A whole message with the arguments as values in it: large ones are copied once, not twice."""
+        """A whole message with its arguments, so that large ones are copied once, not twice."""
         try:
             data = self._codec.encode(call)
         except _UNSENDABLE as bad:

@@ -1,4 +1,4 @@
-"""Several calls: at once, or one after the other, each with an outcome of its own."""
+"""Several calls, concurrently or in sequence, each with its own outcome."""
 
 import asyncio
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,17 +27,17 @@ class Outcome:
         return self.error is None
 
     def value(self) -> Any:
-        """The result, or the error raised."""
+        """Returns the result, or raises the error."""
         if self.error is not None:
             raise self.error
         return self.result
 
 
 def begun(call: Bound) -> Run:
-    """The call under way; what keeps it from beginning is its outcome, too."""
+    """Starts a call; an error that prevents its start is its outcome, too."""
     try:
         return call.start()
-    except Exception as error:  # noqa: BLE001 - it belongs to whoever looks at the outcome
+    except Exception as error:  # noqa: BLE001 - any error is the outcome
         run = Run(call.handle)
         run.fail(error)
         return run
@@ -49,17 +49,17 @@ def _ended(call: Bound, run: Run) -> Outcome:
 
 
 def bound(calls: Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[Bound]:
-    """Calls as they are, handles with the arguments."""
+    """Binds the arguments to handles; bound calls stay as they are."""
     return [call if isinstance(call, Bound) else call.bind(*args, **kwargs) for call in calls]
 
 
 def all_outcomes(calls: Iterable[Bound]) -> list[Outcome]:
-    """Run at once and wait for all; outcomes in order."""
+    """Runs calls concurrently and waits for all; returns their outcomes in order."""
     return list(_waves(list(calls)))
 
 
 def _waves(calls: list[Bound]) -> Iterator[Outcome]:
-    """At most so many at once: a call of this process is a thread while it runs."""
+    """Runs a limited number at once, because a local call occupies a thread while it runs."""
     running = [begun(call) for call in calls[:_MOST_AT_ONCE]]
     for index, call in enumerate(calls):
         yield _ended(call, running[index])
@@ -85,7 +85,7 @@ async def _ended_async(call: Bound) -> Outcome:
 
 
 def sequence(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
-    """One after the other; outcomes of those that ran."""
+    """Runs calls in sequence; returns the outcomes of those that ran."""
     outcomes: list[Outcome] = []
     for call in calls:
         outcomes.append(_ended(call, begun(call)))

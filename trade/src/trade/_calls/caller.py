@@ -1,7 +1,7 @@
 """The caller's side of a call: borrow a reply channel, put the request, wait until it is answered, lost or too late.
 
-The blocking caller itself waits on its reply channel: no hop. What ends a wait without an answer is a put of our own on
-the reply key, from the deadline thread or from whoever learns that the callee is gone.
+A blocking caller waits on its reply channel itself, so no other thread is involved. A wait without an answer ends with
+the container's own put on the reply key, from the deadline thread or from the thread that notices the callee's loss.
 """
 
 import itertools
@@ -38,14 +38,14 @@ _CANCEL_S: Final = 2.0
 
 
 class Caller:
-    """Every outgoing call of one container."""
+    """Sends the calls of one container."""
 
     def __init__(self, transport: Transport, own: Address) -> None:
         self._transport = transport
         self.own: Final = own
         """The container that calls."""
         self.session: Final = str(own)
-        """In which it calls, unless it acts for a client."""
+        """The session of its calls, unless it acts for a client."""
         self._ends_on = f"reply/{own.identity}/"
         self.new_id: Callable[[], int] = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._peers: dict[Address, Peer] = {}
@@ -58,33 +58,33 @@ class Caller:
         self._threads: list[threading.Thread] = []
         self._closed = False
         self.leaving = False
-        """Whether its container closes: who is called sees that, and ends what was asked for."""
+        """Whether its container closes: the callees see that, and end its calls."""
         self._next_deadline_ns: float = NEVER
         self._sooner = threading.Event()
         self.malformed = 0
         self.spans: Spans | None = None
-        """Where calls are noted while this container is traced."""
+        """Records its calls while this container is traced."""
         self._spawn("trade-deadlines", self._watch_deadlines)
 
     @property
     def closed(self) -> bool:
-        """Whether no more calls are sent."""
+        """Whether it sends no more calls."""
         return self._closed
 
     # --- what a call needs to know
 
     def peer(self, address: Address) -> Peer:
-        """Another container; one whose sign of life does not stand is lost."""
+        """Another container; one without a liveliness token counts as lost."""
         return self._peers.get(address) or Peer(address, lost=True)
 
     # --- calling
 
     def new_call(self, service: str, args: Raw) -> Call:
-        """A call that inherits nothing and may be late. What is sent gets its reply channel then."""
+        """A call without a deadline that inherits nothing; its reply channel is set when it is sent."""
         return Call(PROTOCOL, self.new_id(), service, "", self.session, None, (), args)
 
     def ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
-        """Send a call and wait for the answer; it always comes, if only from ourselves at the deadline."""
+        """Sends a call and waits for its reply, which always comes, at the deadline from this container itself."""
         try:
             box = self._borrow()
         except ChannelClosed:
@@ -102,7 +102,7 @@ class Caller:
             sent_ns = time.monotonic_ns()
             publisher.put(data)
             return self._await_reply(box, call.id, peer, sent_ns)
-        except ChannelClosed:  # the publisher went with its provider, or everything does
+        except ChannelClosed:  # the publisher closed with its provider, or the whole container closes
             return _ended(call.id, Status.UNSENT)
         finally:
             box.waiting = box.sent = None
@@ -117,20 +117,20 @@ class Caller:
             reply = self._decode(message)
             if reply is None or reply.id != call_id or not self._may_answer(message, peer, reply):
                 continue
-            if reply.status == Status.PROGRESS:  # nobody asks a call that is waited for
+            if reply.status == Status.PROGRESS:  # a blocking caller does not read progress
                 continue
             if reply.status < Status.TIMED_OUT:
                 peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
             return reply
 
     def _may_answer(self, message: Message, peer: Peer, reply: Reply) -> bool:
-        """Only the callee may answer, and only ourselves may end the wait; who puts stands in the key."""
+        """Only the callee may answer, and only this container may end the wait; the key names the sender."""
         return message.key.startswith(self._ends_on if reply.status >= Status.TIMED_OUT else peer.answers_on)
 
     def start(
         self, call: Call, route: Route, deadline_ns: int, on_reply: OnReply, on_progress: OnReply | None = None
     ) -> None:
-        """Send a call without waiting; answer and progress go there on a thread of ours."""
+        """Sends a call without waiting; the callbacks get its reply and progress on another thread."""
         try:
             call.reply = self._shared_box().name
         except ChannelClosed:
@@ -149,7 +149,7 @@ class Caller:
             self._finish(_ended(call.id, Status.UNSENT))
 
     def cancel(self, peer: Peer, call_id: int, service: str, deadline_ns: int) -> None:
-        """Ask the callee to end a call, or never to begin it; does not wait."""
+        """Asks the callee to end a call, or not to begin it; does not wait."""
         now = time.monotonic_ns()
         if call_id not in self._pending or now >= deadline_ns:
             return
@@ -160,9 +160,9 @@ class Caller:
     # --- sending again
 
     def resend(self, peer: Peer) -> None:
-        """The link to the same epoch was gone and is back: put once more what still waits, same id, never later.
+        """Sends pending calls again after a lost link to the same epoch is back: same ids, no later deadlines.
 
-        The callee runs no id twice. Its clock is asked for first, as it may have stood still meanwhile.
+        The callee runs no id twice. Its clock is requested first, as it may have been suspended meanwhile.
         """
         sent = [box.sent for box in list(self._every) if box.waiting is not None and box.waiting[1] is peer]
         sent += [pending.sent for pending in list(self._pending.values()) if pending.peer is peer]
@@ -188,7 +188,7 @@ class Caller:
         try:
             publisher.put(encode_message(structs.replace(call, expires_ns=expires_ns)))
         except ChannelClosed:
-            _logger.debug("%s is not sent again: its provider is gone", call.service)
+            _logger.debug("%s is not sent again, because its provider is gone", call.service)
 
     def _deadline_of(self, call_id: int) -> int | None:
         pending = self._pending.get(call_id)
@@ -206,7 +206,7 @@ class Caller:
         try:
             pending.on_reply(reply)
         except Exception:
-            _logger.exception("the receiver of an answer failed")
+            _logger.exception("the callback of an answer failed")
 
     # --- reply channels
 
@@ -218,7 +218,7 @@ class Caller:
 
     def _new_reply_slot(self) -> ReplySlot:
         with self._lock:
-            index = f"{self.own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
+            index = f"{self.own.epoch}-{len(self._every)}"  # another container may have the same name
             key = reply_key("*", self.own.identity, self.own.container, index)
             own = reply_key(self.own.identity, self.own.identity, self.own.container, index)
             box = ReplySlot(f"{self.own.container}/{index}", own, self._transport.subscribe(key))
@@ -264,9 +264,9 @@ class Caller:
     # --- ends without an answer
 
     def lost(self, address: Address, *, back: bool = False) -> None:
-        """The callee's container is gone (or back): end what waits for it.
+        """Ends the calls that wait for a lost container, or sends them again when it is back.
 
-        Nothing is kept of it: while it is out of sight its clock may stand still, as that of a computer that sleeps.
+        A lost peer is forgotten with its clock, which may stop while it is unreachable, as on a suspended computer.
         """
         if back:
             self.resend(self._peers.setdefault(address, Peer(address)))
@@ -277,7 +277,7 @@ class Caller:
     def _watch_deadlines(self) -> None:
         while not self._closed:
             self._sooner.clear()
-            self._next_deadline_ns = NEVER  # whoever starts during the scan wakes us
+            self._next_deadline_ns = NEVER  # a call that starts during the scan wakes this thread
             now = time.monotonic_ns()
             self._end_overdue(now)
             soonest = min(self._deadlines(), default=NEVER)
@@ -301,7 +301,7 @@ class Caller:
             if call_id != box.ended_id and meant(peer, deadline_ns):
                 box.ended_id = call_id
                 self._transport.wake(box.wake_key, encode_message(_ended(call_id, status)))
-        for call_id, pending in self._pending.copy().items():  # a list of pairs is not made at one go
+        for call_id, pending in self._pending.copy().items():  # list(...items()) is not atomic
             if meant(pending.peer, pending.deadline_ns):
                 self._finish(_ended(call_id, status))
 
@@ -311,9 +311,9 @@ class Caller:
         thread.start()
 
     def finish_stops(self, limit_s: float) -> None:
-        """The container leaves: wait until no stop is under way, at most so long, in seconds."""
+        """Waits, as the container closes, until no stop is under way, at most ``limit_s`` seconds."""
         self.leaving = True
-        if threading.current_thread() in self._threads:  # the one that hears of their ends
+        if threading.current_thread() in self._threads:  # the thread that their replies need
             return
         until = time.monotonic() + limit_s
         while self._stopping() and time.monotonic() < until:
@@ -324,7 +324,7 @@ class Caller:
         return any(one is not None and self.publishers.of_stops(one[0]) for one in sent)
 
     def close(self) -> None:
-        """End every wait and every thread. Idempotent."""
+        """Ends every wait and every thread. Idempotent."""
         self._closed = True
         self._sooner.set()
         self._end(lambda _peer, _deadline: True, Status.CLOSED)
@@ -337,7 +337,7 @@ class Caller:
         self.publishers.close()
 
     def _wait_until_free(self, deadline: float) -> None:
-        """Nobody may be left inside the transport when the interpreter ends: that would abort it."""
+        """Waits until no thread is inside the transport: otherwise the end of the interpreter would abort it."""
         while any(box.waiting is not None for box in list(self._every)) and time.monotonic() < deadline:
             time.sleep(0.001)
 

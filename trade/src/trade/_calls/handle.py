@@ -1,4 +1,4 @@
-"""Handles: values that name one service of one boot."""
+"""Handles: values that name one service of one epoch."""
 
 import asyncio
 import logging
@@ -28,7 +28,7 @@ HANDLE_EXT: Final = 1
 
 
 class CallHost(Protocol):
-    """What a handle asks of the container that made it. Implemented by `trade.Container`."""
+    """The container that made a handle, as the handle uses it. Implemented by `trade.Container`."""
 
     @property
     def address(self) -> Address: ...
@@ -46,9 +46,9 @@ class CallHost(Protocol):
 
 
 class Handle:
-    """One service of one boot epoch: call it, compare it, keep it, pass it as argument or result.
+    """One service of one epoch: call it, compare it, keep it, pass it as an argument or a result.
 
-    A call raises ServiceGone once the service was deregistered or its container ended or restarted.
+    A call raises ServiceGone after the service was deregistered, or its container ended or restarted.
     """
 
     __slots__ = ("_deadline_s", "_home", "_record", "key")
@@ -58,22 +58,22 @@ class Handle:
     def __init__(self, home: CallHost, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
         self._home = home
         self.key = key
-        """What the handle is over the wire."""
+        """Its identity on the wire."""
         self._record = record
         self._deadline_s = deadline_s
 
     # --- calling
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call and wait for the result, at most until the deadline."""
+        """Calls the service and waits for the result, at most until the deadline."""
         return self._home.invoke(self, args, kwargs, self._deadline_s)
 
     def start(self, *args: Any, **kwargs: Any) -> Run:
-        """Call without waiting."""
+        """Calls the service without waiting."""
         return self._home.begin(self, args, kwargs, self._deadline_s)
 
     async def acall(self, *args: Any, **kwargs: Any) -> Any:
-        """Call from asyncio. Cancelling the task that waits here cancels the call, see `Run.cancel`."""
+        """Calls the service from asyncio. Cancelling the waiting task cancels the call, see `Run.cancel`."""
         run = self.start(*args, **kwargs)
         try:
             return await run
@@ -82,16 +82,16 @@ class Handle:
                 Context().run(run.end_soon)
             raise
 
-    def note_not_cancelled(self, error: BaseException) -> None:
-        """Told by a call of it: it was to end, and could not be ended."""
+    def log_not_cancelled(self, error: BaseException) -> None:
+        """Logs that a call of it could not be cancelled."""
         level = logging.DEBUG if self._home.closed else logging.WARNING
         _logger.log(level, "%s could not be cancelled: %s: %s", self.label, type(error).__name__, error)
 
     def with_(self, *, deadline_s: float) -> "Handle":
-        """The same service, called with other options.
+        """The same service with other options for its calls.
 
         Args:
-            deadline_s: how long a call may take, in seconds; greater than zero, at most a day.
+            deadline_s: how long a call may take, in seconds; more than zero, at most a day.
         """
         if not 0 < deadline_s <= LONGEST_DEADLINE_S:
             problem = f"deadline_s must be more than 0 and at most {LONGEST_DEADLINE_S:.0f} (a day), not {deadline_s}"
@@ -99,20 +99,20 @@ class Handle:
         return Handle(self._home, self.key, self._record, deadline_s)
 
     def bind(self, *args: Any, **kwargs: Any) -> "Bound":
-        """The call as a value, to be made later; arguments are checked then."""
+        """The call as a value, to be made later; its arguments are checked then."""
         return Bound(self, args, kwargs)
 
-    # --- telling
+    # --- its description
 
     @property
     def record(self) -> Record:
-        """What the registry says of it now, or said last. Raises ServiceGone if it never knew the service."""
+        """Its registry entry, or the last known one. Raises ServiceGone if the registry never had the service."""
         self._record = self._home.record(self)
         return self._record
 
     @property
     def last_record(self) -> Record | None:
-        """What the registry said of it last, if anything."""
+        """Its last known registry entry, if any."""
         return self._record
 
     @property
@@ -137,12 +137,12 @@ class Handle:
 
     @property
     def container(self) -> str:
-        """The name of the container it lives in."""
+        """The name of its container."""
         return self.key.address.container
 
     @property
     def local(self) -> bool:
-        """Whether it lives in this very container."""
+        """Whether it is in this same container."""
         return self.key.address == self._home.address
 
     @property
@@ -167,7 +167,7 @@ class Handle:
 
     @property
     def resources(self) -> tuple[str, ...]:
-        """Physical things it needs for itself."""
+        """The resources that it needs exclusively."""
         return self.record.info.uses
 
     @property
@@ -177,41 +177,41 @@ class Handle:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Names of its provider's class and of the bases and interfaces that have services."""
+        """The names of its provider's class, and of the bases and interfaces that have services."""
         return self.record.kinds
 
     @property
     def meta(self) -> Mapping[str, Scalar]:
-        """What it is declared with, and its provider over it."""
+        """Its metadata; the provider's values override those of its declaration."""
         return dict(self.record.meta)
 
     @property
     def health(self) -> str:
-        """``healthy``, or what its provider says is wrong."""
+        """``healthy``, or the problem that its provider reports."""
         return self.record.health
 
     @property
     def verb(self) -> str:
-        """What a policy must allow a caller over its first group: ``call``, ``read``...; empty: everybody may call."""
+        """The right over its first group that a caller needs: ``call``, ``read``...; empty: all may call it."""
         return self._home.asked_for(self)[0]
 
     @property
     def roles(self) -> tuple[str, ...]:
-        """The roles whose identities may call it, by the policy of this container; none if that asks for none."""
+        """The roles that may call it by the policy of this container; empty if it requires none."""
         return self._home.asked_for(self)[1]
 
     @property
     def schema(self) -> Mapping[str, Mapping[str, Any]]:
-        """JSON Schema of ``arguments`` and ``result``."""
+        """The JSON Schemas of its ``arguments`` and ``result``."""
         info = self.record.info
         return {"arguments": read_schema(info.arguments_schema), "result": read_schema(info.result_schema)}
 
     def cancel_service(self) -> "Handle":
-        """The service that ends this one early. Raises ConfigurationError if there is none."""
+        """The service that cancels this one. Raises ConfigurationError if it has none."""
         cancel = self.record.info.cancel
         if cancel is None:
             raise ConfigurationError(
-                where=self.label, problem="it cannot be cancelled: its provider names no service for that"
+                where=self.label, problem="it cannot be cancelled, because its provider names no service for that"
             )
         key = ServiceKey(self.key.address, self.key.domain, self.key.provider, cancel)
         return Handle(self._home, key, None)
@@ -241,28 +241,28 @@ class Handle:
 
 
 class Bound:
-    """A call that can be made: a handle with arguments. Call it, compare it, put it into a sequence."""
+    """A bound call: a handle with arguments. Call it, compare it, put it into a sequence."""
 
     __slots__ = ("args", "handle", "kwargs")
 
     def __init__(self, handle: Handle, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         self.handle = handle
-        """Which service."""
+        """The service."""
         self.args = args
         """Positional arguments."""
         self.kwargs = MappingProxyType(dict(kwargs))
         """Arguments by name."""
 
     def __call__(self) -> Any:
-        """Make the call and wait for the result."""
+        """Makes the call and waits for the result."""
         return self.handle(*self.args, **self.kwargs)
 
     def start(self) -> Run:
-        """Make the call without waiting."""
+        """Makes the call without waiting."""
         return self.handle.start(*self.args, **self.kwargs)
 
     async def acall(self) -> Any:
-        """Make the call from asyncio."""
+        """Makes the call from asyncio."""
         return await self.start()
 
     def __eq__(self, other: object) -> bool:
@@ -282,17 +282,17 @@ class Bound:
 
 
 def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[ServiceKey], Handle]) -> Codec:
-    """What turns values into bytes and back; handles travel as the key of their service.
+    """A codec whose handles travel as the keys of their services.
 
     Args:
-        key_of: what is written of a handle; raises TypeError if it must not leave.
-        handle_of: the handle that a key means here; raises msgspec.ValidationError if it means none.
+        key_of: returns the key to write for a handle; raises TypeError if the handle must not be sent.
+        handle_of: returns the handle for a key; raises msgspec.ValidationError if it has none.
     """
 
     def to_data(value: Any) -> Any:
         if isinstance(value, Handle):
             return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(value)))
-        if isinstance(value, float):  # of a kind of its own, as those of arrays
+        if isinstance(value, float):  # a subclass of float, as in arrays
             return float(value)
         if hasattr(value, "__index__"):
             return operator.index(value)

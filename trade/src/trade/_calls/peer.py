@@ -1,4 +1,4 @@
-"""Another container as callers see it: its clock, how calls reach it, and where their replies wait."""
+"""A peer: another container as callers see it, with its clock, the routes to it, and the pending replies."""
 
 import math
 import threading
@@ -15,16 +15,16 @@ from trade._transport.base import Channel, Publisher, Transport
 
 NEVER: Final = math.inf
 _DRIFT: Final = 200e-6
-"""Two monotonic clocks run apart at most this fast (quartz is specified to 100 ppm)."""
+"""The largest drift between two monotonic clocks (quartz is specified to 100 ppm)."""
 
 
 class Peer:
-    """Another container as callers see it: whether it is there, and how its clock runs against ours."""
+    """Another container as callers see it: whether it is reachable, and the offset of its clock."""
 
     def __init__(self, address: Address, *, lost: bool = False) -> None:
         self.address = address
         self.answers_on = f"reply/{address.identity}/"
-        """How the keys of its answers begin."""
+        """The prefix of the keys of its answers."""
         self.lost = lost
         self._low_ns = -NEVER
         self._high_ns = NEVER
@@ -35,45 +35,45 @@ class Peer:
         return self._low_ns > -NEVER
 
     def heard(self, clock_ns: int, sent_ns: int, received_ns: int) -> None:
-        """Its clock stood at ``clock_ns`` some time between our sending and our receiving."""
+        """Takes its clock's reading ``clock_ns``, from a time between sending the request and receiving the reply."""
         slack = (received_ns - self._at_ns) * _DRIFT
         low = max(self._low_ns - slack, clock_ns - received_ns)
         high = min(self._high_ns + slack, clock_ns - sent_ns)
-        if low > high:  # its clock or ours was set or stood still: what was known is void
+        if low > high:  # one of the clocks was set or suspended: earlier readings are void
             low, high = clock_ns - received_ns, clock_ns - sent_ns
         self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
 
     def expiry_ns(self, deadline_ns: int) -> int | None:
-        """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
+        """A local deadline in its clock, never later than intended; None while its clock is unknown."""
         low, slack = self._low_ns, (time.monotonic_ns() - self._at_ns) * _DRIFT
         return int(deadline_ns + low - slack) if low > -NEVER else None
 
 
 class Route(Struct, frozen=True):
-    """How calls reach one provider of another container; made once for all of them."""
+    """How calls reach one provider of another container; all of them share it."""
 
     peer: Peer
     publisher: Publisher
     arguments: ArgumentEncoder | None = None
-    """Encodes arguments that are values; None: they are bytes already."""
+    """Encodes arguments that are values; None if they are bytes already."""
 
     def encode(self, call: Call) -> bytes:
-        """Raises InvalidArgument, NotSerialisable, TooLarge."""
+        """The call as bytes. Raises InvalidArgument, NotSerialisable, TooLarge."""
         return encode_message(call) if self.arguments is None else self.arguments.encode_call(call)
 
 
 OnReply = Callable[[Reply], None]
 
 Waiting = tuple[int, Peer, int]
-"""Call id, who is to answer, deadline: swapped as a whole, so that whoever ends a wait ends the one it looked at."""
+"""Call id, callee and deadline: replaced as a whole, so that a thread ends the same wait that it has examined."""
 
 
 Sent = tuple[Publisher, bytes]
-"""What was put where, to be put once more if the link had gone."""
+"""A sent message and its publisher, to send it again after a lost link."""
 
 
 class ReplySlot:
-    """A reply channel lent to one caller at a time."""
+    """A reply channel that one caller at a time borrows."""
 
     __slots__ = ("channel", "ended_id", "name", "sent", "waiting", "wake_key")
 
@@ -84,11 +84,11 @@ class ReplySlot:
         self.waiting: Waiting | None = None
         self.sent: Sent | None = None
         self.ended_id = 0
-        """The call whose wait was ended from our side last."""
+        """The last call whose wait this container ended itself."""
 
 
 class Pending:
-    """A started call that waits for its answer without a thread."""
+    """A started call that waits for its reply without a thread."""
 
     __slots__ = ("deadline_ns", "on_progress", "on_reply", "peer", "sent", "sent_ns")
 
@@ -104,19 +104,19 @@ class Pending:
 
 
 class CallPublishers:
-    """Each is made once, and let go of with its provider."""
+    """The publishers of calls: one for each provider and priority, closed with the provider."""
 
     def __init__(self, transport: Transport, identity: str) -> None:
         self._transport = transport
         self._identity = identity
         self._lock = threading.Lock()
         self._made: dict[str, Publisher] = {}
-        """By key."""
+        """The publishers, by key."""
         self._urgent: set[Publisher] = set()
-        """Those of stops."""
+        """The publishers of stops."""
 
     def get(self, callee: Address, domain: str, provider: str, *, stop: bool) -> Publisher:
-        """The one of a provider. Raises ChannelClosed: everything is closed."""
+        """The publisher of a provider. Raises ChannelClosed if the transport is closed."""
         key = call_key(self._identity, callee, domain, provider, stop=stop)
         with self._lock:
             found = self._made.get(key)
@@ -127,11 +127,11 @@ class CallPublishers:
             return found
 
     def of_stops(self, publisher: Publisher) -> bool:
-        """Whether what is put there are stops."""
+        """Whether a publisher sends stops."""
         return publisher in self._urgent
 
     def forget(self, callee: Address, domain: str, provider: str) -> None:
-        """A provider is gone."""
+        """Closes the publishers of a provider that is gone."""
         keys = [call_key(self._identity, callee, domain, provider, stop=stop) for stop in (False, True)]
         with self._lock:
             gone = [self._made.pop(key, None) for key in keys]
@@ -141,6 +141,6 @@ class CallPublishers:
                 publisher.close()
 
     def close(self) -> None:
-        """Let go of all."""
+        """Closes all publishers."""
         for publisher in list(self._made.values()):
             publisher.close()

@@ -1,4 +1,4 @@
-"""Calls that were started without waiting."""
+"""Runs: calls that were started without waiting."""
 
 import asyncio
 import contextlib
@@ -21,14 +21,14 @@ _logger = logging.getLogger("trade")
 
 
 class Run:
-    """A call under way. Wait with ``result()`` or ``await``; every one ends at its deadline at the latest."""
+    """A call under way. Wait with ``result()`` or ``await``; it ends at its deadline at the latest."""
 
     def __init__(self, handle: "Handle") -> None:
         self._handle = handle
         self._outcome: tuple[Any, BaseException | None] | None = None
         """Its result or its error, once it has ended."""
         self._ended = InterruptibleCondition()
-        self._told: list[Callable[[Run], object]] = []
+        self._done_callbacks: list[Callable[[Run], object]] = []
         self._progress: Any = None
         self._on_progress: Callable[[Any], object] | None = None
         self._cancelling = False
@@ -39,10 +39,10 @@ class Run:
         return f"<Run of {self._handle.label}, {state}>"
 
     def result(self, timeout_s: float | None = None) -> Any:
-        """The service's result, or its error raised.
+        """Returns the service's result, or raises its error.
 
         Args:
-            timeout_s: give up waiting (not the call) after this long; raises TimeoutError.
+            timeout_s: stops waiting after this long, but not the call; raises TimeoutError.
         """
         result, error = self._wait(timeout_s)
         if error is not None:
@@ -50,7 +50,7 @@ class Run:
         return result
 
     def done(self) -> bool:
-        """Whether it has ended, well or not."""
+        """Whether it has ended, with a result or an error."""
         return self._outcome is not None
 
     def exception(self, timeout_s: float | None = None) -> BaseException | None:
@@ -61,32 +61,32 @@ class Run:
         if self._outcome is None:
             self._ended.wait_for(self.done, timeout_s)
         if self._outcome is None:
-            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
+            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it continues")
         return self._outcome
 
     def when_done(self, tell: "Callable[[Run], object]") -> None:
-        """Have this called once it has ended, on the thread that learns of it; at once if it has."""
-        self._told.append(tell)
+        """Calls this when the run has ended, on the thread that notices it; at once if it has."""
+        self._done_callbacks.append(tell)
         if self._outcome is not None:
-            self._tell()
+            self._call_back()
 
-    def _tell(self) -> None:
-        """Each once, whichever thread comes first."""
-        while self._told:
+    def _call_back(self) -> None:
+        """Calls each done callback once, on whichever thread is first."""
+        while self._done_callbacks:
             try:
-                tell = self._told.pop(0)
-            except IndexError:  # another thread has told the last one
+                callback = self._done_callbacks.pop(0)
+            except IndexError:  # another thread has called the last one
                 return
             try:
-                tell(self)
+                callback(self)
             except Exception:
-                _logger.exception("who was to learn that %s has ended failed", self._handle)
+                _logger.exception("a callback at the end of %s failed", self._handle)
 
     def cancel(self) -> None:
-        """End it early; the result then tells how it ended.
+        """Cancels the call; the result then shows how it ended.
 
-        A call that has not begun never will, and raises Cancelled. One that runs is asked to end, and goes on if
-        it does not heed that. If its provider names a service that ends it, that is called, and waited for.
+        A call that has not begun never begins, and raises Cancelled. A running one is asked to end, and continues if
+        it ignores that. If its provider names a service that cancels it, that is called and waited for.
         """
         if self._outcome is not None:
             return
@@ -95,17 +95,17 @@ class Run:
             self._handle.cancel_service()()
 
     def end_soon(self) -> None:
-        """What `cancel` does, without waiting: what ends the call is under way when this returns. Once."""
+        """Does what `cancel` does, without waiting for it; only the first call has an effect."""
         if not self._cancelling and self._outcome is None:
             self._soon(self.ask_to_end)
             self._soon(self._call_off)
 
     def _call_off(self) -> None:
-        """Have the service called that ends it, if its provider names one."""
+        """Calls the service that cancels it, if its provider names one."""
 
         def look(stopping: Run) -> None:
             if (error := stopping.exception()) is not None:
-                self._handle.note_not_cancelled(error)
+                self._handle.log_not_cancelled(error)
 
         if self._handle.record.info.cancel is not None:
             self._handle.cancel_service().start().when_done(look)
@@ -113,18 +113,18 @@ class Run:
     def _soon(self, do: Callable[[], None]) -> None:
         try:
             do()
-        except Exception as error:  # noqa: BLE001 - a container that is gone, say: the call is, too
-            self._handle.note_not_cancelled(error)
+        except Exception as error:  # noqa: BLE001 - the container may be gone, and the call with it
+            self._handle.log_not_cancelled(error)
 
     def ask_to_end(self) -> None:
-        """What `cancel` does first: ask the call alone to end. Does not wait."""
+        """Does the first part of `cancel`: asks the call itself to end. Does not wait."""
         self._cancelling = True
-        tell = self._cancel_call
-        if tell is not None:
-            tell()
+        cancel = self._cancel_call
+        if cancel is not None:
+            cancel()
 
     def progress(self) -> Any:
-        """What the service said last of how far it is, or None."""
+        """The latest progress that the service has reported, or None."""
         return self._progress
 
     @property
@@ -132,33 +132,33 @@ class Run:
         """Whether ``cancel()`` was called."""
         return self._cancelling
 
-    def on_cancel(self, tell: Callable[[], None]) -> None:
-        """Told by the container: how to ask the call to end. Idempotent itself, as it may be used twice."""
-        self._cancel_call = tell
+    def on_cancel(self, cancel: Callable[[], None]) -> None:
+        """Sets how the call is asked to end; called by the container. It must be idempotent, as it may run twice."""
+        self._cancel_call = cancel
         if self._cancelling:
-            tell()
+            cancel()
 
     def note_progress(self, value: Any) -> None:
-        """Told by the container: the service said this of how far it is."""
+        """Takes progress that the service has reported; called by the container."""
         self._progress = value
         if self._on_progress is not None:
             self._on_progress(value)
 
     def on_progress(self, tell: Callable[[Any], object]) -> None:
-        """Have this called with each that comes, on the thread that hears of it; with the last one at once."""
+        """Calls this with each progress value, on the thread that receives it; with the latest one at once."""
         self._on_progress = tell
         if self._progress is not None:
             tell(self._progress)
 
     def fail(self, error: BaseException) -> None:
-        """Told by the container: it could not begin."""
+        """Ends the run with an error, because the call could not begin; called by the container."""
         self._end(None, error)
 
     def end(self, outcome: Callable[[], Any]) -> None:
-        """Told by the container: the outcome is what this returns or raises."""
+        """Ends the run with what this returns or raises; called by the container."""
         try:
             result = outcome()
-        except BaseException as error:  # noqa: BLE001 - whatever the service raised belongs to who asks for the result
+        except BaseException as error:  # noqa: BLE001 - `result` raises it
             self._end(None, error)
         else:
             self._end(result, None)
@@ -166,14 +166,14 @@ class Run:
     def _end(self, result: Any, error: BaseException | None) -> None:
         self._outcome = (result, error)
         self._ended.notify_all()
-        self._tell()
+        self._call_back()
 
     def end_with(self, outer: ActiveCall) -> Callable[[], None]:
-        """Told by the container: it is made inside another call, and ends with that. Returns what takes that back.
+        """Ends the run when its outer call is cancelled; called by the container. Returns a function that undoes this.
 
-        Also at its deadline, when nobody knows whether it ended: what ends it is called all the same.
+        The service that cancels it is also called at its deadline, when it is unknown whether it ended.
         """
-        around = copy_context()  # for whom, and under which locks
+        around = copy_context()  # its session and its locks
 
         def end() -> None:
             end_calls([partial(around.run, self.end_soon)])
@@ -191,11 +191,11 @@ class Run:
         return forget
 
     async def settled(self) -> None:
-        """Wait for its end from asyncio, well or not; the service goes on if this waiting is cancelled."""
+        """Waits from asyncio until it has ended, with a result or an error; cancelling this wait does not cancel it."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
         def tell(_: object) -> None:
-            with contextlib.suppress(RuntimeError):  # nobody waits any more: that loop has ended
+            with contextlib.suppress(RuntimeError):  # that loop has ended
                 loop.call_soon_threadsafe(ended.set)
 
         self.when_done(tell)

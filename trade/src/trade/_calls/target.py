@@ -1,4 +1,4 @@
-"""From a handle to a result: the same checks whether the service is here or elsewhere."""
+"""Call targets: how a handle becomes a result, with the same checks for local and remote services."""
 
 import logging
 from collections.abc import Callable
@@ -56,11 +56,11 @@ _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
 _Taken = bytes | tuple[tuple[Any, ...], dict[str, Any]]
-"""The arguments of a strict call, and those of one that goes straight through."""
+"""The encoded arguments of a strict call, or the plain ones of any other call."""
 
 
 class LocalTarget:
-    """A service of this container: called directly, with the validation and the copies a wire would make."""
+    """A service of this container, called directly, with the validation and the copies that a wire would make."""
 
     def __init__(
         self, service: LocalService, record: Record, codec: Codec, caller: Caller, threads: ThreadPool
@@ -78,7 +78,7 @@ class LocalTarget:
         self._new_id = caller.new_id
 
     def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
-        """A call that begins now; most inherit nothing and wait for nothing, and need no request."""
+        """Makes a new call; most inherit nothing and wait for nothing, and so need no request."""
         inherits = running.get() is not None or speaking.get() is not None or holding.get() or handed_down
         if inherits or self._service.serial is not None:
             return self.invoke(args, kwargs, new_request(deadline_s))
@@ -91,14 +91,14 @@ class LocalTarget:
         return self._copied(taken, context)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        """A call that was asked for already."""
+        """Makes the call of a request."""
         taken = self._arguments.encode(args, kwargs) if self._service.strict else (args, kwargs)
         if self._service.serial is None:
             return self._run(taken, request, None)
         return self._take_turn(self._service.serial, taken, request, None)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run, *, here: bool) -> None:
-        """The same on a thread of its own, or on this one (``here``), with the arguments as they are now."""
+        """Makes the call on another thread, or on this one (``here``), with the present values of the arguments."""
         service = self._service
         taken = self._arguments.encode(args, kwargs) if service.strict else (args, kwargs)
 
@@ -165,14 +165,14 @@ class LocalTarget:
             if not service.signature.has_secrets:
                 raise
             masked = unpack_error(service.failure(error, raw), service.label)
-        raise masked  # as it would come over the wire: without what is secret
+        raise masked  # as it would arrive over the wire, without secrets
 
 
 class RemoteTarget:
-    """A service of another container, with everything about calling it that can be decided beforehand."""
+    """A service of another container, with everything about its calls that can be prepared."""
 
     def __init__(self, record: Record, caller: Caller, codec: Codec, known: ServiceInfo | None = None) -> None:
-        """``known`` describes the result, if that is not to be what the callee says of it."""
+        """``known`` describes the result, in place of the callee's own description."""
         address, key = record.key.address, record.key
         self._label = record.label
         self._record = record
@@ -189,11 +189,11 @@ class RemoteTarget:
         self._traceable = traceable(key)
 
     def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
-        """A call that begins now."""
+        """Makes a new call."""
         return self.invoke(args, kwargs, new_request(deadline_s))
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        """A call that was asked for already."""
+        """Makes the call of a request."""
         values = self._values(args, kwargs, request)
         if not self._may_go:
             reply = self._caller.ask(self._clock_call(request), self._clock, request.deadline_ns)
@@ -211,7 +211,7 @@ class RemoteTarget:
         *,
         here: bool,  # noqa: ARG002 - it runs elsewhere
     ) -> None:
-        """The same without waiting; the outcome goes into the run."""
+        """Makes the call without waiting; the run gets its outcome."""
         values = self._values(args, kwargs, request)
 
         def go() -> None:
@@ -226,7 +226,7 @@ class RemoteTarget:
             try:
                 run.note_progress(self._decode_any(reply.body))
             except Exception as bad:  # noqa: BLE001 - the bytes are anything
-                _logger.debug("%s said something of its progress that cannot be read: %s", self._label, bad)
+                _logger.debug("the progress of %s cannot be decoded: %s", self._label, bad)
 
         def finish(reply: Reply) -> None:
             run.end(lambda: self._unpack(reply, request))
@@ -241,11 +241,11 @@ class RemoteTarget:
 
     @property
     def _may_go(self) -> bool:
-        """Whether nothing need be asked first."""
+        """Whether the call can be sent without requesting the callee's clock first."""
         return self.is_stop or self._peer.clock_known
 
     def _values(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        """The arguments, for a message that is made now; as bytes, checked already, for one that comes later."""
+        """The arguments: as values for a message made now, as checked bytes for a later one."""
         if self.is_stop:
             request.ignore_outer_deadline()
         elif request.deadline_s <= 0:
@@ -255,7 +255,7 @@ class RemoteTarget:
         return Raw(self._arguments.encode(args, kwargs))
 
     def _call(self, values: Any, request: Request) -> Call:
-        """The message; its deadline is in the clock of the callee."""
+        """The message, with its deadline in the callee's clock."""
         expires_ns = None if self.is_stop else self._peer.expiry_ns(request.deadline_ns)
         return self._message(self._info.name, values, expires_ns, request)
 
@@ -282,7 +282,7 @@ class RemoteTarget:
             raise InvalidResult(service=self._label, problem=str(bad)) from None
 
     def _not_begun(self, reply: Reply, request: Request) -> BaseException:
-        """The answer to the question before the call was none: the call itself was never sent."""
+        """The error when the callee's clock was not received, so that the call was never sent."""
         if reply.status == Status.TIMED_OUT:
             return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
         if reply.status == Status.LOST:
@@ -326,14 +326,14 @@ class RemoteTarget:
 
 
 def result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
-    """A decoder for the result, as typed as its description allows."""
+    """A decoder for the result, with the types that its description allows."""
     try:
         return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))
-    except Exception as bad:  # noqa: BLE001 - a schema from elsewhere may be anything
+    except Exception as bad:  # noqa: BLE001 - a foreign schema may be anything
         _logger.debug("the result of %s stays plain data: %s", info.name, bad)
         return codec.decoder(Any)
 
 
 def container_closed(own: Address) -> ConfigurationError:
-    """What every use of a closed container raises."""
+    """The error of every use of a closed container."""
     return ConfigurationError(where=own.container, problem="this container is closed; start another one")

@@ -1,4 +1,4 @@
-"""Where calls lead: what was looked up once for a handle is kept until something about it changes."""
+"""The cache of call targets: a handle's target is kept until its service or the policy changes."""
 
 from typing import Final
 
@@ -19,11 +19,11 @@ from trade.errors import AccessDenied, ServiceGone
 Target = LocalTarget | RemoteTarget
 
 _PATIENCE_S: Final = 1.0
-"""How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
+"""How long a call waits for the registry entry of a handle that arrived in a message before it."""
 
 
 class Targets:
-    """What a container may call, and how, by service."""
+    """The call targets of a container, by service."""
 
     def __init__(
         self,
@@ -44,13 +44,13 @@ class Targets:
         self._thread_pool = ThreadPool()
         self._closed = False
         self.known: Final[dict[ServiceKey, Target]] = {}
-        """Looked up already, and allowed."""
+        """Targets that were looked up, and are allowed."""
 
     def look_up(self, handle: Handle) -> Target:
-        """The target of a handle, known from now on.
+        """Looks up the target of a handle, and keeps it.
 
         Raises:
-            ServiceGone: it is not there, or not any more.
+            ServiceGone: the service does not exist, or no longer.
             AccessDenied: the policy does not let this container call it.
             ConfigurationError: the container is closed.
         """
@@ -66,7 +66,7 @@ class Targets:
             raise self.gone(handle)
         self.known[key] = target
         changed = self._registry.get(key) is not record or self._access.policy is not policy
-        if self._closed or changed:  # it left, or is another one, since we looked
+        if self._closed or changed:  # it was removed or replaced meanwhile
             self.known.pop(key, None)
         return target
 
@@ -85,14 +85,14 @@ class Targets:
             except ChannelClosed:  # closed meanwhile
                 raise container_closed(self._own) from None
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
-        if service is None:  # deregistered since we looked
+        if service is None:  # deregistered meanwhile
             return None
         return LocalTarget(service, record, self._codec, self._caller, self._thread_pool)
 
     def _our_own(self, record: Record) -> ServiceInfo | None:
-        """How this container describes a function of the middleware that another one has, too.
+        """This container's own description of a middleware function that another container has, too.
 
-        What it answers is known here, whatever that one says of it: it may be written in another language.
+        It takes precedence over the other container's description, which may come from another language.
         """
         key = record.key
         if key.domain != DOMAIN or key.provider not in (PROVIDER, ESTOP_PROVIDER):
@@ -101,7 +101,7 @@ class Targets:
         return None if service is None else service.info
 
     def gone(self, handle: Handle) -> ServiceGone:
-        """Why a handle leads nowhere."""
+        """The error of a handle without a target."""
         address = handle.key.address
         if moved_to := self._registry.moved_to(handle.key):
             return gone_to(handle.label, moved_to)
@@ -112,7 +112,7 @@ class Targets:
         return ServiceGone(service=handle.label, reason=reason)
 
     def changed(self, change: Change) -> None:
-        """Told by the registry: calls to what left must fail at once."""
+        """Forgets the targets of removed services, so that their calls fail at once; called by the registry."""
         for record in (*change.left, *change.replaced):
             self.known.pop(record.key, None)
         for record in change.left:
@@ -121,11 +121,11 @@ class Targets:
                 self._caller.publishers.forget(key.address, key.domain, key.provider)
 
     def recheck_access(self) -> None:
-        """The policy is another one."""
+        """Forgets all targets, because the policy has changed."""
         self.known.clear()
 
     def close(self) -> None:
-        """Keep none from now on."""
+        """Keeps no more targets."""
         self._closed = True
         self._thread_pool.close()
         self.known.clear()
