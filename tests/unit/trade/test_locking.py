@@ -60,7 +60,7 @@ def test_whose_locks_are_not_known_is_told(
         monkeypatch.setattr(api, "_ANSWER_S", 0.2)
         assert [info.resources for info in robot.other.locks()] == [("b",)]
         asleep.set()
-    assert "which locks there are in tester/a is not known" in caplog.text
+    assert "the locks in tester/a are not known" in caplog.text
 
 
 def test_P51_how_a_lock_is_used_is_seen_from_elsewhere(robot: Robot) -> None:

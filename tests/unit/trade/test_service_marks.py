@@ -392,7 +392,7 @@ def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock
         with pytest.raises(LockedByOther):
             burn()
     assert diary.lines == ["rain"]
-    with pytest.raises(ConfigurationError, match="only writes something down; no lock takes it"):
+    with pytest.raises(ConfigurationError, match="only writes something down, so it cannot be locked"):
         there.lock([write]).acquire()
 
 

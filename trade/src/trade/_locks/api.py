@@ -1,4 +1,4 @@
-"""What one does with locks: take them over many services, look at them, ask for them, take them away; and resume."""
+"""The lock methods of a container: take, list, request and break locks, and resume after stops."""
 
 import contextlib
 import logging
@@ -28,27 +28,27 @@ _logger = logging.getLogger("trade")
 
 LONGEST_WAIT_S: Final = 3600.0
 LEASE_S: Final = 2.0
-"""The lease of a lock is the deadman's budget, too (S12)."""
+"""The default lease of a lock, which is also the time limit of the deadman (S12)."""
 RESUME_WAIT_S: Final = 2.0
 _SETTLE_S: Final = 1.0
 _ANSWER_S: Final = 2.0
-"""So long it may take to tell what is locked."""
+"""How long a container may take to list its locks."""
 
 
 class LockOverview(NamedTuple):
-    """What is known of all locks."""
+    """The known locks of all containers."""
 
     locks: list[LockInfo]
     silent: list[Address]
-    """Who is there and did not answer: what is locked in these is not known."""
+    """Containers that did not answer: their locks are not known."""
 
     def still(self, container: str) -> bool:
-        """Whether what was known of a container before is all that is known of it now."""
+        """Whether a container did not answer, so that only its earlier locks are known."""
         return any(address.container == container for address in self.silent)
 
 
 class LockHost(Protocol):
-    """What locking asks of its container."""
+    """The container, as locking uses it."""
 
     access: Final[Authorizer]
 
@@ -61,7 +61,7 @@ class LockHost(Protocol):
 
 
 class LockApi:
-    """The locks of one container; ``container.locking``."""
+    """The lock methods of one container; ``container.locking``."""
 
     def __init__(self, home: LockHost) -> None:
         self._home = home
@@ -80,32 +80,32 @@ class LockApi:
         on_lost: OnLost | None = None,
         on_request: OnRequest | None = None,
     ) -> Lock:
-        """Services for oneself alone, on all their containers or on none: ``with container.lock(...):``.
+        """Locks services for exclusive use, in all their containers or in none: ``with container.lock(...):``.
 
-        Nothing is taken before the context is entered (or `Lock.acquire` called).
+        It takes nothing before the context is entered (or `Lock.acquire` is called).
 
         Args:
-            which: the actuating services that match, as they are when it is taken, or handles. If nothing matches yet,
+            which: handles, or a constraint: the actuating services that match when it is taken. If nothing matches yet,
                 it waits for that, and then for the whole of a robot's group. Of ``A | B`` it takes a part of each, or
-                nothing. What such a constraint selects and the lock does not hold is not commanded under it.
-            purpose: what for, as others are told who would like to have them.
-            wait_s: how long to wait for others, and for what is not there yet, in seconds; 0 tries. Inside a call it
-                ends before that call's deadline.
+                nothing. Under it no service can be commanded that such a constraint selects and the lock does not hold.
+            purpose: the reason, as other clients see it.
+            wait_s: how long to wait for other clients and missing services, in seconds; 0 does not wait. Inside a call
+                the wait ends before that call's deadline.
             lease_s: how long it outlives its owner, in seconds.
-            priority: who waits with a higher one comes first.
+            priority: waiting clients with a higher one come first.
             delegates: identities that may use it, too.
-            partial: take a robot's group even if members of it are not there, and of ``A | B`` what there is; then
-                `Lock.missing` says what is not.
-            on_lost: called with the error, on a thread of its own, when it is lost.
-            on_request: called with who and why, on a thread of its own, when somebody asks for it.
+            partial: take a robot's group although members are missing, and of ``A | B`` the available parts;
+                `Lock.missing` then lists the others.
+            on_lost: called with the error, on another thread, when it is lost.
+            on_request: called with the client and its reason, on another thread, when a client requests its release.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s``.
-            LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
-            IncompleteGroup: the robot file says that more belongs to the group, or nothing of an alternative is there.
-            ConfigurationError: there is nothing to lock in what matches: it only reads.
+            LockedByOther: another client holds one of them, or something still moves, after ``wait_s``.
+            IncompleteGroup: members of the group in the robot file, or a whole alternative, are missing.
+            ConfigurationError: the matching services only read, so there is nothing to lock.
             AccessDenied: the policy does not let this container lock one of them.
-            NotStopped: one of them could not be stopped when it had to be.
+            NotStopped: a required stop of one of them failed.
         """
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="lock", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
@@ -124,9 +124,9 @@ class LockApi:
         return Lock(self.lease_client, terms, wanted, on_lost, on_request, claim)
 
     def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
-        """The services to lock. If nothing matches yet, that is waited for until it is there as a whole.
+        """The services to lock. If nothing matches yet, it waits until the whole selection exists.
 
-        A part of it is given a moment to become whole or to leave, as when a driver starts or ends.
+        An incomplete selection gets a moment to become complete or to disappear, as when a driver starts or ends.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s`` seconds.
@@ -144,7 +144,7 @@ class LockApi:
         found: list[Handle] = []
 
         def arrived() -> bool:
-            with contextlib.suppress(ConfigurationError, IncompleteGroup):  # it comes and goes one by one
+            with contextlib.suppress(ConfigurationError, IncompleteGroup):  # services come and go one by one
                 found[:] = look()
             return bool(found)
 
@@ -158,22 +158,22 @@ class LockApi:
         except NoSuchService:
             if not self._home.services(which):
                 raise
-            return look()  # there is some of it, and it says what is missing
+            return look()  # a part of it exists, and the error names the missing ones
         return found
 
     def locks(self) -> list[LockInfo]:
-        """Every lock in the system: what, whose, what for, since when, who waits.
+        """Every lock in the system, with its resources, owner, purpose, start and waiters.
 
-        Containers that do not answer within 2 s are left out, and named in the log.
+        Containers that do not answer within 2 s are omitted, and named in the log.
         """
         known = self.known()
         if known.silent:
             who = ", ".join(address.who for address in known.silent)
-            _logger.warning("which locks there are in %s is not known: no answer within %g s", who, _ANSWER_S)
+            _logger.warning("the locks in %s are not known: no answer within %g s", who, _ANSWER_S)
         return known.locks
 
     def known(self) -> LockOverview:
-        """The locks of the system, and whose are not known."""
+        """The known locks of the system, and the containers that did not answer."""
         runs: list[tuple[Address, Run]] = []
         found, silent = list[LockInfo](), list[Address]()
         for address in self._home.addresses():
@@ -189,27 +189,27 @@ class LockApi:
         return LockOverview(sorted(found, key=lambda info: (info.resources, info.container)), silent)
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
-        """Ask the owners of locks on these services to give them back; they hear of who asks, and why.
+        """Asks the owners of locks on these services to release them; they learn which client asks, and why.
 
         Returns:
-            Who was asked.
+            The owners.
         """
         return self._everywhere("request_release", which, reason)
 
     def resume(self, which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
-        """Let services move again after a stop by somebody else.
+        """Lets services move again after a stop by another client.
 
         Args:
             which: handles, or a constraint: the actuating services that match.
-            wait_s: how long to wait for what a constraint matches to be there, in seconds.
+            wait_s: how long to wait for services that match the constraint, in seconds.
 
         Returns:
             The resources that were stopped.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s`` seconds.
-            LockedByOther: it is the owner of their lock who resumes.
-            AccessDenied: without a lock of one's own it is for who administers them, says the policy.
+            LockedByOther: another client holds their lock; only that client may resume them.
+            AccessDenied: this container has no lock on them, and the policy does not let it administer them.
         """
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="resume", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
@@ -218,7 +218,7 @@ class LockApi:
         return self._everywhere("resume", which)
 
     def _await_some(self, which: Constraint, wait_s: float) -> None:
-        """Wait until some of it can be resumed, and a moment for the rest; what is missing then is left out.
+        """Waits until a service can be resumed, and a moment for the others; later ones are omitted.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s`` seconds.
@@ -238,15 +238,15 @@ class LockApi:
         except NoSuchService:
             if not self._home.services(which):
                 raise
-            return  # what matches does not actuate, and that is said next
+            return  # the matching services do not actuate; the next step raises that error
         with contextlib.suppress(NoSuchService):
             self._home.await_services(which, whole, min(wait_s, _SETTLE_S))
 
     def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
-        """Take the locks on these services away from their owners; what moves under them stops.
+        """Takes the locks on these services away from their owners; motion under them stops.
 
         Returns:
-            Those that were broken.
+            The broken locks.
 
         Raises:
             AccessDenied: the policy does not let this container administer one of them.
@@ -261,7 +261,7 @@ class LockApi:
         return broken
 
     def _require(self, verb: str, handles: Sequence[Handle], which: Constraint | Iterable[Handle]) -> None:
-        """Raises AccessDenied, which names what was asked for, and then the service that it fails at."""
+        """Raises AccessDenied, which names the requested group and the forbidden service."""
         groups = _groups_of(which) if isinstance(which, Constraint) else []
         for handle in handles:
             what = f"{groups[0]} (of it {handle.label})" if len(groups) == 1 else handle.label
@@ -278,7 +278,7 @@ class LockApi:
 
 
 def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
-    """What to lock for the use of services, by the container that judges it."""
+    """The resources to lock for services, by the container that grants their locks."""
     wanted: dict[Address, dict[str, None]] = {}
     for handle in handles:
         wanted.setdefault(handle.key.address, {}).update(dict.fromkeys(handle.record.used))
@@ -288,10 +288,10 @@ def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
 def selected(
     which: Constraint | Iterable[Handle], select: Callable[[Constraint], Sequence[Handle]], verb: str = "lock"
 ) -> list[Handle]:
-    """The services a lock, or a resume, is for: those given, or the actuating ones that match.
+    """The services to lock or resume: those given, or the actuating ones that match.
 
     Raises:
-        ConfigurationError: there are none, a stop is among them, or it is one handle and no list.
+        ConfigurationError: there are none, a stop is among them, or it is one handle instead of a list.
     """
     if isinstance(which, Handle):
         problem = f"is one service; give a list, {verb}([handle]), or a constraint, {verb}(where(...))"
@@ -300,18 +300,18 @@ def selected(
         found = [handle for handle in select(which) if handle.effect == "actuate"]
         if not found:
             problem = f"nothing that matches actuates, so there is nothing to {verb}"
-            problem += "; what reads is locked by its handle" if verb == "lock" else ""
+            problem += "; lock a service that reads by its handle" if verb == "lock" else ""
             raise ConfigurationError(where=f"{verb} of {which}", problem=problem)
         return found
     found = list(which)
     if noted := next((handle for handle in found if handle.effect == "note"), None):
-        problem = "it only writes something down; no lock takes it"
+        problem = "it only writes something down, so it cannot be locked"
         raise ConfigurationError(where=noted.label, problem=problem)
     if not found:
         raise ConfigurationError(where=verb, problem=f"an empty selection {verb}s nothing; name some services")
     for handle in found:
         if handle.effect == "stop":
-            raise ConfigurationError(where=handle.label, problem="a stop is everybody's; it cannot be locked")
+            raise ConfigurationError(where=handle.label, problem="a stop is open to every client and cannot be locked")
     return found
 
 
@@ -321,10 +321,10 @@ def _groups_of(which: Constraint) -> list[str]:
 
 
 def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> None:
-    """A group of a robot is locked as a whole (S16), and of a union a part of each alternative (S13).
+    """Checks that a robot's group is complete (S16), and that each alternative of a union has a part (S13).
 
     Raises:
-        IncompleteGroup: some of what belongs to it is not there.
+        IncompleteGroup: members or alternatives are missing.
     """
     if missing := absent(which, handles):
         groups = _groups_of(which) if isinstance(which, Constraint) else []
@@ -332,7 +332,7 @@ def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle
 
 
 def absent(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> list[str]:
-    """What a constraint is for and is not among these: members that the robot file names, and whole alternatives."""
+    """What a constraint names and these do not include: members of the robot file's groups, and whole alternatives."""
     if not isinstance(which, Constraint):
         return []
     groups, there = _groups_of(which), {name for handle in handles for name in handle.record.info.uses}
@@ -348,7 +348,7 @@ def absent(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> l
 
 
 def _alternatives(which: Constraint) -> list[Constraint]:
-    """What is asked for in place of each other; clauses that differ in what they leave out are one."""
+    """The alternatives of a constraint; clauses that differ only in what they exclude count as one."""
     asked: dict[frozenset[Term], list[frozenset[Term]]] = {}
     for clause in which.clauses:
         asked.setdefault(frozenset(term for term in clause if not term.negated), []).append(clause)

@@ -14,21 +14,21 @@ VARIABLE: Final = "TRADE_LOCK"
 
 
 def passed_on(holder: Address, resources: tuple[str, ...], tokens: list[Token], claim: Claim) -> str:
-    """What stands in the variable."""
+    """The value of the variable."""
     numbers = [[token.epoch, token.number] for token in tokens]
     claimed = msgspec.to_builtins(claim)
     return json.dumps([[holder.identity, holder.container, holder.epoch], list(resources), numbers, claimed])
 
 
 class InheritedLock:
-    """Every call of one container of this process is made under it, in all threads, while its holder lives.
+    """A lock around every call of one container of this process, in all threads, while its holder lives.
 
     Args:
-        text: what `passed_on` gave.
+        text: the value that `passed_on` returned.
         owner: the container of this process that makes the calls.
 
     Raises:
-        ConfigurationError: the text is something else.
+        ConfigurationError: the text has another form.
     """
 
     def __init__(self, text: str, owner: Address) -> None:
@@ -43,25 +43,25 @@ class InheritedLock:
             problem = "is what `trade lock` passes to the command it runs; unset it"
             raise ConfigurationError(where=VARIABLE, problem=problem) from None
         self._lost = ""
-        """Why, once it is."""
+        """Why it is lost; empty if it is not."""
 
     @property
     def held(self) -> bool:
-        """Whether it holds, as far as one can know here: those who granted it judge."""
+        """Whether it holds, as far as is known here: the containers that granted it decide."""
         return not self._lost
 
     def tokens(self) -> list[Token]:
-        """What shows it to those it was granted by; raises LockLost once its holder is gone."""
+        """Its proofs for the containers that granted it; raises LockLost once its holder has ended."""
         if self._lost:
             raise LockLost(resources=self._resources, reason=self._lost)
         return self._tokens
 
     def refused(self, by: Address, error: LockLost) -> None:  # noqa: ARG002
-        """A call under it was refused."""
+        """Handles the refusal of a call made under it."""
         if not set(self._resources).isdisjoint(error.resources):
             self._lost = self._lost or error.reason
 
     def lost(self, address: Address) -> None:
-        """A container has ended or cannot be reached."""
+        """Handles the end or loss of a container."""
         if address == self._holder:
             self._lost = f"{address.container}, which held it, has ended or cannot be reached"

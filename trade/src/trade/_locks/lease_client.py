@@ -1,4 +1,4 @@
-"""Every lock a container has or wants: asked for everywhere, renewed, given back. One of them: `lock`."""
+"""The lease client: acquires, renews and releases all locks of a container. One lock: `lock`."""
 
 import contextlib
 import math
@@ -19,14 +19,14 @@ from trade._resources.grants import LockRequest
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0
-"""How long a container may take to answer, on top of what it is asked to wait."""
+"""How long a container may take to answer, beyond the requested wait."""
 _AGAIN_S: Final = 0.1
 _BEATS: Final = 4
 """Renewals within one lease."""
 
 
 class LeaseHost(Protocol):
-    """What locking asks of its container."""
+    """The container, as locking uses it."""
 
     @property
     def address(self) -> Address: ...
@@ -34,7 +34,7 @@ class LeaseHost(Protocol):
 
 
 class LeaseClient:
-    """Every lock of a container, and the thread that renews them while there are any."""
+    """All locks of a container, and the thread that renews them."""
 
     def __init__(self, home: LeaseHost) -> None:
         self._home = home
@@ -42,7 +42,7 @@ class LeaseClient:
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._due = math.inf
-        """When the next renewals go out."""
+        """When the next renewals are sent."""
         self._closed = False
 
     @property
@@ -50,13 +50,13 @@ class LeaseClient:
         return self._home.address
 
     def over(self) -> bool:
-        """Whether its container closes, or has."""
+        """Whether its container closes or is closed."""
         return self._closed
 
     # --- taking
 
     def acquire(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest) -> Lock:
-        """Take all or nothing: all containers at once first, then one after the other in the order all keep (S13).
+        """Takes all or nothing: first from all containers at once, then one by one in the common order (S13).
 
         Raises:
             LockedByOther, NotStopped, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
@@ -113,11 +113,11 @@ class LeaseClient:
 
     # --- giving back
 
-    def let_go(self, lock: Lock, lost: str = "") -> bool:
-        """Renew it no more, and give back what is held of it; if it is lost, what it moves stops.
+    def release(self, lock: Lock, lost: str = "") -> bool:
+        """Stops renewing a lock and releases its parts; if it is lost, its motion stops.
 
         Returns:
-            Whether it was held until then, as far as those say who answer.
+            Whether it was held until then, by those containers that answer.
         """
         with self._changed:
             if lock in self._locks:
@@ -132,7 +132,7 @@ class LeaseClient:
         ]
         held = True
         for _, result in _at_once(gifts):
-            with contextlib.suppress(TradeError):  # where it is not heard, its lease ends it
+            with contextlib.suppress(TradeError):  # if the message is lost, the lease ends it
                 held &= result()
         return held
 
@@ -164,7 +164,7 @@ class LeaseClient:
             self._renew(locks)
 
     def _renew(self, locks: Sequence[Lock]) -> None:
-        """One call for each container, whatever the number of locks; nobody waits for the answers here."""
+        """Sends one renewal to each container, for all its locks; does not wait for the answers."""
         parts: dict[Address, list[tuple[Lock, int]]] = {}
         for lock in locks:
             if lock.wanted:
@@ -193,7 +193,7 @@ class LeaseClient:
                 lock.lose(over[number])
 
     def _not_renewed(self, address: Address, held: list[tuple[Lock, int]], error: Exception) -> None:
-        if not isinstance(error, (ServiceGone, ContainerLost)):  # too late or refused: its own lease judges
+        if not isinstance(error, (ServiceGone, ContainerLost)):  # too late or refused: its lease decides
             return
         for lock, number in held:
             if lock.has(address, number):
@@ -201,7 +201,7 @@ class LeaseClient:
                 lock.lose(str(error))
 
     def lost(self, address: Address) -> None:
-        """A container has ended or cannot be reached: locks it has a part in are lost as a whole (S14)."""
+        """Loses, as a whole, the locks with a part in a container that has ended or cannot be reached (S14)."""
         with self._changed:
             hit = [lock for lock in self._locks if address in lock.granted]
         for lock in hit:
@@ -209,7 +209,7 @@ class LeaseClient:
             lock.lose(f"container {address.container} has ended or cannot be reached")
 
     def asked(self, token: Token, who: str, reason: str) -> bool:
-        """Somebody would like to have what a grant holds. Returns whether its owner has an ear for that."""
+        """Takes a release request for a grant. Returns whether its owner handles requests."""
         with self._changed:
             found = next((lock for lock in self._locks if token in lock.granted.values()), None)
         if found is None or found.on_request is None:
@@ -218,7 +218,7 @@ class LeaseClient:
         return True
 
     def close(self) -> None:
-        """Give everything back and end the thread. Idempotent."""
+        """Releases all locks and ends the thread. Idempotent."""
         with self._changed:
             locks, self._closed = list(self._locks), True
             self._changed.notify_all()
@@ -229,7 +229,7 @@ class LeaseClient:
 
 
 def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Callable[[], Any]]]:
-    """Make calls side by side; returns how to get each result, the first one's by making it on this very thread."""
+    """Makes calls concurrently; returns a getter for each result. The first call runs on this same thread."""
     if not calls:
         return []
     (first, call), *others = calls
@@ -239,7 +239,7 @@ def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Call
 def _started(call: Bound) -> Callable[[], Any]:
     try:
         return call.start().result
-    except TradeError as error:  # it is not even there; the others are asked all the same
+    except TradeError as error:  # the service is gone; the other calls are made all the same
         return partial(_fail, error)
 
 

@@ -1,4 +1,4 @@
-"""A lock as its owner has it: its parts, and whether they still hold. `lease_client` acquires and renews them."""
+"""The owner's side of one lock: its parts, and whether they still hold. `lease_client` acquires and renews them."""
 
 import asyncio
 import contextlib
@@ -27,23 +27,23 @@ _logger = logging.getLogger("trade")
 
 
 class Selection(NamedTuple):
-    """What a lock is to be of, when it is taken."""
+    """The resources that a lock will hold."""
 
     resources: dict[Address, list[str]]
-    """By the container that judges them."""
+    """By the container that grants their locks."""
     missing: tuple[str, ...] = ()
-    """What belongs to it and was not there."""
+    """What belongs to the selection but is missing."""
 
 
 Wanted = Callable[[], Selection]
-"""Finds what to lock at the moment it is taken; waits until it is there."""
+"""Selects what to lock when the lock is taken; waits until it exists."""
 OnLost = Callable[[LockLost], object]
 OnRequest = Callable[[str, str], object]
-"""Told who would like to have the lock, and why."""
+"""Called with the client that requests the lock's release, and its reason."""
 
 
 class Lock:
-    """Exclusive use of services; a context manager, also of asyncio. Calls made inside carry it; no others get through.
+    """Exclusive use of services; a context manager, also of asyncio. Only calls made inside it get through.
 
     It holds under leases that are renewed while this process lives. Once lost it stays lost: every actuating call
     inside raises LockLost before anything is sent.
@@ -63,20 +63,20 @@ class Lock:
         self._wanted = wanted
         self._on_lost = on_lost
         self.on_request = on_request
-        """Called, on a thread of its own, when somebody asks for it."""
+        """Called, on another thread, when a client requests its release."""
         self.purpose: Final = terms.purpose
         self.lease_s: Final = terms.lease_s
         self.resources: tuple[str, ...] = ()
-        """What it holds, by name."""
+        """The names of the resources that it holds."""
         self.missing: tuple[str, ...] = ()
-        """What its constraint is for and was not there when it was taken, with ``partial=True``: members of a robot's
+        """What its constraint names and was missing when it was taken with ``partial=True``: members of a robot's
         group, and alternatives."""
         self.claim = claim
-        """What it selects, and where what it holds of that is."""
+        """What it selects, and which resources of that it holds in which container."""
         self._granted: dict[Address, Token] = {}
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None
-        """Why, once it is; it is never raised itself, as it would keep every frame that it went through."""
+        """Why it is lost; never raised itself, as it would keep every frame that it passed through."""
         self._taken = self._whole = self._ended = False
         self._guard = threading.Lock()
         self._resets: list[Reset[tuple[Held, ...]]] = []
@@ -84,18 +84,18 @@ class Lock:
     # --- being used
 
     def acquire(self) -> "Lock":
-        """Take it, once; calls are made under it inside `use`. Entering the context does both.
+        """Takes the lock, once; make calls under it inside `use`. Entering the context does both.
 
-        Until `release`, or the end of this process, it is renewed and kept from others, used or not.
+        Until `release`, or the end of this process, it is renewed and excludes other clients, used or not.
 
         Raises:
             NoSuchService, LockedByOther, NotStopped, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError:
                 see `Container.lock`; nothing is held then.
-            LockLost: what it had already was lost while it waited for the rest.
+            LockLost: a part was lost while it waited for the rest.
         """
         with self._guard:
             if self._taken:
-                problem = "a lock is taken once; make another one with trade.lock(...), or share this one with use()"
+                problem = "a lock is taken once; create another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
             self._taken = True
         until = time.monotonic() + patience_s(self._terms.wait_s)
@@ -106,38 +106,38 @@ class Lock:
         self._lease_client.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
         self._whole = True
         if self.missing:
-            told = self.purpose, ", ".join(self.resources), ", ".join(self.missing)
-            _logger.warning("the lock for %r holds %s; missing: %s", *told)
+            report = self.purpose, ", ".join(self.resources), ", ".join(self.missing)
+            _logger.warning("the lock for %r holds %s; missing: %s", *report)
         return self
 
     @property
     def owner(self) -> Address:
-        """The container whose lock it is."""
+        """The container that owns it."""
         return self._lease_client.owner
 
     @property
     def held(self) -> bool:
-        """Whether it holds now, as far as one can know here."""
+        """Whether it holds now, as far as is known here."""
         return self._whole and self.wanted
 
     @property
     def wanted(self) -> bool:
-        """Whether what it has of its parts is to be kept: it holds, or waits for the others."""
+        """Whether to keep its granted parts: it holds, or waits for the others."""
         self._look()
         return not self._ended and self._lost is None
 
     def tokens(self) -> Iterable[Token]:
-        """What shows it to those it was granted by.
+        """Its proofs for the containers that granted it.
 
         Raises:
-            LockLost: it holds no more.
+            LockLost: it no longer holds.
         """
         self.check()
         return () if self._ended else self._granted.values()
 
     @contextlib.contextmanager
     def use(self) -> Generator["Lock", None, None]:
-        """Make calls under it in another thread or task of its owner."""
+        """Makes the calls inside under it, in another thread or task of its owner."""
         reset = holding.set((*holding.get(), self))
         try:
             yield self
@@ -145,17 +145,17 @@ class Lock:
             holding.reset(reset)
 
     def environment(self) -> dict[str, str]:
-        """What lets a child process make all its calls under it; raises LockLost if it holds no more."""
+        """Environment variables with which a child process makes all calls under it; raises LockLost if it is lost."""
         return {VARIABLE: passed_on(self.owner, self.resources, list(self.tokens()), self.claim)}
 
     def release(self) -> None:
-        """Give it back. Idempotent."""
+        """Releases the lock. Idempotent."""
         with self._guard:
             if self._ended:
                 return
             self._ended = True
         resources = self.resources
-        if not self._lease_client.let_go(self) and self._lost is None:
+        if not self._lease_client.release(self) and self._lost is None:
             self._lost = LockLost(resources=resources, reason="it was not held any more when it was given back")
 
     def __enter__(self) -> "Lock":
@@ -197,18 +197,18 @@ class Lock:
     # --- being kept
 
     def take_parts(self) -> dict[Address, Token]:
-        """All parts it has, which it has no longer."""
+        """Removes and returns all its parts."""
         with self._guard:
             parts, self._granted, self._confirmed, self.resources = self._granted, {}, {}, ()
         return parts
 
     @property
     def granted(self) -> dict[Address, Token]:
-        """Its parts, by the container that granted them; never changed, only replaced."""
+        """Its parts, by the container that granted them; replaced, never changed in place."""
         return self._granted
 
     def add(self, address: Address, granted: Granted, asked_at: float) -> None:
-        """One container granted its part; it was asked at that time."""
+        """Adds the part that one container granted; it was requested at that time."""
         with self._guard:
             if granted.token is not None:
                 self._confirmed = {**self._confirmed, address: asked_at + granted.waited_s}
@@ -217,18 +217,18 @@ class Lock:
             self.claim = self.claim.with_held(address, granted.resources)
 
     def confirm(self, address: Address, number: int, asked_at: float) -> None:
-        """One container still holds its part of that number; it was asked at that time."""
+        """Takes the renewal of one container's part; it was requested at that time."""
         with self._guard:
             if self.has(address, number):
                 self._confirmed = {**self._confirmed, address: max(asked_at, self._confirmed[address])}
 
     def has(self, address: Address, number: int) -> bool:
-        """Whether that grant is a part of it (still)."""
+        """Whether that grant is still a part of it."""
         token = self._granted.get(address)
         return token is not None and token.number == number
 
     def drop(self, address: Address) -> None:
-        """That container is gone, and with it all it granted."""
+        """Removes the part of a container that is gone."""
         with self._guard:
             self._granted = {other: token for other, token in self._granted.items() if other != address}
 
@@ -239,24 +239,24 @@ class Lock:
             raise _again(self._lost)
 
     def refused(self, by: Address, error: LockLost) -> None:
-        """A call under it was refused by a container: what that granted is lost, and with it the rest."""
+        """Handles the refusal of a call under it: that container's part is lost, and with it the whole lock."""
         if by in self._granted and not set(self.resources).isdisjoint(error.resources):
             self.lose(error.reason)
 
     def _look(self) -> None:
-        """On waking, what was not confirmed within the lease is lost before anything is done (S12)."""
+        """Loses the lock, before any other action, if a part was not renewed within its lease (S12)."""
         oldest = min(self._confirmed.values(), default=None)
         if oldest is not None and time.monotonic() - oldest >= self.lease_s:
             self.lose(f"it could not be renewed within its lease of {self.lease_s:g} s")
 
     def lose(self, reason: str) -> None:
-        """It does not hold any more; give up the rest of it. Once."""
+        """Loses the lock, and releases its other parts; only the first call has an effect."""
         with self._guard:
             if self._ended or self._lost is not None:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        apart(self._lease_client.over, self._lease_client.let_go, self, reason)
+        apart(self._lease_client.over, self._lease_client.release, self, reason)
         if self._on_lost is not None:
             apart(self._lease_client.over, self._on_lost, _again(self._lost))
 
@@ -266,12 +266,12 @@ def _again(lost: LockLost) -> LockLost:
 
 
 def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
-    """Call it on a thread of its own: nobody who tells of locks waits for whoever is told.
+    """Calls a lock callback on another thread, so that no lock waits for it.
 
     Args:
-        over: whether the container closes; what that cuts off is no failure.
-        call: what to call.
-        arguments: with these.
+        over: whether the container closes; an error that this causes is not a failure.
+        call: the callback.
+        arguments: its arguments.
     """
 
     def guarded() -> None:
@@ -279,8 +279,8 @@ def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any
             call(*arguments)
         except Exception as error:
             if over() and isinstance(error, TradeError):
-                _logger.debug("told of a lock, %r was cut off as its own container closed: %s", call, error)
+                _logger.debug("the lock callback %r was cut off, because its container closed: %s", call, error)
             else:
-                _logger.exception("told of a lock, %r failed", call)
+                _logger.exception("the lock callback %r failed", call)
 
-    threading.Thread(target=guarded, name="trade-lock-told", daemon=True).start()
+    threading.Thread(target=guarded, name="trade-lock-told", daemon=True).start()  # plain: told

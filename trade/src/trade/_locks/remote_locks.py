@@ -1,4 +1,4 @@
-"""What is locked in other systems behind the grants of this container: where a resource is shared, its home judges."""
+"""Locks in other systems behind the grants of this container: the home of a shared resource grants its locks."""
 
 import contextlib
 import time
@@ -18,13 +18,13 @@ from trade._resources.resource import Resource
 from trade.errors import LockLost
 
 Wanted = Mapping[Address, Sequence[str]]
-"""Resources by the container that judges them, all of one other system."""
+"""Resources of one other system, by the container that grants their locks."""
 Wish = Callable[[int, str, str], None]
-"""Told who would like to have what stands behind a grant, and why."""
+"""Takes a release request for the locks behind a grant: the grant, the requesting client and the reason."""
 
 
 class RemoteSystem(Protocol):
-    """The way to another system, for a call that was made in this one."""
+    """Access to another system, for a call that was made in this one."""
 
     def lock(
         self, call: CallContext, wanted: Wanted, terms: LockRequest, on_lost: OnLost, on_request: OnRequest
@@ -52,7 +52,7 @@ class SharedResource(Resource):
         *,
         estop: bool = False,
     ) -> None:
-        """Void what was admitted; whether it latches is judged at home."""
+        """Makes earlier permits void; its home decides whether the stop latches."""
         super().stop(by, (), reason, estop=estop)
 
 
@@ -63,48 +63,48 @@ class RemoteLock:
         self._borrowed = borrowed
         self._wish = wish
         self.number = 0
-        """Of the grant; 0 while there is none."""
+        """The number of the grant; 0 while it has none."""
         self.locks: list[Lock] = []
         self.waited_s = 0.0
-        """How long it took to get them."""
+        """How long it took to acquire them."""
 
-    def stand_for(self, granted: Granted) -> None:
-        """They are behind that from now on. Raises LockLost: one of the two does not hold any more."""
+    def bind(self, granted: Granted) -> None:
+        """Binds them to that grant. Raises LockLost if one of the two no longer holds."""
         if granted.token is not None and self.locks:
             self.number = granted.token.number
             self._borrowed.keep(self)
 
     def lost(self, why: LockLost) -> None:
-        """Told by a lock of another system."""
+        """Handles the loss of a lock in another system."""
         self._borrowed.lose(self.number, why.reason)
 
     def asked(self, who: str, reason: str) -> None:
-        """Told by a lock of another system: somebody there would like to have it."""
+        """Handles a release request from another system."""
         self._wish(self.number, who, reason)
 
     def release(self) -> None:
-        """Give them back, for nobody here any more."""
+        """Releases them, in no client's context."""
         for lock in self.locks:
             Context().run(lock.release)
 
 
 class RemoteLocks:
-    """The loans of one container, by its own grants."""
+    """The locks of one container in other systems, by its own grants."""
 
     def __init__(self, table: LockTable, epoch: str) -> None:
         self._table = table
         self._epoch = epoch
         self._loans: dict[int, RemoteLock] = {}
-        table.tell_of_losses(self._lost)
+        table.on_loss(self._lost)
 
     @contextlib.contextmanager
     def behind(
         self, call: CallContext, resources: Iterable[Resource], terms: LockRequest, wish: Wish
     ) -> Generator[RemoteLock, None, None]:
-        """Take those of these that are shared where they are at home; given back unless they stand for a grant then.
+        """Locks the shared ones of these at their homes; releases them unless they are bound to a grant then.
 
         Raises:
-            TradeError: what the home says.
+            TradeError: the error of the home.
         """
         loan, begun = RemoteLock(self, wish), time.monotonic()
         try:
@@ -118,7 +118,7 @@ class RemoteLocks:
                 loan.release()
 
     def keep(self, loan: RemoteLock) -> None:
-        """Told by the loan: it stands for a grant now. Raises LockLost."""
+        """Keeps the locks of a grant. Raises LockLost if one of them, or the grant, no longer holds."""
         number = loan.number
         self._loans[number] = loan
         reason = self._table.over(number) or next((_lapsed(lock) for lock in loan.locks if not lock.held), "")
@@ -128,24 +128,24 @@ class RemoteLocks:
             raise LockLost(resources=tuple(name for lock in loan.locks for name in lock.resources), reason=reason)
 
     def lose(self, number: int, reason: str) -> None:
-        """What stood behind a grant is lost: so is the grant."""
+        """Revokes a grant, because a lock behind it is lost."""
         if number:
             self._table.lose(number, reason)
 
     def _lost(self, number: int, reason: str) -> None:
-        """Told by the table: a grant was taken away, and what moves under it is to stop there, too."""
+        """Gives up the locks behind a revoked grant, so that their motion stops, too; called by the table."""
         loan = self._loans.pop(number, None)
         for lock in () if loan is None else loan.locks:
             lock.lose(reason)
 
     def give_back(self, number: int) -> None:
-        """A grant was given back."""
+        """Releases the locks behind a released grant."""
         loan = self._loans.pop(number, None)
         if loan is not None:
             loan.release()
 
     def shown(self, call: CallContext) -> tuple[Lock, ...]:
-        """The locks that a call which shows its tokens here is made under elsewhere."""
+        """The locks in other systems behind the tokens of a call."""
         return tuple(lock for token in call.tokens if self._may_show(call, token) for lock in self._behind(token))
 
     def _may_show(self, call: CallContext, token: Token) -> bool:
@@ -156,12 +156,12 @@ class RemoteLocks:
         return () if loan is None else loan.locks
 
     def resume(self, call: CallContext, resources: Iterable[Resource]) -> list[str]:
-        """Let those of these that are shared move again; which were stopped, by their names here."""
+        """Resumes the shared ones of these; returns those that were stopped, by their names here."""
         shared = [one for one in resources if isinstance(one, SharedResource)]
         return [one.name for one in shared if one.lender.resume(call, one.home, [one.home_name])]
 
     def request_release(self, call: CallContext, resources: Iterable[Resource], reason: str) -> list[str]:
-        """Ask for those of these that are shared and locked elsewhere; who was asked."""
+        """Asks the owners of the shared ones of these to release them; returns who was asked."""
         asked = [
             who
             for lender, wanted in _by_lender(resources).items()

@@ -1,4 +1,4 @@
-"""What every container offers about the locks of its resources, in group ``trade``."""
+"""The lock services of every container, in group ``trade``."""
 
 import threading
 import time
@@ -20,18 +20,18 @@ from trade._services.decorator import service
 from trade.errors import Busy, LockedByOther, TradeError
 
 _MOST_WAITING: Final = 24
-"""So many may stand in the queues of a container at once; who comes then asks again."""
+"""The most requests in the queues of a container; further clients ask again later."""
 
 GroupsOf = Callable[[str], set[str]]
 """The groups of the services that use a resource."""
 Ask = Callable[[Holder, Token, str, str], None]
-"""Passes a wish on to the holder of a grant: whose, which, who asks and why."""
+"""Passes a release request to the holder of a grant: the holder, the grant, the requesting client and the reason."""
 Asked = Callable[[Token, str, str], bool]
-"""Told of such a wish for a lock of this container; whether anybody heeds it."""
+"""Takes such a request for a lock of this container; returns whether its owner handles requests."""
 
 
 class LockServices:
-    """The wire's side of a `LockTable`."""
+    """The services of a `LockTable`."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class LockServices:
 
     @service
     def acquire(self, resources: list[str], terms: LockRequest) -> Granted:
-        """Take all of these and what is coupled to them for the calling session."""
+        """Locks all of these, and what is coupled to them, for the calling session."""
         call = served_call()
         named = self._table.named(resources)
         self._require(call, "lock", [resource.name for resource in named])
@@ -71,12 +71,12 @@ class LockServices:
             raise Busy(service="trade.acquire", container=self._own.container)
         terms = structs.replace(terms, wait_s=call.patience_s(terms.wait_s))
         try:
-            with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # elsewhere first: judged there
+            with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # at their homes first
                 wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
                 granted = self._table.acquire(resources, holder, wait, call.tokens, (call.id, *calls))
                 try:
                     self._require(call, "lock", granted.resources)  # once more: it may have waited for long
-                    loan.stand_for(granted)
+                    loan.bind(granted)
                 except TradeError:
                     if granted.token is not None:
                         self._table.release(granted.token.number, call.caller)
@@ -86,20 +86,20 @@ class LockServices:
         return structs.replace(granted, waited_s=granted.waited_s + loan.waited_s)
 
     def _pass_wish(self, number: int, who: str, reason: str) -> None:
-        """Somebody in another system would like to have what stands behind a grant."""
+        """Passes on a release request from another system."""
         holders = [info.holder for info in self._table.infos() if info.token.number == number]
         if holders:
             self._ask(holders[0], Token(self._own.epoch, number), who, reason)
 
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:
-        """Begin the leases of these grants anew; why those that hold no more do not."""
+        """Renews the leases of these grants; returns why each of the others no longer holds."""
         held = self._table.renew(grants, served_call().caller)
         return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
 
     @service(effect="stop")
     def release(self, grant: int, lost: str = "") -> bool:
-        """Give a grant back; ``lost`` says why the rest of its lock is, and then what it moves stops."""
+        """Releases a grant; with ``lost``, the reason why its lock is lost, its motion stops."""
         identity = served_call().caller
         if lost and self._table.renew([grant], identity):
             return self._table.lose(grant, lost)
@@ -110,12 +110,12 @@ class LockServices:
 
     @service(effect="read")
     def locks(self) -> list[LockInfo]:
-        """What is locked here, by whom, and who waits for it; and what nobody gets, as it could not be stopped."""
+        """The locks of this container's resources, with owners and waiters; also what could not be stopped."""
         return self._table.infos() + self._table.withheld()
 
     @service(effect="stop")
     def break_lock(self, grant: int, reason: str) -> bool:
-        """Take a lock away from its owner; what it moves stops. Whether it was held."""
+        """Takes a lock away from its owner; its motion stops. Returns whether it was held."""
         call = served_call()
         held = [info.resources for info in self._table.infos() if info.token.number == grant]
         self._require(call, "administer", held[0] if held else ())
@@ -123,7 +123,7 @@ class LockServices:
 
     @service
     def request_release(self, resources: list[str], reason: str) -> list[str]:
-        """Ask the owners of these to give them back; who was asked."""
+        """Asks the owners of these to release them; returns who was asked."""
         call = served_call()
         who = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
         holders: dict[Token, Holder] = {}
@@ -137,12 +137,12 @@ class LockServices:
 
     @service
     def release_requested(self, token: Token, who: str, reason: str) -> bool:
-        """Somebody would like to have what a lock of this container holds; whether its owner has an ear for that."""
+        """Takes a release request for a lock of this container; returns whether its owner handles requests."""
         return self._asked(token, who, reason)
 
     @service
     def resume(self, resources: list[str]) -> list[str]:
-        """Let these move again after a stop; for the owner of their lock, or who administers what is not locked."""
+        """Lets these move again after a stop; for the owner of their lock, or, if unlocked, for an administrator."""
         call = served_call()
         found = self._table.named(resources)
         for resource in found:
@@ -158,18 +158,18 @@ class LockServices:
         return [resource.name for resource in found if _resumed(resource) or resource.name in there]
 
     def _is_for(self, resource: Resource, holder: Holder, call: CallContext) -> bool:
-        """Whether a call is made for whoever holds a lock, or under it, as by the command of `trade lock`.
+        """Whether a call is made for the holder of a lock, or under it, as by the command of `trade lock`.
 
-        For whom else than itself, and under what, is what its caller says: who that is has to fit.
+        The caller states its session and tokens itself, so its identity must match, too.
         """
         mine = holder.session in call.sessions or Token(self._own.epoch, resource.live) in call.tokens
         return mine and (call.caller == holder.identity or call.caller in holder.delegates)
 
     def _require(self, call: CallContext, verb: str, resources: Iterable[str]) -> None:
-        """Of each resource one service that uses it is enough for the caller to have the right over.
+        """Checks that the caller has the right over at least one service that uses each resource.
 
         Raises:
-            AccessDenied: the policy gives it over none.
+            AccessDenied: the policy gives it the right over none of them.
         """
         for name in resources if self._access.policy is not None else ():
             self._access.require_any(call.caller, verb, self._groups(name), name)

@@ -1,4 +1,4 @@
-"""What the lock table keeps: requests, grants, and who waits."""
+"""The records of the lock table: requests, grants and waiters."""
 
 from collections.abc import Iterable
 
@@ -9,14 +9,14 @@ from trade._resources.resource import Holder, Resource
 
 
 class LockRequest(Struct, frozen=True):
-    """How somebody wants a lock."""
+    """The terms of a lock request."""
 
     purpose: str = ""
     lease_s: float = 2.0
     wait_s: float = 0.0
-    """How long to stand in the queue, and then to wait for what still runs and moves."""
+    """How long to wait in the queue, and then for calls and motion to end."""
     priority: int = 0
-    """Higher ones come first; whoever has it keeps it."""
+    """Higher ones come first; a granted lock is not taken away."""
     delegates: tuple[str, ...] = ()
     """Identities that may use it, too."""
 
@@ -25,14 +25,14 @@ class Granted(Struct, frozen=True):
     """A lock's part in one container."""
 
     token: Token | None
-    """None: everything asked for was locked by the asking call already."""
+    """None: the requesting call had locked everything already."""
     resources: tuple[str, ...]
     waited_s: float = 0.0
-    """How long after it was asked for; the lease began then."""
+    """How long after the request it was granted; the lease began then."""
 
 
 class LockInfo(Struct, frozen=True):
-    """One grant, as `trade.locks` tells it; or, with number 0 and of "nobody", what could not be stopped (S14)."""
+    """One grant, as `trade.locks` reports it; with number 0 a resource that could not be stopped (S14)."""
 
     token: Token
     container: str
@@ -41,27 +41,27 @@ class LockInfo(Struct, frozen=True):
     left_s: float
     """What is left of the lease."""
     uses: int
-    """Calls made under it."""
+    """The number of calls made under it."""
     last_use: float
     """``time.time()`` of the last one; 0 for none."""
     waiting: tuple[str, ...]
-    """Who waits for any of it, next first."""
+    """The clients that wait for any of it, next first."""
 
 
 class Waiter(Struct, eq=False):
-    """Somebody who asks for resources."""
+    """A client that waits for resources."""
 
     order: tuple[int, int]
     resources: tuple[Resource, ...]
     holder: Holder
     calls: frozenset[int]
-    """Of the asking chain: they are not waited for."""
+    """The calls that led to the request: it does not wait for them."""
     gone: str = ""
-    """Why it waits in vain."""
+    """Why it cannot get them any more."""
 
 
 class Grant(Struct, eq=False):
-    """Resources that somebody has, all until the same moment."""
+    """Resources that one client holds under the same lease."""
 
     number: int
     resources: tuple[Resource, ...]
@@ -70,7 +70,7 @@ class Grant(Struct, eq=False):
     until: float
 
     def info(self, epoch: str, container: str, now: float, waiting: Iterable[Waiter]) -> LockInfo:
-        """As others see it, with those of the waiting who wait for any of it."""
+        """The grant as others see it, with the waiters for any part of it."""
         in_vain = [one.holder for one in waiting if not set(one.resources).isdisjoint(self.resources)]
         return LockInfo(
             token=Token(epoch, self.number),
@@ -85,13 +85,13 @@ class Grant(Struct, eq=False):
 
 
 def withheld(resource: Resource, epoch: str, container: str) -> LockInfo:
-    """Of what could not be stopped: nobody gets it before it is resumed."""
-    purpose = f"could not be stopped ({resource.unsafe}); look at it, then `trade resume {resource.name}`"
+    """The entry of a resource that could not be stopped: no client gets it before it is resumed."""
+    purpose = f"could not be stopped ({resource.unsafe}); check it, then run `trade resume {resource.name}`"
     return LockInfo(
         token=Token(epoch, 0),
         container=container,
         resources=(resource.name,),
-        holder=Holder("nobody", "", "", purpose, resource.unsafe_at),
+        holder=Holder("nobody", "", "", purpose, resource.unsafe_at),  # plain: nobody
         left_s=0.0,
         uses=0,
         last_use=0.0,

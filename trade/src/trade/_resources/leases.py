@@ -1,4 +1,4 @@
-"""When leases of locks end: a thread that waits for the next one."""
+"""The expiry of lock leases: a thread that waits for the next one."""
 
 import math
 import threading
@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 
 class Leases:
-    """Looks when the next lease may end, and earlier if it is told of one that ends before.
+    """Expires leases when they end.
 
     Args:
-        expire: takes away what is over; returns when the next may end, or infinity.
-        clock: in which these moments are, in seconds.
+        expire: revokes expired grants; returns when the next one may expire, or infinity.
+        clock: the clock of these times, in seconds.
     """
 
     def __init__(self, expire: Callable[[], float], clock: Callable[[], float]) -> None:
@@ -22,7 +22,7 @@ class Leases:
         self._closed = False
 
     def look_by(self, until: float) -> None:
-        """There is a lease that ends then. Two threads may not say so at once."""
+        """Notes a lease that ends then. Two threads must not call this at once."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
             self._thread.start()
@@ -32,13 +32,13 @@ class Leases:
     def _run(self) -> None:
         while not self._closed:
             self._sooner.clear()
-            self._next_look = math.inf  # whoever is told of during the look wakes us
+            self._next_look = math.inf  # a lease noted meanwhile wakes this thread
             self._next_look = self._expire()
             left_s = self._next_look - self._clock()
             self._sooner.wait(None if left_s == math.inf else max(0.0, left_s))
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
+        """Ends the thread. Idempotent."""
         self._closed = True
         self._sooner.set()
         if self._thread is not None and self._thread is not threading.current_thread():

@@ -1,7 +1,7 @@
-"""The lock table of a container: who has which of its resources, for how long, and who comes next.
+"""The lock table of a container: which client holds which of its resources, for how long, and which one is next.
 
-All of it is this container's own: grants are made here, leases run on this clock, fences fall here. The other side of a
-lock, who asks and renews, is `_locks.lease_client`.
+The container grants locks of its own resources, on its own clock. The owner's side of a lock, which requests and renews
+it, is `_locks.lease_client`.
 """
 
 import math
@@ -23,15 +23,15 @@ from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, T
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 
 _REMEMBERED: Final = 256
-"""So many grants that ended are known with the reason."""
+"""How many ended grants it remembers, with the reasons."""
 _LEASE_ENDED: Final = "its lease ended"
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
-"""Stops resources for a reason, without waiting; tells of each when it is over, and why if it could not be done."""
+"""Stops resources for a reason, without waiting; reports each stop when it is over, and why if it failed."""
 
 
 class LockTable:
-    """The resources of one container."""
+    """The resources of one container, and the locks that hold on them."""
 
     def __init__(
         self,
@@ -44,18 +44,18 @@ class LockTable:
         self._epoch = epoch
         self._container = container
         self._stop: Stop = _leave_it
-        self._told: Callable[[int, str], None] = lambda _number, _reason: None
+        self._on_loss: Callable[[int, str], None] = lambda _number, _reason: None
         self._clock = clock
         self._resources: dict[str, tuple[Resource, int]] = {}
-        """By name, with the number of services that use it."""
+        """Resources by name, with the number of services that use them."""
         self._grants: dict[int, Grant] = {}
         self._ended: dict[int, str] = {}
-        """Why the last few grants ended."""
+        """Why the last grants ended, by number."""
         self._sessions = EndedSessions()
         self._waiting: list[Waiter] = []
-        """For their turn, next first."""
+        """Requests that wait for their turn, next first."""
         self._acquiring: list[Waiter] = []
-        """For their turn or for what still runs."""
+        """Requests that wait for their turn, or for running calls and motion."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
         self._leases = Leases(self.expire, clock)
@@ -63,20 +63,20 @@ class LockTable:
         self._estop: Latch | None = None
 
     def stop_with(self, stop: Stop) -> None:
-        """How to stop what moves under a lock that is lost."""
+        """Sets how motion under a lost lock is stopped."""
         self._stop = stop
 
-    def tell_of_losses(self, told: Callable[[int, str], None]) -> None:
-        """Have this called, and not kept waiting, with each grant that is taken away, and why."""
-        self._told = told
+    def on_loss(self, callback: Callable[[int, str], None]) -> None:
+        """Calls this with each grant that is revoked, and the reason; it must not wait."""
+        self._on_loss = callback
 
     # --- resources
 
     def adopt(self, named: Resource | str) -> Resource:
-        """The resource of that name, made if it is new; given back by `drop`.
+        """The resource of that name, created if it is new; `drop` releases it.
 
         Raises:
-            ValueError: another object stands for that name already.
+            ValueError: the name belongs to another object.
         """
         name = named if isinstance(named, str) else named.name
         with self._changed:
@@ -84,7 +84,7 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
-            if known is None:  # what is offered anew is nobody's
+            if known is None:  # a newly offered resource has no holder
                 resource.live, resource.holder = 0, None
             resource.epoch, resource.over, resource.gone = self._epoch, self.over, self._sessions.gone
             resource.estop = self._estop
@@ -93,14 +93,14 @@ class LockTable:
             return resource
 
     def estop(self, latch: Latch | None) -> None:
-        """Latch every resource, those to come, too, or none any more."""
+        """Latches every resource, present and future, or releases the latch (None)."""
         with self._changed:
             self._estop = latch
             for resource, _ in self._resources.values():
                 resource.estop = latch
 
     def drop(self, resource: Resource) -> None:
-        """One service less uses it. With the last one it is gone: locks of it are lost, who waits for it is refused."""
+        """Releases one service's use. After the last one its locks are lost and its waiters are refused."""
         with self._changed:
             known, uses = self._resources[resource.name]
             if uses > 1:
@@ -114,15 +114,15 @@ class LockTable:
         self.lose(resource.live, f"{resource.name} is no longer offered")
 
     def resources(self) -> list[Resource]:
-        """All of them, by name."""
+        """All resources, sorted by name."""
         with self._changed:
             return [self._resources[name][0] for name in sorted(self._resources)]
 
     def named(self, names: Iterable[str]) -> tuple[Resource, ...]:
-        """Those of these names and what is coupled to them, in the order all lock in.
+        """The resources of these names and those coupled to them, in the common order of locking.
 
         Raises:
-            ServiceGone: one is not here (any more).
+            ServiceGone: one does not exist here, or no longer.
         """
         wanted, found = list(names), dict[str, Resource]()
         with self._changed:
@@ -146,20 +146,20 @@ class LockTable:
         tokens: Iterable[Token] = (),
         calls: Iterable[int] = (),
     ) -> Granted:
-        """Wait for one's turn, then for what still runs, then have them all.
+        """Waits for the client's turn, then until running calls and motion end, and grants all resources.
 
         Args:
-            names: of resources; what is coupled to them comes with them.
-            holder: who asks.
-            terms: how.
-            tokens: locks the asking call is made under; what they hold is not asked for again.
-            calls: the asking chain, which is not waited for.
+            names: of resources; those coupled to them are included.
+            holder: the requesting client.
+            terms: the terms of the request.
+            tokens: the locks around the requesting call; what they hold is not requested again.
+            calls: the requesting call and its outer ones, which are not waited for.
 
         Raises:
-            LockedByOther: not within the times given; nothing is held then.
-            NotStopped: one could not be stopped when it had to be, and is given to nobody.
-            ServiceGone: one is not here.
-            SessionEnded: who asks is not there any more.
+            LockedByOther: not within the given times; nothing is held then.
+            NotStopped: a required stop of one failed, so no client gets it.
+            ServiceGone: one does not exist here.
+            SessionEnded: the client's session has ended.
         """
         mine = set(tokens)
         resources = tuple(one for one in self.named(names) if Token(self._epoch, one.live) not in mine)
@@ -188,7 +188,7 @@ class LockTable:
             self._changed.notify_all()
 
     def _take_turn(self, waiter: Waiter, until: float) -> None:
-        """Wait until nobody has any of them and nobody waits before us for any; they are ours to empty then."""
+        """Waits until no client holds any of them and no earlier one waits for any; then new calls are refused."""
         self._waiting.append(waiter)
         self._waiting.sort(key=lambda one: one.order)
         try:
@@ -212,7 +212,7 @@ class LockTable:
             if earlier is waiter:
                 return None
             shared = next((one for one in waiter.resources if one in earlier.resources), None)
-            if shared is not None:  # in strict order, so that every wait is bounded by those before it
+            if shared is not None:  # in strict order, so that every wait is bounded
                 return locked(shared, earlier.holder, waiter.holder.session)
         return None
 
@@ -221,10 +221,10 @@ class LockTable:
 
     def _drain(self, waiter: Waiter, until: float) -> None:
         while (running := self._running(waiter)) is not None:
-            owner = ", ".join(running.movers) or "somebody"
+            owner = ", ".join(running.movers) or "another client"
             purpose = "a call or a motion that has not ended"
             self._wait(waiter, until, LockedByOther(resources=(running.name,), owner=owner, purpose=purpose))
-            if (unsafe := self._unsafe(waiter)) is not None:  # whoever moved it has gone meanwhile, and it went on
+            if (unsafe := self._unsafe(waiter)) is not None:  # its mover has ended meanwhile, but the motion has not
                 raise unsafe
 
     def _wait(self, waiter: Waiter, until: float, obstacle: TradeError) -> None:
@@ -234,7 +234,7 @@ class LockTable:
         self._changed.wait(left)
 
     def _running(self, waiter: Waiter) -> Resource | None:
-        """One of them that is still in use by others than the asking chain."""
+        """One of them that calls outside the requesting chain still use."""
         for resource in waiter.resources:
             others = [call for call in list(resource.calls) if call not in waiter.calls]
             if others or (resource.moving and not resource.calls):
@@ -259,7 +259,7 @@ class LockTable:
     # --- while it is held
 
     def renew(self, numbers: Iterable[int], identity: str) -> list[int]:
-        """Let leases begin anew; returns those that still hold."""
+        """Renews leases; returns the grants that still hold."""
         with self._changed:
             now = self._clock()
             held = [self._grants[number] for number in numbers if number in self._grants]
@@ -269,19 +269,19 @@ class LockTable:
             return [grant.number for grant in own]
 
     def over(self, number: int) -> str:
-        """Why a grant holds no more; empty if it holds."""
+        """Why a grant no longer holds; empty if it holds."""
         grant = self._grants.get(number)
         if grant is None:
             return self._ended.get(number, "it ended long ago")
         return "" if grant.until > self._clock() else _LEASE_ENDED
 
     def may_use(self, number: int, identity: str) -> bool:
-        """Whether a grant holds and somebody of that identity may show it."""
+        """Whether a grant holds and that identity may use it."""
         grant = self._grants.get(number)
         return grant is not None and (identity == grant.holder.identity or identity in grant.holder.delegates)
 
     def release(self, number: int, identity: str) -> bool:
-        """Give it back; what its owner left moving goes on, and the next one waits for it. Returns whether it held."""
+        """Releases a grant; motion continues, and the next holder waits for it. Returns whether it held."""
         with self._changed:
             grant = self._grants.get(number)
             if grant is None or grant.holder.identity != identity:
@@ -291,9 +291,9 @@ class LockTable:
             return True
 
     def retire(self, number: int, reason: str) -> Callable[[], None] | None:
-        """End a grant so that nobody is let in any more to what it holds; None if it has ended.
+        """Ends a grant without freeing its resources, for resources about to be dropped; None if it has ended.
 
-        For what is about to be dropped: there is no moment in which it is free. Returns what frees it after all.
+        No other client can get them in between. Returns a function that frees them after all.
         """
         with self._changed:
             grant = self._grants.pop(number, None)
@@ -312,7 +312,7 @@ class LockTable:
         return free
 
     def lose(self, number: int, reason: str) -> bool:
-        """Take it away: what moves under it stops, and only then it is given on. Returns whether it held."""
+        """Revokes a grant: its motion stops, and only then the next client gets it. Returns whether it held."""
         with self._changed:
             grant = self._grants.get(number)
             if grant is None:
@@ -322,18 +322,18 @@ class LockTable:
             self._note("lock lost", grant, reason)
             for resource in busy:
                 resource.pending = _STOPPING
-        self._told(number, reason)
+        self._on_loss(number, reason)
         try:
             self._stop(busy, reason, self._stopped)
-        except Exception as error:  # noqa: BLE001 - other locks depend on this very thread
+        except Exception as error:  # noqa: BLE001 - other locks depend on this same thread
             for resource in busy:
                 self._stopped(resource, f"it could not be stopped: {error}")
         return True
 
     def session_ended(self, session: str, reason: str) -> None:
-        """Nobody of that session (or of one within it) is there any more: its locks fall, its waiting ends.
+        """Ends a session and those within it: its locks are lost, and its requests end.
 
-        What comes from it later is refused: a call may have been under way, or have waited for its turn.
+        Its later calls are refused: some may have been under way, or waited for their turn.
         """
         with self._changed:
             self._sessions.ended(session, reason)
@@ -346,27 +346,27 @@ class LockTable:
             self.lose(number, reason)
 
     def session_back(self, session: str) -> None:
-        """It could not be reached, and is there again."""
+        """Records that an unreachable session is back."""
         self._sessions.back(session)
 
     def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
-        """Which of these has ended, as an error; None if all are there."""
+        """Which of these has ended, as an error; None if all exist."""
         return self._sessions.gone(sessions)
 
     def infos(self) -> list[LockInfo]:
-        """What is held, and who waits."""
+        """The grants that hold, with their waiters."""
         with self._changed:
             now = self._clock()
             return [grant.info(self._epoch, self._container, now, self._waiting) for grant in self._grants.values()]
 
     def withheld(self) -> list[LockInfo]:
-        """What nobody gets before it is resumed, as it could not be stopped (S14): of "nobody", with number 0."""
+        """Resources that could not be stopped, which no client gets before they are resumed (S14), with number 0."""
         return [withheld(one, self._epoch, self._container) for one in self.resources() if one.unsafe]
 
     # --- its end
 
     def _end(self, grant: Grant, reason: str) -> None:
-        self._ended[grant.number] = reason  # first: who does not find the grant looks here
+        self._ended[grant.number] = reason  # first: threads that do not find the grant read this
         del self._grants[grant.number]
         if len(self._ended) > _REMEMBERED:
             del self._ended[next(iter(self._ended))]
@@ -393,7 +393,7 @@ class LockTable:
                 self._changed.notify_all()
 
     def expire(self) -> float:
-        """Take away what outlived its lease. Returns when the next one may end, as this clock counts; or infinity."""
+        """Revokes grants whose lease has ended. Returns when the next one may end, by this clock, or infinity."""
         with self._changed:
             now = self._clock()
             over = [grant.number for grant in self._grants.values() if grant.until <= now]
@@ -403,7 +403,7 @@ class LockTable:
         return soonest
 
     def close(self) -> None:
-        """End every wait. Idempotent."""
+        """Ends every wait. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

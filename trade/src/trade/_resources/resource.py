@@ -1,7 +1,7 @@
-"""Resources: what one at a time may use, and the fences that hold to the last place before the wire.
+"""Resources, which one client at a time may use, and the fences that protect them until immediately before the wire.
 
-A call is admitted under what holds for its resources at that moment, its permit. Whoever drives the hardware looks at
-the permit once more right before bytes go out: any lock, unlock or stop in between makes it void.
+A call is admitted under a permit, which records the locks and stops of its resources at that moment. The driver checks
+the permit again immediately before bytes go out: any lock, unlock or stop in between makes it void.
 """
 
 import contextlib
@@ -22,11 +22,11 @@ __all__ = ["Permit", "Resource", "permit"]
 
 _stop_numbers: Final = itertools.count(1).__next__
 _permit_ids: Final = itertools.count(-1, -1).__next__
-"""Plain Python calls have no id of the system's; theirs are below zero."""
+"""Plain Python calls have no call id; their ids are negative."""
 
 
 class Holder(Struct, frozen=True):
-    """Whose grant it is, as errors and `trade.locks` tell it."""
+    """The holder of a grant, as errors and `trade.locks` report it."""
 
     identity: str
     container: str
@@ -43,15 +43,15 @@ class Holder(Struct, frozen=True):
 
 
 class Latch(NamedTuple):
-    """A stop that holds until somebody resumes."""
+    """A stop that holds until it is resumed."""
 
     by: str
     reason: str
     estop: bool = False
-    """Whether an e-stop did it; clearing that does not resume."""
+    """Whether it was an e-stop; clearing that does not resume."""
 
     def stopped(self, resource: str, *, estop: bool) -> Stopped:
-        """The error of who comes to that resource.
+        """The error of calls on that resource.
 
         Args:
             resource: its name.
@@ -61,10 +61,10 @@ class Latch(NamedTuple):
 
 
 class Resource:
-    """Something physical, such as a joint: used by one at a time, stopped by anybody.
+    """A physical thing, such as a joint: one client at a time uses it, any client may stop it.
 
-    Whoever drives it makes it, names it in ``resources`` of every provider that moves it, reports ``moving``, and
-    passes each command through ``permit``. The container those providers are registered in judges who may use it.
+    Its driver creates it, names it in ``resources`` of every provider that moves it, reports ``moving``, and passes
+    each command through ``permit``. The container of those providers decides which client may use it.
     """
 
     __slots__ = (
@@ -77,38 +77,38 @@ class Resource:
         self.coupled: Final = tuple(coupled)
         """Names of resources of the same container that are only locked together with it."""
         self.epoch = ""
-        """Of the container that judges."""
+        """The epoch of the container that grants its locks."""
         self.over: Callable[[int], str] = _every_grant_is_over
-        """Why a grant of that container holds no more, by the clock of its leases; empty if it holds."""
+        """Why a grant no longer holds, by the clock of its lease; empty if it holds."""
         self.gone: Callable[[Iterable[str]], SessionEnded | None] = _all_are_there
-        """Which of some sessions has ended."""
+        """Which of some sessions has ended, as an error."""
         self.live = 0
-        """The grant that holds now; 0 is none."""
+        """The number of the grant that holds now; 0 is none."""
         self.holder: Holder | None = None
         self.pending: Holder | None = None
-        """For whom it is being emptied: no new call is admitted."""
+        """The client that waits until its calls and motion have ended: no new call is admitted."""
         self.stops = 0
         self.latch: Latch | None = None
         self.estop: Latch | None = None
         self.why = ""
-        """Why it is to stop, for whoever drives it; empty once that has begun to."""
+        """Why it has to stop, for its driver; empty once the driver has begun to stop it."""
         self.unsafe = ""
-        """Why it is not granted on: it could not be stopped when it had to be."""
+        """Why it is not granted again: a required stop failed."""
         self.unsafe_at = 0.0
-        """``time.time()`` when that was."""
+        """``time.time()`` of that failure."""
         self.movers: tuple[str, ...] = ()
-        """The sessions for which it was moved last."""
+        """The sessions that moved it last."""
         self.calls: dict[int, Permit] = {}
-        """What is admitted and has not ended, by call id."""
+        """The admitted calls that have not ended, by call id."""
         self.uses = 0
-        """Calls under the lock that holds."""
+        """The number of calls under its present lock."""
         self.used_at = 0.0
         self._moving = False
         self._rested: Callable[[], None] | None = None
 
     @property
     def moving(self) -> bool:
-        """Whether it moves now, as far as whoever drives it knows."""
+        """Whether it moves now, as its driver reports."""
         return self._moving
 
     @moving.setter
@@ -118,34 +118,34 @@ class Resource:
             self.tell_rest()
 
     def on_rest(self, tell: Callable[[], None]) -> None:
-        """Have this called whenever it comes to rest, and when a call on it ends while it is being emptied."""
+        """Calls this whenever it comes to rest, and when a call on it ends while a lock waits for that."""
         self._rested = tell
 
     def tell_rest(self) -> None:
-        """Have those who wait for it look again."""
+        """Makes the waiters for it check again."""
         if self._rested is not None:
             self._rested()
 
     def stop(
         self, by: str, sessions: Iterable[str] = (), reason: str = "stop() was called", *, estop: bool = False
     ) -> None:
-        """Void everything admitted so far; by a session other than the motion's own or the lock owner's, latch (S08).
+        """Makes all earlier permits void; a stop by a session other than the mover's or lock owner's latches (S08).
 
         Args:
             by: who stops, for messages.
-            sessions: of who stops; none: whoever drives the resource, which never latches.
+            sessions: the stopping client's sessions; none: the resource's driver, whose stops never latch.
             reason: why.
             estop: whether it is an e-stop.
         """
         asking = set(sessions)
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
-            self.latch = Latch(by, reason, estop)  # first: who is let in under the new number has seen it
+            self.latch = Latch(by, reason, estop)  # first: a call admitted under the new number has seen it
         self.why = reason
-        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
+        self.stops = _stop_numbers()  # not += 1: one of two concurrent stops would be lost
 
     def _is_of(self, asking: set[str]) -> bool:
-        """Whether all that moves it belongs to these, or its lock does."""
+        """Whether its lock, or all calls that move it, belong to these sessions."""
         if self.holder is not None and self.holder.session in asking:
             return True
         begun = [permit.sessions for permit in list(self.calls.values())] or [self.movers]
@@ -153,42 +153,42 @@ class Resource:
 
     @property
     def sessions(self) -> frozenset[str]:
-        """For whom it moves: of the calls that run, and of the last one that was let in."""
+        """The sessions that move it: of its running calls, and of the last admitted one."""
         return frozenset(self.movers).union(*(permit.sessions for permit in list(self.calls.values())))
 
     @property
     def busy(self) -> bool:
-        """Whether something moves it or is about to."""
+        """Whether a call moves it or is about to."""
         return self._moving or bool(self.calls)
 
     @property
     def guarded(self) -> bool:
-        """Whether somebody has it or is about to; asked in this order, as a grant holds before it ceases to pend."""
+        """Whether a client holds it or is about to; read in this order, as a grant holds before it ceases to pend."""
         return self.pending is not None or self.live != 0
 
     def stop_ended(self, problem: str) -> None:
-        """Note how a stop that had to be ended: with a problem nobody gets it before somebody resumes it (S14).
+        """Takes the result of a required stop: after a failed one no client gets it before it is resumed (S14).
 
-        A later one that went well takes nothing back: it was not seen to rest when it had to.
+        A later successful stop does not undo this: it was not at rest when it had to be.
 
         Args:
             problem: why it could not be stopped; empty if it was.
         """
         if problem:
-            self.unsafe_at, self.unsafe = time.time(), problem  # the time first: who sees the problem tells it
+            self.unsafe_at, self.unsafe = time.time(), problem  # the time first: readers of the problem report it
 
     def resume(self) -> None:
-        """Let it move again after a stop that latched, and be granted again after one that failed."""
+        """Lets it move again after a latched stop, and be granted again after a failed one."""
         self.latch = None
         self.unsafe = ""
 
     def check(self, tokens: Iterable[Token], caller: str, session: str = "") -> None:
-        """Whether a call with these tokens may begin.
+        """Checks that a call with these tokens may begin.
 
         Raises:
             Stopped: a stop latched.
-            LockedByOther: somebody else has it, or it is being emptied for somebody else.
-            LockLost: the caller had it.
+            LockedByOther: another client holds it, or is about to.
+            LockLost: the caller has lost its lock.
         """
         latch = self.estop or self.latch
         if latch is not None:
@@ -196,7 +196,7 @@ class Resource:
         self.check_lock(tokens, caller, session)
 
     def check_lock(self, tokens: Iterable[Token], caller: str, session: str = "") -> None:
-        """The same for what only reads, which goes on after a stop.
+        """The same check for calls that only read, which a stop does not prevent.
 
         Raises:
             LockedByOther, LockLost: see `check`.
@@ -223,18 +223,18 @@ def _all_are_there(_: Iterable[str]) -> None:
 
 
 def _every_grant_is_over(_: int) -> str:
-    return "nobody judges locks of it"
+    return "no container grants its locks"
 
 
 def lapsed(resource: Resource, why: str) -> LockLost:
-    """The error of who comes under a grant that holds no more."""
+    """The error of calls under a grant that no longer holds."""
     return LockLost(resources=(resource.name,), reason=why)
 
 
 def locked(resource: Resource, holder: Holder | None, session: str = "") -> LockedByOther:
-    """The error of who comes to a resource that another one has."""
+    """The error of calls on a resource that another client holds."""
     if holder is None:
-        return LockedByOther(resources=(resource.name,), owner="somebody")
+        return LockedByOther(resources=(resource.name,), owner="another client")
     return LockedByOther(
         resources=(resource.name,),
         owner=holder.owner,
@@ -245,29 +245,29 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
 
 
 def not_stopped(resource: Resource, container: str) -> NotStopped:
-    """The error of who wants what could not be stopped."""
+    """The error of lock requests for a resource that could not be stopped."""
     when = clock(resource.unsafe_at)
     reason, waited_s = f"at {when} ({resource.unsafe})", max(0.0, time.time() - resource.unsafe_at)
     return NotStopped(device=resource.name, bus=container, waited_s=waited_s, reason=reason)
 
 
 class Permit(Struct, eq=False):
-    """What a call was admitted under."""
+    """The permit of an admitted call: the locks and stops of its resources at that moment."""
 
     call_id: int
     sessions: tuple[str, ...]
     cancel: Callable[[], None] | None
-    """Asks what runs under it to end."""
+    """Asks the call to end."""
     fences: list[tuple[Resource, int, int]] = []
-    """Of each of its resources the grant and the number of stops."""
+    """Each of its resources with the grant and the stop number at admission."""
 
     def gate(self) -> None:
-        """The last look before bytes go out.
+        """The last check before bytes go out.
 
         Raises:
             MotionStopped: a stop came after it was admitted.
-            LockLost: it was admitted under a lock that does not hold any more.
-            LockedByOther: it was admitted without a lock, and now somebody has it.
+            LockLost: it was admitted under a lock that no longer holds.
+            LockedByOther: it was admitted without a lock, and another client has locked a resource since.
         """
         for resource, live, stops in self.fences:
             if resource.stops != stops:
@@ -280,12 +280,12 @@ class Permit(Struct, eq=False):
                 raise locked(resource, resource.holder)
 
     def covers(self, resources: Iterable[Resource]) -> bool:
-        """Whether all of these are among what it was admitted for."""
+        """Whether it was admitted for all of these."""
         own = {id(resource) for resource, _, _ in self.fences}
         return all(id(resource) in own for resource in resources)
 
     def close(self) -> None:
-        """The call has ended."""
+        """Ends the permit with its call."""
         for resource, _, _ in self.fences:
             resource.calls.pop(self.call_id, None)
             if resource.pending is not None:
@@ -300,14 +300,14 @@ def admit(
     sessions: tuple[str, ...],
     cancel: Callable[[], None] | None,
 ) -> Permit:
-    """Let a call begin on its resources; it is counted until the permit is closed.
+    """Admits a call to its resources; it counts as running until the permit is closed.
 
-    It is counted first, what holds is noted then, and checked last: whoever empties a resource either sees it or has
-    refused it, and whatever comes after the check voids it at its gate.
+    The order matters: the call is counted first, then the fences are recorded, then checked. So a pending lock sees the
+    call or has refused it, and the gate refuses the call after any later change.
 
     Raises:
-        Stopped, LockedByOther, LockLost: see `Resource.check`; nothing is counted then.
-        SessionEnded: one for whom it is made is not there any more; likewise.
+        Stopped, LockedByOther, LockLost: see `Resource.check`; the call does not count then.
+        SessionEnded: one of its sessions has ended; likewise.
     """
     permitted = Permit(call_id, sessions, cancel)
     try:
@@ -327,7 +327,7 @@ def admit(
 
 
 def admitted(resources: Sequence[Resource], context: CallContext) -> Permit:
-    """Admit a call that came through the middleware, which has the permit then."""
+    """Admits a call that came through the middleware, and stores the permit in its context."""
     ongoing, behalf = context.ongoing, context.behalf
     cancel = None if ongoing is None else ongoing.cancel
     tokens = () if behalf is None else behalf.tokens
@@ -339,10 +339,10 @@ def admitted(resources: Sequence[Resource], context: CallContext) -> Permit:
 
 @contextlib.contextmanager
 def permit(resources: Sequence[Resource]) -> Generator[Permit, None, None]:
-    """For who drives hardware: what the running code may do to these, to be looked at right before bytes go out.
+    """The running code's permit for these resources; a driver checks its `gate` immediately before bytes go out.
 
     Within a service that needs them it is that call's permit. Anywhere else it is a plain Python call, which counts as
-    one without a lock (S15).
+    a call without a lock (S15).
 
     Raises:
         Stopped, LockedByOther: see `Resource.check`.
