@@ -563,7 +563,7 @@ def test_S09_an_estop_that_another_one_tells_of_is_on_record_with_who_told(
     heard = one.estop("smoke", limit_s=GENEROUS_S)
     assert {known.id: known.told_by for known in late.estops()}[heard.id] == ""
     [row] = [row for row in rows if row.about == "abc"]
-    assert (row.who, row.why) == ("boss", "fire (told by mallory/x)")
+    assert (row.who, row.why) == ("boss", "fire (reported by mallory/x)")
 
 
 def test_S09_what_an_estop_has_everybody_tell_everybody_is_small(system: MemorySystem) -> None:

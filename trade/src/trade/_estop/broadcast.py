@@ -1,4 +1,4 @@
-"""The line that e-stops travel on (S09): orders and confirmations that wait for nobody, and are repeated instead."""
+"""The broadcast of e-stops (S09): orders and confirmations that wait for no receiver, and are repeated instead."""
 
 import logging
 import threading
@@ -26,31 +26,31 @@ Expected = Callable[[], set[Address]]
 
 
 class EstopReport(Struct, frozen=True):
-    """Who did what an e-stop, or its clearing, told them."""
+    """Which containers carried out an e-stop, or its clearing."""
 
     id: str
-    """Of the e-stop; of a clearing all ids, with commas."""
+    """The id of the e-stop; for a clearing all ids, separated by commas."""
     confirmed: tuple[str, ...]
-    """Containers (``identity/container``) that did it: what they drive is at rest."""
+    """Containers (``identity/container``) that did it: their devices are at rest."""
     missing: tuple[str, ...] = ()
     """Containers with something to stop that did not answer in time."""
     failed: dict[str, str] = {}
-    """Containers that answered that something of it failed, and what."""
+    """Containers where a part failed, with the problem."""
     versions: dict[str, int] = {}
-    """Those of the above that speak another version of the protocol, and which. What they offer cannot be read here, so
-    each of them counts as one with something to stop. A clearing they do not heed: one of their version is needed."""
+    """Those of the above that use another protocol version, with that version. Their services cannot be read here, so
+    each of them counts as having something to stop. They ignore a clearing that does not use their own version."""
 
     apart: tuple[str, ...] = ()
-    """Containers that did not say what they offer and, by the policy, may offer nothing: they have nothing to stop."""
+    """Containers that did not list their services and, by the policy, may offer none: they have nothing to stop."""
 
     @property
     def complete(self) -> bool:
-        """Whether somebody was found, and all of them did it."""
+        """Whether at least one container was found, and all of them did it."""
         return bool(self.confirmed) and not self.missing and not self.failed
 
 
 class EstopBroadcast:
-    """Where one container hears orders and confirmations, and gives its own."""
+    """Receives and sends the orders and confirmations of one container."""
 
     def __init__(self, transport: Transport, own: Address, access: Authorizer, audit: Audit) -> None:
         self._access = access
@@ -61,22 +61,22 @@ class EstopBroadcast:
         self._channel = transport.subscribe(ESTOPS)
         self._take: Callable[[EstopOrder, str], None] | None = None
         self._asked: list[dict[str, dict[Address, str]]] = []
-        """Of each who asks, by request: who has confirmed it, and what failed there."""
+        """For each `ask` under way, by request: the containers that have confirmed it, with their problems."""
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
         self.malformed = 0
 
     def listen(self, take: Callable[[EstopOrder, str], None]) -> None:
-        """Begin to hear, told of each order and of who gives it; what was put before waits until then."""
+        """Begins to receive: calls this with each order and its giver's identity. Earlier orders wait until then."""
         self._take = take
         self._thread.start()
 
     def confirm(self, request: str, problem: str) -> None:
-        """Say that it was done, and what of it failed."""
+        """Confirms a request, with the problem if a part failed."""
         try:
             self._confirmations.put(encode_message(EstopConfirmed(PROTOCOL, request, problem[:500])))
         except ChannelClosed:
-            _logger.debug("e-stop %s is not confirmed: the container is closing", request)
+            _logger.debug("e-stop %s is not confirmed, because the container is closing", request)
 
     def ask(
         self,
@@ -87,14 +87,14 @@ class EstopBroadcast:
         *,
         beyond: bool = True,
     ) -> EstopReport:
-        """Repeat orders until all that are expected have confirmed each of them.
+        """Repeats orders until all expected containers have confirmed each of them.
 
         Args:
             orders: what to do.
-            expected: whose confirmation to wait for, as far as is known; who was expected once stays expected.
-            limit_s: how long to try, in seconds; also if nobody is found.
-            over: whether they are to be repeated no more: somebody has cleared it, or it is known to be done.
-            beyond: whether others are told, too; else this container alone does it.
+            expected: the containers to wait for, as far as is known; once expected, a container stays expected.
+            limit_s: how long to try, in seconds; also if no container is found.
+            over: whether to stop repeating them: the e-stop was cleared, or is known to be done.
+            beyond: whether to send them to other containers; else only this container does it.
         """
         until = time.monotonic() + limit_s
         data = [encode_message(order) for order in orders]
@@ -129,7 +129,7 @@ class EstopBroadcast:
                 if self.malformed == 1:
                     _logger.warning("dropped an e-stop message: %s (further ones are counted, not logged)", bad)
             except Exception:
-                _logger.exception("an e-stop could not be dealt with")
+                _logger.exception("an e-stop message could not be processed")
 
     def _heard(self, message: Message) -> None:
         _, *chunks = message.key.split("/")
@@ -153,14 +153,14 @@ class EstopBroadcast:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
+        """Ends the thread. Idempotent."""
         self._channel.close()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(2)
 
 
 def all_of(estop_id: str, reports: Iterable[EstopReport]) -> EstopReport:
-    """What several containers report of one e-stop, as one: who confirmed it to one of them has done it."""
+    """Merges the reports of several containers about one e-stop: one confirmation of a container is enough."""
     confirmed, missing = set[str](), set[str]()
     failed, versions, apart = dict[str, str](), dict[str, int](), set[str]()
     for report in reports:
@@ -182,7 +182,7 @@ def _confirmed(awaited: set[Address], heard: Mapping[str, Mapping[Address, str]]
 
 
 def _report(orders: Sequence[EstopOrder], awaited: set[Address], heard: Sequence[Mapping[Address, str]]) -> EstopReport:
-    """What became of orders that were given together, by what was heard of each."""
+    """The report of orders that were given together, from the confirmations of each."""
     done = awaited.intersection(*heard)
     problems: dict[Address, str] = {}
     for address, problem in chain.from_iterable(one.items() for one in heard):

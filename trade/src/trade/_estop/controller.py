@@ -1,4 +1,4 @@
-"""E-stops of one container, tied together: hearing and giving orders, telling of what is open, taking the union."""
+"""The e-stop controller of a container: it gives and takes orders, and publishes and merges open e-stops."""
 
 import logging
 import secrets
@@ -14,7 +14,7 @@ from trade._audit.events import Audit
 from trade._estop.broadcast import EstopBroadcast, EstopReport, all_of
 from trade._estop.deadman import Deadman
 from trade._estop.latch import EstopLatch
-from trade._estop.ledger import as_told
+from trade._estop.ledger import as_reported
 from trade._estop.store import EstopStore
 from trade._protocol.keys import DOMAIN, Address, is_chunk
 from trade._protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
@@ -29,8 +29,8 @@ _logger = logging.getLogger("trade")
 
 LIMIT_S: Final = 3.0
 _LONGEST_LIMIT_S: Final = 60.0
-_TOLD_S: Final = 1.0
-"""How long the entries of others may lag behind their confirmations."""
+_ENTRY_LAG_S: Final = 1.0
+"""How long the registry entries of others may lag behind their confirmations."""
 _LONGEST_REASON: Final = 500
 
 
@@ -46,7 +46,7 @@ Beside = Callable[[str, str, float], LineReports]
 
 
 class EstopController:
-    """``container.estop`` and its kind."""
+    """The e-stop methods of a container: ``container.estop`` and others."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class EstopController:
             self.deadman,
             EstopStore(folder, own),
             self._line.confirm,
-            self._tell,
+            self._publish,
             lambda: bool(providers.stops()),
             audit,
         )
@@ -78,7 +78,7 @@ class EstopController:
         self._beside: Beside | None = None
 
     def open_here(self) -> tuple[Estop, ...]:
-        """What is open in this very container."""
+        """The e-stops that are open in this container."""
         return self._estops.open()
 
     def knows(self, estop_id: str) -> bool:
@@ -86,10 +86,10 @@ class EstopController:
         return self._estops.knows(estop_id)
 
     def begin(self, provider: object, lines: Beside | None = None) -> None:
-        """Hear orders from now on.
+        """Begins to take orders.
 
         Args:
-            provider: that of e-stops, registered; its entry tells what is open, as its ``open_estops``.
+            provider: the registered provider of e-stops; its entry lists the open ones, as its ``open_estops``.
             lines: begins an e-stop on the stop lines of others, by its id, reason and limit.
         """
         self._provider = provider
@@ -99,26 +99,26 @@ class EstopController:
 
     @property
     def malformed(self) -> int:
-        """Messages that were dropped."""
+        """The number of messages that were dropped."""
         return self._line.malformed
 
     # --- asking
 
     def estop(self, reason: str = "", *, limit_s: float = LIMIT_S, estop_id: str = "") -> EstopReport:
-        """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
+        """Stops everything in the whole system, and lets nothing move until the e-stop is cleared (S09).
 
-        It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
-        that all of it is at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
+        It waits for no receiver, and is repeated until every container with a stop service has confirmed that all its
+        devices are at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
 
         Args:
             reason: why, for people.
-            limit_s: how long to try, in seconds; also if nobody is found.
-            estop_id: names it, in letters, digits, ``.``, ``_`` and ``-``; given again, it is the same e-stop. Empty: a
-                new one.
+            limit_s: how long to try, in seconds; also if no other container is found.
+            estop_id: its id, in letters, digits, ``.``, ``_`` and ``-``; the same id means the same e-stop. Empty: a
+                new id.
         """
         check_limit(limit_s)
         if estop_id and not is_chunk(estop_id):
-            raise ConfigurationError(where="estop", problem=f"{estop_id!r} is no id; use letters, digits, . _ -")
+            raise ConfigurationError(where="estop", problem=f"{estop_id!r} is not an id; use letters, digits, . _ -")
         estop = Estop(estop_id or new_estop_id(), str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop.id, estop)
 
@@ -134,18 +134,18 @@ class EstopController:
 
         report = self._line.ask([order], self._awaited, limit_s, over)
         if self._beside is not None:
-            beside = beside or self._beside(estop.id, estop.reason, limit_s)  # for whom there is no link to
-            told = report.complete and any(who != self._own.who for who in report.confirmed)
-            report = all_of(estop.id, [report, beside.report() if told else beside.wait()])
+            beside = beside or self._beside(estop.id, estop.reason, limit_s)  # for containers without a link
+            done = report.complete and any(who != self._own.who for who in report.confirmed)
+            report = all_of(estop.id, [report, beside.report() if done else beside.wait()])
         return self._with_versions(report)
 
     def _is_done(self, report: EstopReport) -> bool:
-        """Whether it says of all that are known here that they did it."""
+        """Whether the report covers all containers that are known here."""
         known = {address.who for address in self._awaited()} - {self._own.who}
         return report.complete and known <= {*report.confirmed, *report.failed}
 
     def relay(self, estop_id: str, reason: str, limit_s: float, *, beyond: bool) -> EstopReport:
-        """Stop for somebody who asks on the stop line: everything, or what is here alone."""
+        """Carries out an e-stop from the stop line, in the whole system or in this container only."""
         mine = Estop(estop_id, str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop_id, mine)
         expected = self._awaited if beyond else lambda: {self._own}
@@ -153,16 +153,16 @@ class EstopController:
         report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
         return self._with_versions(report)
 
-    def hear(self, tell: Callable[[Estop], None]) -> None:
-        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
-        self._estops.hear(tell)
+    def subscribe(self, callback: Callable[[Estop], None]) -> None:
+        """Calls this, on another thread, with every open and every future e-stop."""
+        self._estops.subscribe(callback)
 
-    def deafen(self, tell: Callable[[Estop], None]) -> None:
-        """Have it called no more."""
-        self._estops.deafen(tell)
+    def unsubscribe(self, callback: Callable[[Estop], None]) -> None:
+        """Calls it no more."""
+        self._estops.unsubscribe(callback)
 
     def carry(self, estop: Estop, system: str) -> None:
-        """Open an e-stop of another system here, under its id; once: it is cleared here by itself."""
+        """Opens an e-stop of another system here, under its id, once; it is cleared here separately."""
         if self._estops.knows(estop.id) or not is_chunk(estop.id):
             return
         reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
@@ -174,31 +174,31 @@ class EstopController:
 
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""
-        told: dict[str, Estop] = {}
-        for teller, estops in self._told():
-            for estop in as_told(estops, teller):
-                if estop.id not in told or not estop.told_by:  # its giver's own word counts most
-                    told[estop.id] = estop
-        told.update((estop.id, estop) for estop in self._estops.open())
-        return sorted(told.values(), key=lambda estop: (estop.at, estop.id))
+        found: dict[str, Estop] = {}
+        for reporter, estops in self._reported():
+            for estop in as_reported(estops, reporter):
+                if estop.id not in found or not estop.told_by:  # the giver's own report has precedence
+                    found[estop.id] = estop
+        found.update((estop.id, estop) for estop in self._estops.open())
+        return sorted(found.values(), key=lambda estop: (estop.at, estop.id))
 
     def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
-        """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
+        """Clears e-stops by their ids; once none is open, calls can run again. Nothing moves by itself.
 
-        What somebody else's e-stop stopped while it was in use holds until `resume`, too (S08). A container that does
-        not hear this, being away, keeps them open until they are cleared again.
+        A resource that another client's e-stop stopped during use also holds until `resume` (S08). A container that is
+        unreachable now keeps them open until they are cleared again.
 
         Args:
-            ids: as `estops` tells them.
+            ids: the ids that `estops` returns.
             limit_s: how long to try, in seconds.
 
         Raises:
-            NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
+            NoSuchEstop: no container has an open e-stop of one of these ids; nothing is cleared then.
             AccessDenied: the policy does not let this container administer the system.
         """
         check_limit(limit_s)
         if isinstance(ids, str) or not ids:
-            problem = "name the e-stops to clear in a list; trade.estops() tells which are open"
+            problem = "name the e-stops to clear in a list; trade.estops() returns the open ones"
             raise ConfigurationError(where="estop_clear", problem=problem)
         there = [estop.id for estop in self.estops()]
         if unknown := [name for name in ids if name not in there]:
@@ -212,7 +212,7 @@ class EstopController:
             return {*self._with_stops(), *self._unread(), *knowing}
 
         report = self._line.ask(orders, expected, limit_s, lambda: False)
-        self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
+        self._registry.wait_for(lambda: not self._still_reported(ids, report.confirmed), _ENTRY_LAG_S)
         unheeding = (state for state in self._others() if any(estop.id in ids for estop in state.open_estops()))
         names = {state.address.who for state in unheeding}
         report = structs.replace(report, missing=tuple(sorted({*report.missing, *names})))
@@ -228,8 +228,8 @@ class EstopController:
             apart=tuple(sorted({address.who for address in unable} - named)),
         )
 
-    def _still_told(self, ids: Sequence[str], by: Sequence[str]) -> bool:
-        """Whether the entries of those who confirmed still have them: what they say now may not have arrived."""
+    def _still_reported(self, ids: Sequence[str], by: Sequence[str]) -> bool:
+        """Whether the entries of confirming containers still list them: a newer entry may be on its way."""
         return any(
             estop.id in ids for record in self._own_records() if record.key.address.who in by for estop in record.estops
         )
@@ -238,11 +238,11 @@ class EstopController:
         return {state.address for state in self._registry.containers() if _has_stop(state)}
 
     def _awaited(self) -> set[Address]:
-        """Who has something to stop, or may have, as far as that can be known."""
+        """The containers that have something to stop, or may have, as far as is known."""
         return {*self._with_stops(), *self._unread(), *(state.address for state in self._others())}
 
     def _unread(self) -> set[Address]:
-        """Who is there and has not said yet what is its own: nobody can tell that it has nothing to stop."""
+        """Containers that have not listed their services yet, and so may have something to stop."""
         return {state.address for state in self._silent() if self._access.may_have_stops(state.address.identity)}
 
     def _silent(self) -> list[ContainerState]:
@@ -250,28 +250,28 @@ class EstopController:
         return [state for state in containers if not state.heard.complete and state.address != self._own]
 
     def _others(self) -> list[ContainerState]:
-        """Those that speak another version."""
+        """The containers of another protocol version."""
         return [state for state in self._registry.containers() if state.protocol not in (0, PROTOCOL)]
 
-    def _told(self) -> list[tuple[Address, Sequence[Estop]]]:
-        """What each container tells of, of whatever version."""
-        of_ours = [(record.key.address, record.estops) for record in self._own_records()]
-        return [*of_ours, *((state.address, state.open_estops()) for state in self._others())]
+    def _reported(self) -> list[tuple[Address, Sequence[Estop]]]:
+        """The open e-stops that each container reports, of any protocol version."""
+        same_version = [(record.key.address, record.estops) for record in self._own_records()]
+        return [*same_version, *((state.address, state.open_estops()) for state in self._others())]
 
     def _own_records(self) -> list[Record]:
-        """One record of each container, of the provider that tells what is open there."""
+        """One record of each container, of the provider that reports its open e-stops."""
         containers = self._registry.containers()
         entries = [entry for state in containers for entry in list(state.providers.values())]
-        return [entry.records[0] for entry in entries if _tells(entry.records)]
+        return [entry.records[0] for entry in entries if _reports(entry.records)]
 
-    # --- telling and hearing of what is open
+    # --- reporting and learning open e-stops
 
-    def learn(self, estops: Iterable[Estop], teller: Address) -> None:
-        """Told by the watch: a container of another version has these open."""
-        self._estops.learn(estops, teller)
+    def learn(self, estops: Iterable[Estop], reporter: Address) -> None:
+        """Takes the open e-stops of a container of another version; called by the registry listener."""
+        self._estops.learn(estops, reporter)
 
-    def _tell(self) -> None:
-        """Let our registry entry say what is open, for those who join."""
+    def _publish(self) -> None:
+        """Lists the open e-stops in this container's registry entry, for containers that join."""
         try:
             self._providers.alter(self._provider, lambda info: _with(info, self._estops.open()))
         except (ChannelClosed, ConfigurationError):  # the container is closing
@@ -279,13 +279,13 @@ class EstopController:
         self._learn_from_all()
 
     def _learn_from_all(self) -> None:
-        """What had no room here before may have some now."""
-        for teller, estops in self._told():
-            if teller != self._own:
-                self._estops.learn(estops, teller)
+        """Learns e-stops again that had no room here before."""
+        for reporter, estops in self._reported():
+            if reporter != self._own:
+                self._estops.learn(estops, reporter)
 
     def _heard(self, change: Change) -> None:
-        """Told by the registry."""
+        """Handles a change of the registry."""
         for record in (*change.joined, *change.replaced):
             if record.estops and not record.local:
                 self._estops.learn(record.estops, record.key.address)
@@ -293,13 +293,13 @@ class EstopController:
             self._estops.keep()
 
     def close(self) -> None:
-        """Hear no more. Idempotent."""
+        """Takes no more orders. Idempotent."""
         self._line.close()
         self._estops.close()
 
 
 def new_estop_id() -> str:
-    """One that no other e-stop has."""
+    """A new, unique id."""
     return secrets.token_hex(4)
 
 
@@ -308,7 +308,7 @@ def _with(info: ProviderInfo, estops: tuple[Estop, ...]) -> ProviderInfo:
 
 
 def is_stop(record: Record) -> bool:
-    """Whether it stops something: not one of the middleware's own."""
+    """Whether it is a stop service, other than the middleware's own."""
     return record.info.effect == "stop" and record.key.domain != DOMAIN
 
 
@@ -316,12 +316,12 @@ def _has_stop(state: ContainerState) -> bool:
     return any(is_stop(record) for entry in list(state.providers.values()) for record in entry.records)
 
 
-def _tells(records: Sequence[Record]) -> bool:
+def _reports(records: Sequence[Record]) -> bool:
     return bool(records) and records[0].key.domain == DOMAIN
 
 
 def check_limit(limit_s: float, where: str = "estop") -> None:
-    """Raises ConfigurationError: it is no limit of a stop, in seconds."""
+    """Raises ConfigurationError if it is not a valid time limit of a stop, in seconds."""
     if not 0 < limit_s <= _LONGEST_LIMIT_S:
         problem = f"limit_s must be above 0 and at most {_LONGEST_LIMIT_S:g}, not {limit_s!r}"
         raise ConfigurationError(where=where, problem=problem)

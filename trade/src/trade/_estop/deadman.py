@@ -1,4 +1,4 @@
-"""Stops what somebody set moving who is not there any more: the end of a session, of a lease, of a lock."""
+"""The deadman: stops motion whose session, lease or lock has ended."""
 
 import logging
 import threading
@@ -14,8 +14,8 @@ from trade._services.local_service import LocalService
 
 _logger = logging.getLogger("trade")
 
-NOBODYS: Final = "trade/"
-"""The session of stops that no client asked for."""
+NO_CLIENT: Final = "trade/"
+"""The session of stops that no client has requested."""
 _STOP_S: Final = 2.0
 """How long a joint may take to come to rest (S05)."""
 
@@ -36,7 +36,7 @@ class Deadman:
         self._resources = resources
 
     def session_ended(self, session: str) -> None:
-        """What it set moving stops, and nothing else (S05)."""
+        """Stops the session's motion, and nothing else (S05)."""
         its_own = [
             one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.sessions)
         ]
@@ -44,7 +44,7 @@ class Deadman:
             self.stop(moving, f"session {session} has ended", _unsafe)
 
     def rest(self, resources: Sequence[Resource], reason: str) -> list[str]:
-        """Stop those of these that move, and wait until that is over; what could not be stopped, and why."""
+        """Stops those of these that move, and waits for it; returns what could not be stopped, and why."""
         busy = [one for one in resources if one.busy and self._stop_of(one) is not None]
         problems, over = list[str](), threading.Semaphore(0)
 
@@ -59,18 +59,18 @@ class Deadman:
         return problems
 
     def stop(self, resources: Sequence[Resource], reason: str, done: Callable[[Resource, str], None]) -> None:
-        """Void what was admitted for these, ask what runs to end, and have them stop; does not wait.
+        """Makes permits for these void, asks their calls to end, and stops them; does not wait.
 
         Args:
             resources: what to stop.
             reason: why, for logs.
-            done: told of each resource when it is over, with a text that says what is wrong, or an empty one.
+            done: called for each resource when its stop is over, with the problem, or an empty text.
         """
         by_stop: dict[LocalService, list[Resource]] = {}
         for resource in resources:
             resource.stop("trade", (), reason)
             service = self._stop_of(resource)
-            if service is None:  # nothing physical: its calls are told to end
+            if service is None:  # nothing physical: its calls are asked to end
                 done(resource, "")
             else:
                 by_stop.setdefault(service, []).append(resource)
@@ -82,12 +82,12 @@ class Deadman:
             self._begin(service, _each(stopped, done))
 
     def everything(self, done: Callable[[list[str]], None]) -> None:
-        """Ask all that runs here to end, and call every stop there is, once for what several share; does not wait.
+        """Asks all calls to end and calls every stop service, a shared one once; does not wait.
 
-        What could not be stopped is unsafe from then on (S14).
+        A resource that could not be stopped is unsafe from then on (S14).
 
         Args:
-            done: told when all is over, with what is wrong.
+            done: called when all stops are over, with the problems.
         """
         resources = self._resources()
         stops: dict[LocalService, list[Resource]] = {service: [] for service in self._stops() if not service.resources}
@@ -98,32 +98,32 @@ class Deadman:
                 stops.setdefault(service, []).append(resource)
         together = _StopGroup(stops, done)
         for service in stops:
-            self._begin(service, together.told_by(service))
+            self._begin(service, together.ended_by(service))
 
-    def _begin(self, service: LocalService, tell: Callable[[str], None]) -> None:
-        threading.Thread(target=self._stop, args=(service, tell), name="trade-deadman", daemon=True).start()
+    def _begin(self, service: LocalService, ended: Callable[[str], None]) -> None:
+        threading.Thread(target=self._stop, args=(service, ended), name="trade-deadman", daemon=True).start()
 
-    def _stop(self, service: LocalService, told: Callable[[str], None]) -> None:
+    def _stop(self, service: LocalService, ended: Callable[[str], None]) -> None:
         first = threading.Lock()
 
-        def tell(problem: str) -> None:
-            if first.acquire(blocking=False):  # what comes after the time-out counts no more
-                told(problem)
+        def end(problem: str) -> None:
+            if first.acquire(blocking=False):  # a result after the time-out does not count
+                ended(problem)
 
-        timer = threading.Timer(_STOP_S, tell, (f"{service.label} did not end within {_STOP_S:g} s",))
+        timer = threading.Timer(_STOP_S, end, (f"{service.label} did not end within {_STOP_S:g} s",))
         timer.daemon = True
         timer.start()
         try:
-            service.run_admitted((), {}, CallContext(0, service.label, "trade", NOBODYS, None))
+            service.run_admitted((), {}, CallContext(0, service.label, "trade", NO_CLIENT, None))
             problem = ""
-        except Exception as error:  # noqa: BLE001 - whatever it is, the resource is not safe to give on
+        except Exception as error:  # noqa: BLE001 - after any error the resource is not safe to grant again
             problem = f"{service.label} failed: {error}"
         timer.cancel()
-        tell(problem)
+        end(problem)
 
 
 class _StopGroup:
-    """Stops that were begun together, until the last one is over."""
+    """Stops that began together, until the last one is over."""
 
     def __init__(self, stops: Mapping[LocalService, Sequence[Resource]], done: Callable[[list[str]], None]) -> None:
         self._stops = stops
@@ -134,11 +134,11 @@ class _StopGroup:
         if not stops:
             done([])
 
-    def told_by(self, service: LocalService) -> Callable[[str], None]:
+    def ended_by(self, service: LocalService) -> Callable[[str], None]:
         return lambda problem: self._over(service, problem)
 
     def _over(self, service: LocalService, problem: str) -> None:
-        """The first word of each counts: who was too late was too late."""
+        """Takes the first result of each service; later ones do not count."""
         with self._guard:
             if service not in self._left:
                 return
@@ -153,20 +153,20 @@ class _StopGroup:
 
 
 def _each(resources: Sequence[Resource], done: Callable[[Resource, str], None]) -> Callable[[str], None]:
-    def tell(problem: str) -> None:
+    def ended(problem: str) -> None:
         for resource in resources:
             done(resource, problem)
 
-    return tell
+    return ended
 
 
 def _ask_to_end(resources: Sequence[Resource]) -> None:
-    """What runs on these is to end."""
+    """Asks the running calls of these to end."""
     end_calls([one.cancel for resource in resources for one in list(resource.calls.values()) if one.cancel])
 
 
 def _unsafe(resource: Resource, problem: str) -> None:
-    """What could not be stopped is locked by nobody before somebody resumes it (S14)."""
+    """Marks a resource that could not be stopped: no client can lock it before it is resumed (S14)."""
     resource.stop_ended(problem)
     if problem:
         _logger.error("%s could not be stopped: %s", resource.name, problem)

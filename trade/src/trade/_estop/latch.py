@@ -1,6 +1,6 @@
-"""E-stops as they hold in one container (S09): latched at once, stopped, written down, confirmed, in the end cleared.
+"""The e-stop latch of one container (S09): it latches at once, stops, writes to disk, confirms, and clears.
 
-The other side, who orders one and waits for the confirmations, is `broadcast`.
+The other side, which gives the order and waits for confirmations, is `broadcast`.
 """
 
 import logging
@@ -12,7 +12,7 @@ from typing import Final
 from trade._audit.events import Audit
 from trade._context.sessions import foreign
 from trade._estop.deadman import Deadman
-from trade._estop.ledger import Ledger, age, as_told, identity_of
+from trade._estop.ledger import Ledger, age, as_reported, identity_of
 from trade._estop.store import EstopStore
 from trade._estop.worker import SHARED_S, Pending, Relay, Round, Worker
 from trade._protocol.keys import Address
@@ -25,19 +25,19 @@ _logger = logging.getLogger("trade")
 _LOOK_AGAIN_S: Final = 0.005
 
 Confirm = Callable[[str, str], None]
-"""Says that a request was done, and what of it failed; waits for nobody."""
+"""Confirms a request, with the problem if a part failed; does not wait."""
 
 
 class EstopLatch:
-    """What is open here. Nothing that actuates begins in this container while anything is.
+    """The open e-stops of this container. While one is open, no actuating call begins here.
 
     Args:
         table: its resources.
-        deadman: what stops them.
-        store: where open ones outlive the process.
-        confirm: tells who asked.
-        changed: called, on a thread of its own, when what is open has become another set.
-        keeps: whether this container has something to stop, so that it must remember.
+        deadman: stops them.
+        store: keeps open e-stops on disk.
+        confirm: sends the confirmation.
+        changed: called, on another thread, when the set of open e-stops has changed.
+        keeps: whether this container has something to stop, so that it must remember them.
     """
 
     def __init__(
@@ -61,14 +61,14 @@ class EstopLatch:
         self._ledger = Ledger(store.read())
         self._pending: dict[str, Pending] = {}
         self._round: Round | None = None
-        """The last one, if something was open here ever since it began."""
+        """The last round of stops, if an e-stop was open here ever since it began."""
         self._finished = 0.0
         self._worker = Worker(self._work, "trade-estop-work")
         self._relays: list[Relay] = []
         self._latch()
 
     def open(self) -> tuple[Estop, ...]:
-        """Those that are open, oldest first."""
+        """The open e-stops, oldest first."""
         with self._guard:
             return tuple(sorted(self._ledger.open.values(), key=age))
 
@@ -77,7 +77,7 @@ class EstopLatch:
         return estop_id in self._ledger.open
 
     def is_cleared(self, estop_id: str) -> bool:
-        """Whether somebody has cleared it here, lately."""
+        """Whether it was cleared here recently."""
         return estop_id in self._ledger.cleared
 
     def knows(self, estop_id: str) -> bool:
@@ -85,21 +85,21 @@ class EstopLatch:
         with self._guard:
             return self._ledger.knows(estop_id)
 
-    def hear(self, tell: Callable[[Estop], None]) -> None:
-        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
-        relay = Relay(tell, self.is_open)
+    def subscribe(self, callback: Callable[[Estop], None]) -> None:
+        """Calls this, on another thread, with every open and every future e-stop."""
+        relay = Relay(callback, self.is_open)
         self._relays = [*self._relays, relay]
         for estop in self.open():
             relay.give(estop)
 
-    def deafen(self, tell: Callable[[Estop], None]) -> None:
-        """Have it called no more."""
-        for relay in [one for one in self._relays if one.tell == tell]:
+    def unsubscribe(self, callback: Callable[[Estop], None]) -> None:
+        """Calls it no more."""
+        for relay in [one for one in self._relays if one.callback == callback]:
             self._relays = [one for one in self._relays if one is not relay]
             relay.close()
 
     def take(self, order: EstopOrder, who: str) -> None:
-        """Do what that identity asks, without waiting; an order that comes again is confirmed again."""
+        """Carries out an identity's order, without waiting; a repeated order is confirmed again."""
         with self._guard:
             known = self._ledger.knows(order.request)
             if known and order.opened is not None:
@@ -114,9 +114,9 @@ class EstopLatch:
         elif not known:
             self._clear(order.request, order.cleared, who)
 
-    def learn(self, estops: Iterable[Estop], teller: Address) -> None:
-        """Another container has these open: take the union. One that was cleared here is not opened again."""
-        for estop in as_told(estops, teller):
+    def learn(self, estops: Iterable[Estop], reporter: Address) -> None:
+        """Opens the open e-stops of another container, except those that were cleared here."""
+        for estop in as_reported(estops, reporter):
             with self._guard:
                 if not self._ledger.wants(estop):
                     continue
@@ -127,7 +127,7 @@ class EstopLatch:
         self._pending.pop(self._ledger.begin(request, opened), None)
 
     def keep(self) -> None:
-        """This container has something to stop from now on: what is open is written down."""
+        """Writes the open e-stops to disk, because this container has something to stop from now on."""
         for estop in self.open():
             if problem := self._written(estop):
                 _logger.error("e-stop %s %s", estop.id, problem)
@@ -137,7 +137,7 @@ class EstopLatch:
     def _begin(self, estop: Estop) -> None:
         reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
         who = foreign(estop.by) or identity_of(estop)
-        why = f"{estop.reason} (told by {estop.told_by})".lstrip() if estop.told_by else estop.reason
+        why = f"{estop.reason} (reported by {estop.told_by})".lstrip() if estop.told_by else estop.reason
         self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=why)
         with self._guard:
             self._latch()
@@ -157,7 +157,7 @@ class EstopLatch:
             relay.give(estop)
 
     def _written(self, estop: Estop) -> str:
-        """Write it down unless it is cleared meanwhile; what went wrong."""
+        """Writes an e-stop to disk unless it was cleared meanwhile; returns the problem."""
         try:
             self._store.write(estop)
             if not self.is_open(estop.id):
@@ -182,7 +182,7 @@ class EstopLatch:
             for estop_id in ids:
                 self._store.remove(estop_id)
         except OSError as bad:
-            return f"is cleared, but its note on disk stays and will be read at the next start: {bad}"
+            return f"is cleared, but its file stays on disk and will be read at the next start: {bad}"
         return ""
 
     # --- both
@@ -197,15 +197,15 @@ class EstopLatch:
         self._worker.wake()
 
     def _work(self) -> float | None:
-        """Write down what is new, and confirm what is over; when to look again, in seconds."""
+        """Writes new e-stops to disk, and confirms finished ones; returns when to check again, in seconds."""
         with self._guard:
             pending, replaced = list(self._pending.values()), list(self._ledger.replaced)
         if replaced and (early_s := self._finished + SHARED_S - time.monotonic()) > 0:
-            return early_s  # there are more than anybody needs, and each that is told costs everybody
+            return early_s  # too many e-stops: each report of one costs every container
         for one in pending:
             self._note(one)
         if problem := self._removed([name for name in replaced if not self.is_open(name)]):
-            _logger.error("an e-stop that a newer one stands for %s", problem)
+            _logger.error("an e-stop that a newer one has replaced %s", problem)
         del self._ledger.replaced[: len(replaced)]
         over = [(one, result) for one in pending if (result := one.result()) is not None]
         if over:
@@ -227,14 +227,14 @@ class EstopLatch:
                 self._ledger.answered(one.request, problem)
                 self._pending.pop(one.request, None)
         self._finished = time.monotonic()
-        self._changed()  # first: who has heard of everybody may look at once
+        self._changed()  # first: a client with all confirmations may look at the entries at once
         for one, problem in over:
             if problem:
                 _logger.error("e-stop %s: %s", one.request, problem)
             self._confirm(one.request, problem)
 
     def close(self) -> None:
-        """Wait for what is being done. Idempotent."""
+        """Waits for work under way. Idempotent."""
         self._worker.close()
         for relay in self._relays:
             relay.close()

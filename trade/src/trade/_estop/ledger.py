@@ -1,4 +1,4 @@
-"""Which e-stops are open in one container, which were cleared, and how far what was asked is; all of it is bounded."""
+"""The ledger of one container's e-stops: open ones, cleared ones, and the state of requests; all of it is bounded."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final, TypeVar
@@ -9,47 +9,47 @@ from trade._protocol.keys import Address
 from trade._protocol.messages import Estop
 
 MOST_OF_ONE: Final = 16
-"""So many e-stops of one identity are open in a container. From then on the newest takes the place of the one before:
-the first ones keep their reasons, and none that comes after somebody has looked is cleared with them."""
+"""The most open e-stops of one identity in a container. Beyond that, the newest replaces the one before it: the first
+ones keep their reasons, and an e-stop after a person's last look is not cleared with the others."""
 _MOST_REQUESTS: Final = 4096
 _Value = TypeVar("_Value")
 
 
 class Ledger:
-    """Its owner has the lock.
+    """The records of e-stops; its owner guards it with a lock.
 
     Args:
-        estops: those that are open from the start.
+        estops: e-stops that are open from the start.
     """
 
     def __init__(self, estops: Iterable[Estop]) -> None:
         self.open: Final = {estop.id: estop for estop in estops}
-        """In the order in which they came."""
+        """The open e-stops, in the order of arrival."""
         self.cleared: Final[dict[str, None]] = {}
-        """What still travels of these opens nothing again."""
+        """Cleared ids: late messages do not open these again."""
         self.replaced: list[str] = []
-        """Ids whose place a newer one has taken; their notes go once that one is written."""
+        """Ids that a newer e-stop has replaced; their files are removed once that one is written."""
         self._answers: dict[str, str | None] = dict.fromkeys(self.open, "")
 
     @property
     def first(self) -> Estop | None:
-        """The oldest that is open."""
+        """The oldest open e-stop."""
         return min(self.open.values(), key=age, default=None)
 
     def knows(self, request: str) -> bool:
-        """Whether that was asked, or cleared, before."""
+        """Whether that was requested, or cleared, before."""
         return request in self._answers or request in self.cleared
 
     def answer(self, request: str) -> str | None:
-        """What failed of what was asked before; None: it is not done yet."""
+        """The problem of an earlier request, or empty; None while it is not done."""
         return "" if request in self.cleared else self._answers[request]
 
     def answered(self, request: str, problem: str) -> None:
-        """It is done."""
+        """Records that a request is done."""
         self._answers[request] = problem
 
     def begin(self, request: str, opened: Estop | None) -> str:
-        """What is asked is not done yet, and what it opens is open. The request that is forgotten for it, if any."""
+        """Begins a request, and opens its e-stop. Returns the request that is forgotten for it, if any."""
         self._answers[request] = None
         if opened is not None:
             its = self._of(identity_of(opened))
@@ -60,19 +60,19 @@ class Ledger:
         return _without_the_oldest(self._answers)
 
     def hear(self, given: Estop) -> None:
-        """Its giver says so itself, after another one told of it."""
+        """Takes the giver's own order after another container's report of it."""
         there = self.open.get(given.id)
         if there is not None and there.told_by and there.by == given.by:
             self.open[given.id] = given
 
-    def wants(self, told: Estop) -> bool:
-        """Whether one that others have open is to be opened here: unknown, or replaced while there was no room."""
-        if told.id in self.open or told.id in self.cleared or self._answers.get(told.id, "") is None:
+    def wants(self, reported: Estop) -> bool:
+        """Whether to open an e-stop that others have open: it is unknown, or was replaced for lack of room."""
+        if reported.id in self.open or reported.id in self.cleared or self._answers.get(reported.id, "") is None:
             return False
-        return len(self._of(identity_of(told))) < MOST_OF_ONE
+        return len(self._of(identity_of(reported))) < MOST_OF_ONE
 
     def clear(self, ids: Sequence[str]) -> None:
-        """These are open no more."""
+        """Clears e-stops by their ids."""
         for estop_id in ids:
             self.open.pop(estop_id, None)
             self.cleared[estop_id] = None
@@ -83,24 +83,25 @@ class Ledger:
 
 
 def identity_of(estop: Estop) -> str:
-    """Who is said to have given it."""
+    """The identity that is said to have given it."""
     return estop.by.partition("/")[0]
 
 
-def as_told(estops: Iterable[Estop], teller: Address) -> list[Estop]:
-    """What a container tells of, with who told, unless that is of the identity that is said to have given it."""
+def as_reported(estops: Iterable[Estop], reporter: Address) -> list[Estop]:
+    """The e-stops that a container reports, marked with that container unless it has the giver's identity."""
     return [
-        structs.replace(estop, told_by="" if identity_of(estop) == teller.identity else teller.who) for estop in estops
+        structs.replace(estop, told_by="" if identity_of(estop) == reporter.identity else reporter.who)
+        for estop in estops
     ]
 
 
 def age(estop: Estop) -> tuple[float, str]:
-    """What e-stops are sorted by."""
+    """The sort key of e-stops."""
     return estop.at, estop.id
 
 
 def _without_the_oldest(known: dict[str, _Value]) -> str:
-    """Forget the one that came first if there are too many; which."""
+    """Forgets the oldest entry if there are too many; returns its id, or empty."""
     if len(known) <= _MOST_REQUESTS:
         return ""
     oldest = next(iter(known))

@@ -1,6 +1,6 @@
-"""E-stops as services of every container, and the registry entry that tells which are open there.
+"""The e-stop services of every container, and the registry entry that lists its open e-stops.
 
-They are a provider of their own because its entry is told anew with every e-stop, by everybody to everybody: it is a
+They have their own provider because every container sends its entry to all others at every e-stop: the entry is a
 twelfth of that of all other functions of the middleware.
 """
 
@@ -12,19 +12,19 @@ from trade._services.decorator import service
 
 
 class EstopServices:
-    """For whoever only speaks the wire, or is no program of ours."""
+    """E-stops for clients that use only the wire protocol, in any language."""
 
     def __init__(self, estopping: EstopController) -> None:
         self._estopping = estopping
 
     @property
     def open_estops(self) -> tuple[Estop, ...]:
-        """What its registry entry tells of e-stops."""
+        """The open e-stops, for the registry entry."""
         return self._estopping.open_here()
 
     @service(effect="stop")
     def estop(self, reason: str = "") -> EstopReport:
-        """Stop everything in the whole system, and let nothing move until that is cleared; who did, who is missing."""
+        """Stops everything in the whole system until the e-stop is cleared; reports which containers did, or failed."""
         call = current_call()
         asked = f"asked by {call.caller}" if call is not None else ""
         return self._estopping.estop(f"{reason} ({asked})" if reason else asked)
@@ -36,5 +36,5 @@ class EstopServices:
 
     @service
     def estop_clear(self, ids: list[str]) -> EstopReport:
-        """Clear e-stops by their ids; nothing moves by itself."""
+        """Clears e-stops by their ids; nothing moves by itself."""
         return self._estopping.estop_clear(ids)

@@ -1,4 +1,4 @@
-"""Open e-stops on disk: a folder for each container, and in it a file for each e-stop, read at the next start."""
+"""Open e-stops on disk: a folder for each container with a file for each e-stop, read at the next start."""
 
 import os
 import secrets
@@ -14,11 +14,11 @@ _PRIVATE: Final = 0o700
 
 
 class EstopStore:
-    """What one container keeps. Notes that an earlier release left for all containers of a host are read, too.
+    """The files of one container. It also reads the shared files of an earlier release.
 
     Args:
-        shared: the folder of all of a system's containers on this host; none: nothing is kept.
-        own: the container; a program that has no name but its process id finds its notes under the next one.
+        shared: the folder of all of a system's containers on this host; None: nothing is kept.
+        own: the container; a program named after its process id finds its files again in the next process.
     """
 
     def __init__(self, shared: Path | None, own: Address) -> None:
@@ -27,7 +27,7 @@ class EstopStore:
         self._own = None if shared is None else shared / own.identity / name
 
     def read(self) -> list[Estop]:
-        """Those that were open when this container last ended. One that cannot be read is open all the same."""
+        """The e-stops that were open when this container last ended. An unreadable one counts as open."""
         notes = {path.stem: path for folder in self._folders() for path in sorted(folder.glob("*.json"))}
         return [_read(path) for name, path in notes.items() if is_chunk(name) and not path.is_dir()]
 
@@ -35,7 +35,7 @@ class EstopStore:
         return [] if self._shared is None or self._own is None else [self._shared, self._own]
 
     def write(self, estop: Estop) -> None:
-        """Keep it. Raises OSError."""
+        """Writes an e-stop. Raises OSError."""
         if self._shared is None or self._own is None:
             return
         for folder in (self._shared, self._own.parent, self._own):
@@ -51,7 +51,7 @@ class EstopStore:
             fresh.unlink(missing_ok=True)
 
     def remove(self, estop_id: str) -> None:
-        """Keep it no more. Raises OSError, but not if it is not there."""
+        """Removes an e-stop, if it has a file. Raises OSError."""
         for folder in self._folders():
             note = folder / f"{estop_id}.json"
             if not note.is_dir():  # an identity's name

@@ -1,4 +1,4 @@
-"""What an e-stop leaves to do beside the thread that heard it: one thread for all of them, while there is something."""
+"""The work of e-stops that must not delay the receiving thread: one shared thread, while there is work."""
 
 import logging
 import threading
@@ -15,13 +15,13 @@ from trade._resources.resource import Resource
 _logger = logging.getLogger("trade")
 
 _ANSWER_S: Final = 2.5
-"""When a container says what did not come to rest; a stop service that does not return is reported after 2 s."""
+"""When a container reports what did not come to rest; a stop service that does not return is reported after 2 s."""
 SHARED_S: Final = 0.1
-"""An e-stop that comes so soon after another one needs no stops of its own; whoever repeats an order waits so long."""
+"""An e-stop within this time after another one shares its stops; repeated orders keep this interval, too."""
 
 
 class Round:
-    """The stops of everything here, called once for all e-stops that come at about the same time."""
+    """One round of all stops here, shared by all e-stops that arrive at about the same time."""
 
     def __init__(self, resources: Callable[[], Sequence[Resource]]) -> None:
         self._resources = resources
@@ -29,7 +29,7 @@ class Round:
         self._problems: Sequence[str] | None = None
 
     def begin(self, deadman: Deadman) -> None:
-        """Does not wait."""
+        """Begins the stops; does not wait."""
         deadman.everything(self._ended)
 
     def _ended(self, problems: Sequence[str]) -> None:
@@ -37,12 +37,12 @@ class Round:
 
     @property
     def serves(self) -> bool:
-        """Whether it does for an e-stop that comes now, if one was open here ever since it began."""
+        """Whether an e-stop that arrives now can share it, if one was open here ever since it began."""
         limit_s = _ANSWER_S if self._problems is None else SHARED_S
         return time.monotonic() < self._begun + limit_s
 
     def result(self) -> list[str] | None:
-        """What failed; None: that is not known yet."""
+        """The problems; None while they are not known."""
         problems, moving = self._problems, [one.name for one in self._resources() if one.moving]
         if time.monotonic() < self._begun + _ANSWER_S and (problems is None or moving):
             return None
@@ -51,28 +51,28 @@ class Round:
 
 
 class Pending(Struct, gc=False):
-    """A request that is not confirmed yet: an e-stop, or ids that are cleared."""
+    """A request that is not confirmed yet: an e-stop, or ids to clear."""
 
     request: str
     round: Round | None = None
     opened: Estop | None = None
     cleared: Sequence[str] = ()
     noted: bool = False
-    """The disk has it."""
+    """Whether it is on disk."""
     problem: str = ""
 
     def result(self) -> str | None:
-        """What failed; None: that is not known yet."""
+        """The problems, as one text; None while they are not known."""
         failed = [] if self.round is None else self.round.result()
         return None if failed is None else "; ".join([*failed, *([self.problem] if self.problem else [])])
 
 
 class Worker:
-    """One thread while there is something to do, and none else.
+    """A thread that runs only while there is work.
 
     Args:
-        step: does what there is; returns after how many seconds it is to be called again, or None: all is done.
-        name: of the thread.
+        step: does the work; returns after how many seconds to call it again, or None if all is done.
+        name: the name of the thread.
     """
 
     def __init__(self, step: Callable[[], float | None], name: str) -> None:
@@ -83,7 +83,7 @@ class Worker:
         self._thread: threading.Thread | None = None
 
     def wake(self) -> None:
-        """There is something to do."""
+        """Starts or wakes the thread, because there is work."""
         with self._changed:
             self._woken = True
             self._changed.notify()
@@ -109,28 +109,28 @@ class Worker:
         try:
             return self._step()
         except Exception:
-            _logger.exception("an e-stop could not be dealt with")
+            _logger.exception("an e-stop could not be processed")
             return SHARED_S
 
     def close(self) -> None:
-        """Wait for what is being done. Idempotent."""
+        """Waits for work under way. Idempotent."""
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(_ANSWER_S)
 
 
 class Relay:
-    """Tells one who asked for it of each e-stop while that is open, one after the other."""
+    """Calls a subscriber with each e-stop while it is open, one after the other."""
 
-    def __init__(self, tell: Callable[[Estop], None], is_open: Callable[[str], bool]) -> None:
-        self.tell: Final = tell
+    def __init__(self, callback: Callable[[Estop], None], is_open: Callable[[str], bool]) -> None:
+        self.callback: Final = callback
         self._is_open = is_open
         self._guard = threading.Lock()
         self._waiting: dict[str, Estop] = {}
         self._worker = Worker(self._next, "trade-estop-relay")
 
     def give(self, estop: Estop) -> None:
-        """Have it told; does not wait."""
+        """Adds an e-stop; does not wait."""
         with self._guard:
             self._waiting = {name: one for name, one in self._waiting.items() if self._is_open(name)}
             self._waiting[estop.id] = estop
@@ -142,11 +142,11 @@ class Relay:
                 return None
             estop = self._waiting.pop(next(iter(self._waiting)))
         if self._is_open(estop.id):
-            self.tell(estop)
+            self.callback(estop)
         return 0.0
 
     def close(self) -> None:
-        """Wait for what is being told. Idempotent."""
+        """Waits for the call under way. Idempotent."""
         with self._guard:
             self._waiting.clear()
         self._worker.close()

@@ -18,7 +18,7 @@ from trade._container.federating import Exposed, MemberSystem, inside, shown
 from trade._context.call_context import CallContext, running
 from trade._context.outgoing import Claim, holding
 from trade._context.sessions import speaking
-from trade._estop.deadman import NOBODYS
+from trade._estop.deadman import NO_CLIENT
 from trade._locks.api import LEASE_S
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._locks.remote_locks import SharedResource, Wanted
@@ -118,8 +118,8 @@ class BorderDirection:
         self._reconcile()
         self._thread.start()
         self._leaving.callback(self._end_thread)
-        self._home.estopping.hear(self._estop)
-        self._leaving.callback(self._home.estopping.deafen, self._estop)
+        self._home.estopping.subscribe(self._estop)
+        self._leaving.callback(self._home.estopping.unsubscribe, self._estop)
 
     def share(self, groups: Sequence[str]) -> None:
         """Go by another list."""
@@ -237,7 +237,7 @@ class BorderDirection:
     @contextlib.contextmanager
     def _speaking(self, call: CallContext, what: Exposed | None) -> Generator[None]:
         """Calls at home are made on behalf of one that came abroad, under the locks it has shown."""
-        if call.session == NOBODYS:  # the deadman of our own container: the stop is ours
+        if call.session == NO_CLIENT:  # the deadman of our own container: the stop is ours
             sessions, names = [], [str(self._home.address)]
         else:
             sessions = self._visitors.of(call, what)
