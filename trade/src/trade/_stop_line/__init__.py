@@ -1,7 +1,7 @@
 """The stop line: stops and e-stops that need neither the transport nor a link of it (S07).
 
-Each container listens on it, and whoever may reach the container may ask it to stop a group or everything.
-docs/wire-protocol.md, "The stop line", has what is said on it.
+Each container listens on it; any client that may reach the container may ask it to stop a group or everything.
+docs/wire-protocol.md, "The stop line", describes its messages.
 """
 
 from trade._stop_line.client import LineCall, StopLines

@@ -1,4 +1,4 @@
-"""Asking on the stop line: everybody who may be asked at once, and whoever answers counts."""
+"""The client of the stop line: it asks all reachable places at once, and merges the answers."""
 
 import contextlib
 import logging
@@ -20,14 +20,14 @@ _logger = logging.getLogger("trade")
 
 _THREADS: Final = 32
 _RELAYS: Final = 4
-"""So many on this host are asked to pass an e-stop on, by orders of their own; the others stop themselves alone."""
+"""How many containers on this host pass an e-stop on with their own orders; the others stop only themselves."""
 _CONNECT_S: Final = 1.0
 _MOST_BYTES: Final = 1 << 20
 _Report = TypeVar("_Report")
 
 
 class LineCall(Generic[_Report]):
-    """One question to several places, under way."""
+    """A request to several places, under way."""
 
     def __init__(
         self,
@@ -49,16 +49,16 @@ class LineCall(Generic[_Report]):
             threading.Thread(target=self._work, name="trade-stop-ask", daemon=True).start()
 
     def report(self) -> _Report:
-        """What was answered so far, as one."""
+        """The answers so far, merged."""
         with self._changed:
             return self._merge(list(self._reports))
 
     def over(self) -> bool:
-        """Whether all have answered, or will not."""
+        """Whether all have answered or failed."""
         return self._left == 0
 
     def wait(self) -> _Report:
-        """What was answered when all have, or the time is over."""
+        """Waits until all have answered, or the time is over; returns the answers, merged."""
         with self._changed:
             self._changed.wait_for(self.over, max(0.0, self._until - time.monotonic()))
         return self.report()
@@ -84,7 +84,7 @@ class LineCall(Generic[_Report]):
         with self._changed:
             if report is None:
                 self.problems[place.name] = problem
-                _logger.debug("nobody answers on the stop line at %s: %s", place.name, problem)
+                _logger.debug("no answer on the stop line at %s: %s", place.name, problem)
             else:
                 self._reports.append(report)
             self._left -= 1
@@ -95,7 +95,7 @@ class LineCall(Generic[_Report]):
 
 
 def _answers(sock: socket.socket, left_s: Callable[[], float]) -> "deque[StopAnswer]":
-    """All lines until the other end closes."""
+    """All answers until the other end closes."""
     heard, found = bytearray(), deque[StopAnswer]()
     while len(heard) <= _MOST_BYTES:
         sock.settimeout(left_s())
@@ -110,11 +110,11 @@ def _answers(sock: socket.socket, left_s: Callable[[], float]) -> "deque[StopAns
 
 
 class StopLines:
-    """Asks for stops without the transport.
+    """Requests stops without the transport.
 
     Args:
-        settings: of who asks; what they say of where others are counts.
-        own: the place to leave out: one's own.
+        settings: of the client; they say where others are.
+        own: returns the client's own places, which are left out.
     """
 
     def __init__(self, settings: Settings, own: Callable[[], Collection[str]] = tuple) -> None:
@@ -122,7 +122,7 @@ class StopLines:
         self._own = own
 
     def estop(self, estop_id: str, reason: str, limit_s: float) -> LineCall[EstopReport]:
-        """Begin to stop everything, as the e-stop with that id; does not wait."""
+        """Begins to stop everything, as the e-stop with that id; does not wait."""
         relays, asked = _RELAYS, list[tuple[Place, StopRequest]]()
         for place in self._places():
             relays -= place.path is not None
@@ -131,7 +131,7 @@ class StopLines:
         return LineCall(asked, limit_s, lambda answer: answer.estop, lambda reports: all_of(estop_id, reports))
 
     def stop(self, group: str, reason: str, limit_s: float) -> LineCall[StopReport]:
-        """Begin to stop all of a group; does not wait."""
+        """Begins to stop a whole group; does not wait."""
         request = self._request("stop", limit_s, reason, group=group)
         asked = [(place, request) for place in self._places()]
         return LineCall(asked, limit_s, lambda answer: answer.stop, lambda reports: together(group, reports))

@@ -1,4 +1,4 @@
-"""Stopping all of a group at once, and what became of it."""
+"""Stops of a whole group at once, and their report."""
 
 import time
 from collections.abc import Iterable
@@ -16,13 +16,13 @@ _LEAST_S = 0.01
 
 
 class StopReport(Struct, frozen=True):
-    """Which stop services of a group were called, and what became of each."""
+    """The results of a group's stop services."""
 
     group: str
     stopped: tuple[str, ...] = ()
-    """Those that ended without an error: what they stop is at rest."""
+    """The services that ended without an error: what they stop is at rest."""
     failed: dict[str, str] = {}
-    """Those that did not, and why."""
+    """The other ones, and why they failed."""
 
     @property
     def complete(self) -> bool:
@@ -31,19 +31,19 @@ class StopReport(Struct, frozen=True):
 
 
 class Run(Protocol):
-    """What a call that was begun tells."""
+    """A call under way, as far as it is used here."""
 
     def exception(self, timeout_s: float | None = None) -> BaseException | None: ...
 
 
 def stops_of(registry: Registry, group: str) -> list[Record]:
-    """The stop services of a group, and of all beneath it."""
+    """The stop services of a group, and of all groups beneath it."""
     found = registry.select(where(group=group))
     return [record for record in found if is_stop(record)]
 
 
 def stop_group(home: CallHost, records: Iterable[Record], group: str, limit_s: float) -> StopReport:
-    """Call these stop services, all at once, and wait for them.
+    """Calls these stop services, all at once, and waits for them.
 
     Args:
         group: as the report names it.
@@ -55,7 +55,7 @@ def stop_group(home: CallHost, records: Iterable[Record], group: str, limit_s: f
     for record in records:
         try:
             begun[record.label] = Handle(home, record.key, record).start()
-        except Exception as error:  # noqa: BLE001 - whatever it is, the others are to stop
+        except Exception as error:  # noqa: BLE001 - after any error, the others still have to stop
             failed[record.label] = _said(error)
     stopped: list[str] = []
     for label, run in begun.items():
@@ -74,7 +74,7 @@ def stop_group(home: CallHost, records: Iterable[Record], group: str, limit_s: f
 
 
 def together(group: str, reports: Iterable[StopReport]) -> StopReport:
-    """What several containers did, as one report: what one of them stopped is stopped."""
+    """Merges the reports of several containers: a service that one of them stopped is stopped."""
     stopped: set[str] = set()
     failed: dict[str, str] = {}
     for report in reports:

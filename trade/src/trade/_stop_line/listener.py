@@ -1,7 +1,7 @@
-"""Hears who asks on the stop line: one thread, and a bound on how many strangers it listens to.
+"""The listener of the stop line: one thread, with a limit on the number of strangers.
 
-A stranger is who has not asked yet. It has a second for its handshake and its question. If too many are there, one goes
-of the address that has most: at first who has said nothing.
+A stranger is a connection that has not made its request yet. It has a second for its handshake and its request. If
+there are too many, the listener drops one from the address that has most, preferably one that has sent nothing.
 """
 
 import contextlib
@@ -24,16 +24,16 @@ _logger = logging.getLogger("trade")
 MOST_STRANGERS: Final = 256
 _STRANGE_S: Final = 1.0
 _AT_ONCE: Final = 64
-"""So many are accepted before the others are heard again."""
+"""How many connections it accepts before it reads from the others again."""
 _LOOK_S: Final = 0.1
 _WANTS: Final = (ssl.SSLWantReadError, ssl.SSLWantWriteError, BlockingIOError)
 
 Serve = Callable[[socket.socket, str, bytes], None]
-"""Takes over who asks: with its identity by its certificate (empty on this host) and its line. Does not wait."""
+"""Takes over a connection, with its certificate's identity (empty on this host) and its line. Does not wait."""
 
 
 class Stranger:
-    """One that has not asked yet."""
+    """A connection that has not made its request yet."""
 
     __slots__ = ("address", "heard", "secure", "since", "sock")
 
@@ -43,15 +43,15 @@ class Stranger:
         self.since = now
         self.secure = not isinstance(sock, ssl.SSLSocket)
         self.heard: bytes | None = None
-        """None: nothing yet, not even of a handshake."""
+        """None: nothing yet, not even a part of a handshake."""
 
 
 class Listener:
-    """Hears at doors until it is closed.
+    """Accepts connections and reads their requests until it is closed.
 
     Args:
-        doors: sockets that listen, and the context of those on a network.
-        serve: takes over who asks.
+        doors: the listening sockets, with the TLS context of those on a network.
+        serve: takes over connections with a request.
     """
 
     def __init__(self, doors: Sequence[tuple[socket.socket, ssl.SSLContext | None]], serve: Serve) -> None:
@@ -75,7 +75,7 @@ class Listener:
                 try:
                     self._hear(key)
                 except Exception:
-                    _logger.exception("the stop line goes on without one who asked")
+                    _logger.exception("the stop line dropped a connection")
             self._forget_the_slow()
         for stranger in list(self._strangers.values()):
             self._drop(stranger)
@@ -92,7 +92,7 @@ class Listener:
         for _ in range(_AT_ONCE):
             try:
                 sock, address = door.accept()
-            except OSError:  # nobody more, or no descriptor is left: then the slow ones go soon
+            except OSError:  # no more connections, or no descriptors: then slow ones are dropped soon
                 return
             sock.setblocking(False)
             if context is None:
@@ -109,7 +109,7 @@ class Listener:
             self._selector.register(stranger.sock, selectors.EVENT_READ)
 
     def _least(self) -> Stranger:
-        """Who goes if there are too many."""
+        """The stranger to drop if there are too many."""
         strangers = list(self._strangers.values())
         busiest, _ = Counter(stranger.address for stranger in strangers).most_common(1)[0]
         its = [stranger for stranger in strangers if stranger.address == busiest]
@@ -146,7 +146,7 @@ class Listener:
         del self._strangers[sock]
         sock.setblocking(True)
         certified = common_name(sock) if isinstance(sock, ssl.SSLSocket) else ""
-        if not certified and isinstance(sock, ssl.SSLSocket):  # a certificate of nobody
+        if not certified and isinstance(sock, ssl.SSLSocket):  # a certificate without a name
             sock.close()
             return
         try:
@@ -170,7 +170,7 @@ class Listener:
         stranger.sock.close()
 
     def close(self) -> None:
-        """Hear nobody any more. Idempotent."""
+        """Closes all connections. Idempotent."""
         if self._ending.is_set():
             return
         self._ending.set()

@@ -1,4 +1,4 @@
-"""Where the stop line is: a Unix socket for this user on this host, a TLS port beside each endpoint of a network."""
+"""The places of the stop line: a Unix socket for this user on this host, a TLS port beside each network endpoint."""
 
 import contextlib
 import os
@@ -25,12 +25,12 @@ _HAS_UNIX: Final = hasattr(socket, "AF_UNIX")
 
 
 def line_port(port: int) -> int:
-    """The port of the stop line of what listens on a port."""
+    """The port of the stop line beside a port of the transport."""
     return port + _PORTS_BEYOND if port + _PORTS_BEYOND <= _LAST_PORT else port - _PORTS_BEYOND
 
 
 class Place(NamedTuple):
-    """Where one container may be asked."""
+    """The stop line of one container."""
 
     name: str
     path: Path | None = None
@@ -38,7 +38,7 @@ class Place(NamedTuple):
     context: ssl.SSLContext | None = None
 
     def connect(self, limit_s: float) -> socket.socket:
-        """Raises OSError: nobody is there, or lets us in, within that time (seconds, for each step)."""
+        """Connects to it. Raises OSError if no container accepts within that time (seconds, for each step)."""
         if self.path is not None:
             return _dialled(self.path, limit_s)
         assert self.endpoint is not None and self.context is not None  # noqa: S101 - one or the other
@@ -52,7 +52,7 @@ class Place(NamedTuple):
 
 
 def places(settings: Settings) -> list[Place]:
-    """Where containers of this system may be asked: those of this user on this host, and those it connects to."""
+    """The stop lines of this system's containers: those of this user on this host, and those it connects to."""
     found = [Place(path.name, path=path) for path in _sockets(settings.system)]
     certificate = settings.certificate()
     if certificate is not None:
@@ -63,7 +63,7 @@ def places(settings: Settings) -> list[Place]:
 
 
 def _sockets(system: str) -> list[Path]:
-    """Of the containers that live; what others left behind goes."""
+    """The sockets of living containers; removes those of ended processes."""
     if not _HAS_UNIX:
         return []
     living: list[Path] = []
@@ -89,7 +89,7 @@ def _lives(process: int) -> bool:
 
 @contextlib.contextmanager
 def _short(path: Path) -> Generator[str]:
-    """A name for it that fits into the address of a socket, 108 bytes at most."""
+    """A name for the path that fits into a socket address, which has at most 108 bytes."""
     if not _OPEN_FILES.is_dir():
         yield str(path)
         return
@@ -113,7 +113,7 @@ def _dialled(path: Path, limit_s: float) -> socket.socket:
 
 
 def host_door(system: str) -> tuple[socket.socket, Path] | None:
-    """A socket for this user on this host; None where the operating system has none. Raises OSError."""
+    """The listening socket for this user on this host; None without Unix sockets. Raises OSError."""
     if not _HAS_UNIX:
         return None
     path = runtime_folder() / system / f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
@@ -131,7 +131,7 @@ def host_door(system: str) -> tuple[socket.socket, Path] | None:
 
 
 def network_door(endpoint: Endpoint) -> socket.socket:
-    """The port beside that endpoint. Raises ConfigurationError: it cannot be had."""
+    """The listening socket beside that endpoint. Raises ConfigurationError if its port cannot be opened."""
     host, port = endpoint.host.strip("[]"), line_port(endpoint.port)
     door = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     try:
@@ -141,7 +141,7 @@ def network_door(endpoint: Endpoint) -> socket.socket:
     except OSError as bad:
         door.close()
         problem = (
-            f"its stop line, port {port}, cannot be opened ({bad.strerror or bad}); free that port, or listen on "
+            f"its stop line, port {port}, cannot be opened ({bad.strerror or bad}). Free that port, or listen on "
             f"another one: the stop line is {_PORTS_BEYOND} above"
         )
         raise ConfigurationError(where=f"listen {endpoint}", problem=problem) from None
@@ -149,8 +149,8 @@ def network_door(endpoint: Endpoint) -> socket.socket:
 
 
 def is_own_user(caller: socket.socket) -> bool:
-    """Whether this user, or root, is at the other end of a Unix socket, as far as the operating system tells."""
+    """Whether this user, or root, is at the other end of a Unix socket, as far as the operating system knows."""
     if not hasattr(socket, "SO_PEERCRED"):
-        return True  # the folder's rights have to do
+        return True  # only the folder's permissions protect it
     _, user, _ = struct.unpack("3i", caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))
     return user in (0, os.getuid())

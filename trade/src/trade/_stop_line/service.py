@@ -1,4 +1,4 @@
-"""One container's end of the stop line: who may ask, what is done, what is answered."""
+"""The service of the stop line: it authorises requests, carries them out, and answers."""
 
 import contextlib
 import logging
@@ -19,7 +19,7 @@ from trade._security.certificates import Certificate, line_context
 from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport
 from trade._stop_line.listener import Listener
-from trade._stop_line.messages import StopAnswer, StopRequest, encoded, read_request, told
+from trade._stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
 from trade._stop_line.places import host_door, network_door
 from trade._transport.endpoints import Endpoint
 from trade.errors import LimitExceeded, TradeError
@@ -27,20 +27,20 @@ from trade.errors import LimitExceeded, TradeError
 _logger = logging.getLogger("trade")
 
 MOST_OF_ONE: Final = 8
-"""So many requests of one identity are done at a time."""
+"""The most concurrent requests of one identity."""
 MOST: Final = 64
-"""So many of all."""
+"""The most concurrent requests."""
 _ANSWER_S: Final = 1.0
 
 
 class StopLineService:
-    """Listens on the networks from the start, and on this host once there is something to stop.
+    """Listens on the networks from the start, and on this host when there is something to stop.
 
     Args:
-        stop: calls all stop services of a group that are known here, for some seconds at most.
+        stop: calls all known stop services of a group, within a time limit in seconds.
 
     Raises:
-        ConfigurationError: a port of it cannot be had.
+        ConfigurationError: one of its ports cannot be opened.
     """
 
     def __init__(
@@ -69,24 +69,24 @@ class StopLineService:
 
     @property
     def own_places(self) -> tuple[str, ...]:
-        """What others know its place on this host by."""
+        """The name of its place on this host, as others know it."""
         return () if self._path is None else (self._path.name,)
 
     def listen_on_host(self) -> None:
-        """Listen for this user on this host, too. Idempotent; what stands in the way is logged."""
+        """Listens for this user on this host, too. Idempotent; logs a problem."""
         with self._guard:
             if self._path is not None or self._closed:
                 return
             try:
                 door = host_door(self._system)
             except (OSError, TradeError) as bad:
-                _logger.warning("the stop line on this host cannot be opened: %s; stops need the transport then", bad)
+                _logger.warning("the stop line on this host cannot be opened: %s. Stops here need the transport", bad)
                 return
             if door is not None:
                 sock, self._path = door
                 self._listeners.append(Listener([(sock, None)], self._serve))
 
-    # --- told by the listener
+    # --- called by the listener
 
     def _serve(self, sock: socket.socket, certified: str, line: bytes) -> None:
         try:
@@ -100,7 +100,7 @@ class StopLineService:
             if not full:
                 self._busy[identity] += 1
         if full:
-            why = f"{MOST_OF_ONE} requests of {identity}, or {MOST} of all, are being done; ask again when one is over"
+            why = f"{MOST_OF_ONE} requests of {identity}, or {MOST} in all, are in progress; ask again when one is over"
             self._end(sock, StopAnswer(who=self._own.who, error=LimitExceeded.__name__, why=why))
             return
         work = (sock, identity, request)
@@ -117,7 +117,7 @@ class StopLineService:
         finally:
             with self._guard:
                 self._busy[identity] -= 1
-                self._busy += Counter()  # who has none left is forgotten
+                self._busy += Counter()  # forget identities without requests
         self._end(sock, answer)
 
     def _answer(self, sock: socket.socket, identity: str, request: StopRequest) -> StopAnswer:
@@ -127,13 +127,13 @@ class StopLineService:
             self._audit.refused(f"trade.{request.ask}", denied, who=identity)
             raise denied
         if request.ask == "open":
-            return StopAnswer(who=own, open=tuple(told(estop) for estop in self._estopping.estops()))
+            return StopAnswer(who=own, open=tuple(estop_fields(estop) for estop in self._estopping.estops()))
         self._say(sock, StopAnswer(who=own, taken=True))
         if request.ask == "stop":
             self._audit.note("stop", "stop line", about=request.group, who=identity, why=request.reason)
             _logger.warning("stopping %s, asked by %s on the stop line: %s", request.group, asked, request.reason)
             return StopAnswer(who=own, stop=self._stop(request.group, request.limit_s))
-        if not self._estopping.knows(request.id):  # else its giver was heard, and is on record
+        if not self._estopping.knows(request.id):  # else it was received, and is on record
             self._audit.note("stop", "stop line", about=request.id, who=identity, why=request.reason)
         reason = f"{request.reason} (asked by {asked} on the stop line)".lstrip()
         return StopAnswer(
@@ -141,7 +141,7 @@ class StopLineService:
         )
 
     def _say(self, sock: socket.socket, answer: StopAnswer) -> None:
-        with contextlib.suppress(OSError):  # who asks need not wait for the answer
+        with contextlib.suppress(OSError):  # the client need not wait for the answer
             sock.settimeout(_ANSWER_S)
             sock.sendall(encoded(answer))
 
@@ -150,7 +150,7 @@ class StopLineService:
         sock.close()
 
     def close(self) -> None:
-        """Listen no more. Idempotent."""
+        """Stops listening. Idempotent."""
         with self._guard:
             self._closed = True
             listeners, self._listeners = self._listeners, []
@@ -161,12 +161,12 @@ class StopLineService:
 
 
 def _network_doors(settings: Settings, certificate: Certificate) -> list[tuple[socket.socket, ssl.SSLContext | None]]:
-    """One beside each endpoint whose port others can know."""
+    """One listening socket beside each endpoint with a fixed port."""
     context = line_context(certificate, server=True)
     doors: list[tuple[socket.socket, ssl.SSLContext | None]] = []
     try:
         for endpoint in filter(_is_known, map(Endpoint.read, settings.listen)):
-            doors.append((network_door(endpoint), context))  # noqa: PERF401 - those that are open are closed if one fails
+            doors.append((network_door(endpoint), context))  # noqa: PERF401 - the open ones are closed if one fails
     except BaseException:
         for door, _ in doors:
             door.close()
