@@ -38,10 +38,10 @@ def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
     with pytest.raises(AccessDenied, match="planner is revoked"):
         move(0.1)
     (tmp_path / "revoked.toml").write_text("revoked = 1")
-    wait_until(lambda: "going on by the old one" in caplog.text, "it is refused")
+    wait_until(lambda: "the earlier one stays" in caplog.text, "it is refused")
     assert watching.access.policy is not None
     assert "planner" in watching.access.policy.revoked
-    assert caplog.text.count("going on by the old one") == 1
+    assert caplog.text.count("the earlier one stays") == 1
     (tmp_path / "revoked.toml").write_text("revoked = []")
     wait_until(lambda: "planner is revoked no more" in caplog.text, "and it is right again")
     assert move(0.1) == 0.1
@@ -88,7 +88,7 @@ def test_files_that_were_refused_are_tried_again_as_they_are(
     wait_until(lambda: "Input/output error" in caplog.text, "it cannot be read")
     down[0] = False
     wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
-    assert caplog.text.count("going on by the old one") == 1
+    assert caplog.text.count("the earlier one stays") == 1
 
 
 def test_a_policy_that_was_loaded_on_purpose_is_the_one_that_is_looked_at(

@@ -145,7 +145,7 @@ def test_the_default_container_starts_once_whoever_comes_first(system: str) -> N
 
 def test_the_default_container_is_started_with_own_settings_before_first_use_only(system: str) -> None:
     assert trade.start(Settings.read(container="mine")).name == "mine"
-    with pytest.raises(ConfigurationError, match=r"runs already; call trade.start before anything else"):
+    with pytest.raises(ConfigurationError, match=r"runs already\. Call trade.start before anything else"):
         trade.start()
 
 

@@ -536,4 +536,4 @@ def test_who_is_in_the_policy_by_a_pattern_only_is_warned_of(
     policy = tmp_path / "policy.toml"
     policy.write_text(RULES + '"dash-*" = ["viewer"]\n')
     start_container("c-arm", tls=papers.of("arm"), policy=policy)
-    assert "dash-*: the transport knows names in full only" in caplog.text
+    assert "dash-*: the transport needs full names" in caplog.text

@@ -1,4 +1,4 @@
-"""What a container is made of: made in order, each from those before it; ended in the reverse order."""
+"""The components of a container: built in order, each from earlier ones, and closed in reverse order."""
 
 import contextlib
 import time
@@ -68,13 +68,13 @@ class Host(
     CallHost,
     Protocol,
 ):
-    """The container, as what it is made of sees it."""
+    """The container, as its components see it."""
 
     def close(self) -> None: ...
 
 
 class Components:
-    """One of each. Data has one owner, and here one sees which."""
+    """The components of one container, and which of them owns which data."""
 
     def __init__(self, home: Host, settings: Settings, transport: Transport | None) -> None:
         self._home = home
@@ -83,10 +83,10 @@ class Components:
         self._address = home.address
         self._session = str(home.address)
         self.session_end: Final = Event[str]()
-        """A session has ended, with that name."""
+        """Emitted with the name of each session that ends."""
         self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
-        """What else there is to measure, as whoever drives something tells it."""
-        with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+        """Further metrics, for example of drivers."""
+        with contextlib.ExitStack() as leaving:  # started components close again if a later one fails
             self._build_transport(leaving, transport)
             self._build_calls(leaving)
             self._build_locks(leaving)
@@ -106,7 +106,7 @@ class Components:
         self.transport = transport or join(self._settings, leaving)
         leaving.callback(self.transport.close)
         self.dialer: Dialer | None = None
-        """Its links; None on a transport that has no such switches."""
+        """Its links; None on a transport without links."""
         if isinstance(self.transport, ZenohTransport):
             self.dialer = Dialer(self.transport.links, self._settings.check_may_dial, self._settings.connect)
             leaving.callback(self.dialer.close)
@@ -143,7 +143,7 @@ class Components:
             self.announcer, self.registry, address, self.codec, self.event_loop, self.locks, access, self.audit
         )
         self.targets = Targets(access, self.registry, self.providers, self.caller, self.codec, self.audit)
-        self.registry.changes.subscribe(self.targets.changed)  # before anybody is told: who is told may call
+        self.registry.changes.subscribe(self.targets.changed)  # before all other subscribers: they may make calls
 
     def _build_notifications_and_hooks(self) -> None:
         self.registry.changes.subscribe(self.notifier.changed)
@@ -208,7 +208,7 @@ class Components:
     def _build_stop_line(self, leaving: contextlib.ExitStack) -> None:
         self.stop_lines = StopLines(self._settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
         self.stop_line: StopLineService | None = None
-        """Its own end of the stop line; None on a transport without a host."""
+        """Its service of the stop line; None on a transport without a host."""
         if self.dialer is not None:
             self.stop_line = StopLineService(
                 self._address, self._settings, self._access, self.audit, self.estop, self.stop_known
@@ -228,11 +228,11 @@ class Components:
         self.metrics_port = open_metrics(self._settings, self.audit.calls, self._measures, leaving)
 
     def appear(self, own: object, estops: object) -> None:
-        """Be there for others, who find these functions of the middleware's own. Ends everything if it cannot.
+        """Announces the container to others, with the middleware's own services. Closes everything on failure.
 
         Args:
-            own: the provider of all but e-stops.
-            estops: the one of e-stops.
+            own: the provider of all services but e-stops.
+            estops: the provider of e-stops.
         """
         with contextlib.ExitStack() as undone:
             undone.callback(self.close)
@@ -256,22 +256,22 @@ class Components:
             undone.pop_all()
 
     def stop_known(self, group: str, limit_s: float) -> StopReport:
-        """Call the stop services of a group that are known here, for some seconds at most."""
+        """Calls the stop services of a group that are known here, within a time limit in seconds."""
         return stop_group(self._home, stops_of(self.registry, group), group, limit_s)
 
     def stop(self, group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
-        """Stop all that moves in a group, and wait until it is at rest: every stop service there is, at once (S07).
+        """Calls all stop services of a group at once, and waits until what they stop is at rest (S07).
 
-        It needs no lock, and no link that stands already: containers are asked on the stop line, too, and what one of
-        them stopped is stopped. Read the report: `StopReport.complete`. This is software, not safety-rated.
+        It needs no lock and no existing link: it also asks containers on the stop line, and a service that one of them
+        stopped is stopped. Read the report: `StopReport.complete`. This is software, not safety-rated.
 
         Args:
-            group: such as ``rosie.left``; all beneath it, too.
+            group: such as ``rosie.left``, with all groups beneath it.
             reason: why, for the record.
             limit_s: how long to try, in seconds; also if nothing is found.
 
         Raises:
-            ConfigurationError: that is no group, or no limit.
+            ConfigurationError: the group or the limit is not valid.
         """
         check_limit(limit_s, "stop")
         until = time.monotonic() + limit_s
@@ -282,15 +282,15 @@ class Components:
         report = self.stop_known(group, max(_LOOK_S, until - time.monotonic()))
         return together(group, [report, beside.report() if report.complete else beside.wait()])
 
-    # --- being told
+    # --- handling events
 
     def _mind_stops(self, change: Change) -> None:
-        """Told by the registry: once there is something to stop here, this host can ask for that."""
+        """Listens on this host's stop line once there is something to stop here; called by the registry."""
         if self.stop_line is not None and any(record.local and is_stop(record) for record in change.joined):
             self.stop_line.listen_on_host()
 
     def _lost(self, address: Address, *, back: bool = False) -> None:
-        """Told by the watch: a container is out of sight, or there again."""
+        """Handles the loss, or the return, of a container; called by the registry listener."""
         self.caller.lost(address, back=back)
         if back:
             return
@@ -301,19 +301,19 @@ class Components:
         self.dispatcher.forget(address)
 
     def session_ended(self, session: str, reason: str = "it was closed") -> None:
-        """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
+        """Ends a session: its later calls are refused, its locks are lost, and its motion stops."""
         self.locks.session_ended(session, reason)
         self.deadman.session_ended(session)
         self.dispatcher.session_ended(session)
         self.session_end.emit(session)
 
     def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
-        """Told by the lock services: somebody would like to have what another one holds."""
+        """Passes a release request to the holder of a lock; called by the lock services."""
         owner = Address(*holder.session.split("/")[:3])
         self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
 
     def trace(self, on: bool) -> bool:
-        """Told by the settings, and by the trace services: note calls, or no more. Whether it did before."""
+        """Switches the tracing of calls on or off. Returns whether it was on."""
         was = self.caller.spans is not None
         spans: Spans | None = self.spans if on else None
         self.hooks.trace(spans)
@@ -321,15 +321,20 @@ class Components:
         return was
 
     def _measures(self) -> Iterator[Measure]:
-        """Asked for by the metrics, on a thread of theirs."""
+        """The metrics, read on the thread of the metrics server."""
         infos, record = self.locks.infos(), self.audit.record
         yield Measure("calls", "Calls from other containers.", sum(self._taken()), kind="counter")
-        yield Measure("calls_in_flight", "Those of them that have a thread now.", self.load_meter.running)
-        yield Measure("calls_queued", "Calls of serial services whose turn has not come.", self.providers.waiting())
-        yield Measure("containers", "Containers that are seen, this one included.", len(self.registry.containers()))
-        yield Measure("dropped_messages", "Malformed, or of another version.", self.dropped_messages, kind="counter")
+        yield Measure("calls_in_flight", "Calls from other containers that run now.", self.load_meter.running)
+        yield Measure("calls_queued", "Calls that wait for the turn of a serial service.", self.providers.waiting())
+        yield Measure("containers", "Containers in the registry, this one included.", len(self.registry.containers()))
+        yield Measure(
+            "dropped_messages",
+            "Malformed, or of another version.",
+            self.dropped_messages,
+            kind="counter",
+        )
         yield Measure("locks", "Locks that hold here.", len(infos))
-        yield Measure("lock_waiters", "Who waits for one of them.", sum(len(info.waiting) for info in infos))
+        yield Measure("lock_waiters", "Clients that wait for one of them.", sum(len(info.waiting) for info in infos))
         yield Measure("estops_open", "E-stops that are open.", len(self.estop.open_here()))
         yield Measure("process_cpu_seconds", "Of the whole process.", time.process_time(), kind="counter")
         if (resident := resident_bytes()) is not None:
@@ -338,8 +343,8 @@ class Components:
             yield Measure("audit_rows", "Written to the audit record.", record.written, kind="counter")
             yield Measure("audit_lost", "Events that were not written to it.", record.lost, kind="counter")
             yield Measure("audit_queue", "Events that are not written yet.", record.waiting)
-        for tell in list(self.measured):
-            yield from tell()
+        for measure in list(self.measured):
+            yield from measure()
 
     def _taken(self) -> list[int]:
         return [pool.taken for pool in list(self.dispatcher._worker_pools)]
@@ -348,7 +353,7 @@ class Components:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)
 
     def recheck_access(self) -> None:
-        """Told by the container: the policy is another one; locks that may no longer be held are lost."""
+        """Applies a changed policy: locks that it no longer allows are lost."""
         access = self._home.access
         self.targets.recheck_access()
         self.dispatcher.hear(access.callers())
@@ -370,12 +375,12 @@ class Components:
         return sum(reader.malformed for reader in readers)
 
     def close(self) -> None:
-        """End all of it."""
+        """Closes all components."""
         self.dispatcher.leave()
         self.targets.close()
         self._leaving.close()
 
     def abandon(self) -> None:
-        """In a forked child: end nothing."""
+        """Closes nothing, in a forked child."""
         self.targets.close()
         self._leaving.pop_all()

@@ -1,4 +1,4 @@
-"""The provider of the middleware's own functions: what is in group ``trade`` of every container, e-stops left out."""
+"""The provider of the middleware's own services, in group ``trade`` of every container; e-stops have their own."""
 
 from collections.abc import Callable
 from typing import Final, Protocol
@@ -22,31 +22,31 @@ Switch = Callable[[bool], bool]
 
 
 class TraceServices:
-    """The wire's side of `Spans` and `Logbook`."""
+    """The services of `Spans` and `Logbook`."""
 
     def __init__(self, container: str, spans: Spans, switch: Switch) -> None:
-        self._teller = container
+        self._container = container
         self._noted = spans
         self._switch = switch
 
     @service
     def set_tracing(self, on: bool) -> bool:
-        """Note every call that this container makes and serves; off: what was noted stays. Whether it was on before."""
+        """Traces every call that this container makes and serves, or stops that. Returns whether it was on."""
         return self._switch(on)
 
     @service(effect="read")
     def spans(self, calls: list[int] | None = None, after: int = 0) -> list[Span]:
-        """What this container noted above that number, of these calls and those they led to, or all; oldest first."""
+        """The spans after that number, of these calls and those they led to, or of all; oldest first."""
         return self._noted.kept(None if calls is None else frozenset(calls), after)
 
     @service(effect="read")
     def log_lines(self, after: int = 0) -> list[LogLine]:
-        """What the process logged lately, of its lines after that one."""
-        return [structs.replace(line, container=self._teller) for line in logbook.lines(after)]
+        """The recent log lines of the process after that one."""
+        return [structs.replace(line, container=self._container) for line in logbook.lines(after)]
 
 
 class ServicesHost(Member, Protocol):
-    """The container they belong to."""
+    """The container of these services."""
 
     access: Final[Authorizer]
     system: Final[System]
@@ -62,7 +62,7 @@ class OwnServices(
     MigrationServices,
     StreamServices,
 ):
-    """One provider, so that one registry entry tells of all its container's own functions."""
+    """One provider, so that one registry entry lists all the container's own services."""
 
     def __init__(self, parts: Components, home: ServicesHost) -> None:
         access, locks = home.access, parts.locks

@@ -1,4 +1,4 @@
-"""How a container comes into its system: where it listens, whom it dials, with which credentials, what it bridges."""
+"""How a container joins its system: its endpoints, the peers that it dials, its credentials, and its bridges."""
 
 import contextlib
 import logging
@@ -25,7 +25,7 @@ _PORTS_TRIED: Final = 4
 
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
-    """Open the main session; what has to be undone when the container leaves goes onto the stack."""
+    """Opens the transport; the stack gets what closes with the container."""
     networks, certificate = _networks(settings.bridge), settings.certificate()
     transport = _join(settings, certificate, networks, leaving)
     try:
@@ -46,7 +46,7 @@ def _join(
     anywhere_here = Endpoint("tcp" if certificate is None else "tls", "127.0.0.1", 0)
     wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
     for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
-        with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
+        with contextlib.suppress(ConfigurationError):  # another process took the free port first
             return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
     return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
 
@@ -83,13 +83,13 @@ def _join_at(
 
 
 def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
-    """The transport's access rules: who may what, if certificates tell who is who, and what crosses a gateway."""
+    """The transport's access rules: the rights of certified identities, and what crosses a gateway."""
     policy = read_policy(settings.policy) if settings.policy and settings.tls else None
     if policy is None and settings.exports is None:
         return {}
     if policy is not None and (patterns := policy.patterns()):
         _logger.warning(
-            "%s: %s: the transport knows names in full only; whoever such a pattern stands for can send nothing",
+            "%s: %s: the transport needs full names; identities that only such a pattern matches can send nothing",
             policy.source,
             ", ".join(patterns),
         )
@@ -101,12 +101,12 @@ def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
 
 
 def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
-    """Those of them that we can link to: either all of a system have certificates, or none has."""
+    """The endpoints that this container can link to: all of a system have certificates, or none has."""
     ours = [endpoint for endpoint in endpoints if (Endpoint.read(endpoint).protocol == "tls") == certified]
     if others := [endpoint for endpoint in endpoints if endpoint not in ours]:
         kinds = ("without certificates", "with certificates")
         _logger.warning(
-            "%s: %s, and this container is %s: they cannot be linked; set TRADE_TLS for all of the system or for none",
+            "%s: %s, and this container is %s: they cannot be linked. Set TRADE_TLS for the whole system or for none",
             ", ".join(others),
             kinds[not certified],
             kinds[certified],
@@ -115,7 +115,7 @@ def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
 
 
 def _nearest(listen: list[str]) -> str:
-    """Where others of this host dial: the loopback interface if we listen there."""
+    """The endpoint for others on this host: on the loopback interface if this container listens there."""
     endpoints = sorted(map(Endpoint.read, listen), key=lambda endpoint: not endpoint.loopback)
     return dialled_from_here(endpoints[0])
 
@@ -124,7 +124,7 @@ def _networks(bridge: Sequence[str]) -> list[list[str]]:
     """The interfaces of each network that a bridge joins; the containers of its own host belong to the first.
 
     Raises:
-        ConfigurationError: there is no such interface.
+        ConfigurationError: an interface does not exist.
     """
     known = [name for _, name in socket.if_nameindex()] if bridge else []
     for name in bridge:
@@ -139,16 +139,16 @@ def _networks(bridge: Sequence[str]) -> list[list[str]]:
 
 
 def _check_bridged(bridge: Sequence[str], links: Links) -> None:
-    """Raises ConfigurationError: nobody can come in by one of the interfaces.
+    """Raises ConfigurationError if no container can connect through one of the interfaces.
 
-    An endpoint that does not answer itself may be flooded by strangers. That must not keep a bridge from starting.
+    An endpoint that this container cannot reach itself may be flooded by strangers; the bridge starts all the same.
     """
     if not bridge or any(own.everywhere for own in links.listen):
         return
     heard = {str(own): links.interfaces(str(own)) for own in links.listen}
     silent = [endpoint for endpoint, names in heard.items() if not names]
     if silent:
-        _logger.warning("%s cannot be reached from here: its interface is not checked", ", ".join(silent))
+        _logger.warning("%s cannot be reached from here, so its interface is not checked", ", ".join(silent))
         return
     for name in bridge:
         if not any(name in names for names in heard.values()):

@@ -1,4 +1,4 @@
-"""One participant of a system. Each of its features is declared in a module of its own, and listed here."""
+"""The container: one participant of a system. Each feature has its own module and is listed here."""
 
 import functools
 import itertools
@@ -51,7 +51,7 @@ _R = TypeVar("_R")
 
 
 def delegated(part: str, method: Callable[Concatenate[Any, _P], _R]) -> "Callable[Concatenate[Container, _P], _R]":
-    """A method of the container that a part of it has, with the signature and the docstring that it has there."""
+    """A method of the container that delegates to a component, with its signature and docstring."""
 
     @functools.wraps(method)
     def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -64,7 +64,7 @@ def delegated(part: str, method: Callable[Concatenate[Any, _P], _R]) -> "Callabl
 class Container:
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
-    Joins on construction. A context manager; ``close()`` leaves and is idempotent.
+    It joins on construction. A context manager; ``close()`` leaves the system and is idempotent.
 
     Raises:
         ConfigurationError: a setting is wrong, the endpoint is taken, or this process was forked from one that has a
@@ -75,13 +75,13 @@ class Container:
         fork_guard.refuse_after_fork()
         fork_guard.note_start()
         self.settings = settings or Settings.read()
-        """What it was started with."""
+        """Its settings."""
         self.address = Address(self.settings.identity, self.settings.container, secrets.token_hex(6))
         self.session = str(self.address)
         self.system: Final = System(lambda: self)
-        """Its own switches: who it is linked to, and whether it lets itself be found."""
+        """Its controls: its links, its discovery, and others."""
         self.access = Authorizer(self.settings.policy, certified=self.settings.tls is not None)
-        """What the policy means for it."""
+        """The access policy, as it applies here."""
         self._clients = itertools.count(1)
         self._closing = threading.RLock()
         self._closed = False
@@ -89,21 +89,21 @@ class Container:
         self._known = self._parts.targets.known
         self._build_features(self._parts)
         self.locking: Final = self._parts.lock_api
-        """Its locks on what others offer, and on what it offers itself."""
+        """Its locks on services, its own and others'."""
         self.estopping: Final = self._parts.estop
         """Its e-stops."""
         self.borrowed: Final = self._parts.remote_locks
-        """What is locked in other systems behind its grants."""
+        """The locks in other systems behind its grants."""
         self.withdrawn: Final = self._parts.withdrawn
-        """What was taken off from elsewhere and can be offered again."""
+        """The providers that were deregistered remotely and can be offered again."""
         self.making: Final = self._parts.factory
-        """What it made for others."""
+        """The providers that it created on request."""
         self.arriving: Final = self._parts.migration_target
-        """What comes to it from elsewhere, or from before."""
+        """The providers that migrate to it, and restored ones."""
         self.meter: Final = self._parts.load_meter
-        """How busy it is."""
+        """Its load."""
         self.terminating: Final = self._parts.shutdown
-        """Its end, if others want it."""
+        """Its shutdown on request."""
         self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estop))
         fork_guard.live.add(self)
 
@@ -119,7 +119,7 @@ class Container:
         self._streaming = Streaming(lookup, parts.subscriptions, parts.scheduler)
         self._tracing = Tracing(lookup)
         self.federating = Federating(self.address, registry, parts.providers, parts.locks, parts.event_loop)
-        """What another system sees of it."""
+        """Its services as another system sees them."""
 
     # --- offering
 
@@ -184,15 +184,15 @@ class Container:
     # --- its own set-up
 
     def load_policy(self, path: Path | str) -> None:
-        """Go by another access policy, or by the same file as it is now; calls under way go on.
+        """Loads another access policy, or the same file again; calls under way continue.
 
-        A container that was started with one (`Settings.policy`) reads it again by itself when its files change, and
-        so it does with what is loaded here.
+        A container that was started with a policy (`Settings.policy`) reads it again when its files change; so it does
+        with a policy that is loaded here.
 
-        What may no longer be offered leaves the registry, and locks that may no longer be held are lost.
+        Services that the policy no longer allows leave the registry, and locks that it no longer allows are lost.
 
         Raises:
-            ConfigurationError: it is wrong, and says where; what was loaded before stays.
+            ConfigurationError: the policy is wrong; the message says where. The earlier policy stays in force.
         """
         self._check_open()
         self.access.load(Path(path))
@@ -200,11 +200,11 @@ class Container:
         self._parts.recheck_access()
 
     def note_change(self, what: str, about: str = "") -> None:
-        """Have a change of configuration in the record of what happened here, if one is kept (`Settings.audit`).
+        """Adds a change of configuration to the audit record, if one is kept (`Settings.audit`).
 
         Args:
-            what: in a few words.
-            about: which file, which device.
+            what: the change, in a few words.
+            about: the file or the device.
         """
         self._parts.audit.changed(what, about, running.get())
 
@@ -219,16 +219,16 @@ class Container:
         why: str = "",
         took_ns: int = 0,
     ) -> None:
-        """Have in the record, if one is kept, what somebody asked of a program that speaks for him: an agent's tool.
+        """Adds a request to a program that acts for others, such as an agent's tool, to the audit record, if kept.
 
         Args:
-            what: in a few words.
-            about: which service; no arguments, as these may be secret.
-            kind: of the row.
-            who: whom it speaks for, where that is another one each time; else it is this container.
+            what: the request, in a few words.
+            about: the service, without arguments, which may be secret.
+            kind: the kind of the row.
+            who: the identity that the program acts for; empty: this container.
             outcome: ``ok``, or the type of the error.
-            why: what the error says.
-            took_ns: how long it took.
+            why: the message of the error.
+            took_ns: the duration in nanoseconds.
         """
         own = self.address
         self._parts.audit.note(
@@ -243,22 +243,22 @@ class Container:
         )
 
     def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
-        """Have more in this container's metrics (`Settings.metrics`): it is called whenever somebody looks.
+        """Adds metrics to this container's own (`Settings.metrics`).
 
         Args:
-            tell: gives numbers that are known already, without waiting for anything.
+            tell: called at each reading; returns numbers that are known already, without waiting.
         """
         self._parts.measured.append(tell)
 
     @property
     def metrics_port(self) -> int:
-        """Where its metrics are; 0: nowhere."""
+        """The port of its metrics; 0: none."""
         return self._parts.metrics_port
 
     # --- looking up
 
     def addresses(self) -> list[Address]:
-        """Where the containers of the system are, this one included."""
+        """The addresses of the system's containers, this one included."""
         return [state.address for state in self._parts.registry.containers()]
 
     def containers(self) -> list[ContainerInfo]:
@@ -284,10 +284,10 @@ class Container:
 
     @property
     def reach(self) -> Dialer:
-        """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
+        """Its links; raises ConfigurationError on a transport without links."""
         self._check_open()
         if self._parts.dialer is None:
-            raise ConfigurationError(problem="this container's transport cannot be linked to others while it runs")
+            raise ConfigurationError(problem="this container's transport cannot change its links while it runs")
         return self._parts.dialer
 
     def handle(self, key: ServiceKey) -> Handle:
@@ -299,7 +299,7 @@ class Container:
         return self._parts.registry.get(key) is not None
 
     def record(self, handle: Handle) -> Record:
-        """What is known of a service; raises ServiceGone if nothing ever was."""
+        """The registry entry of a service, or the last known one; raises ServiceGone if it has none."""
         record = self._parts.registry.get(handle.key) or handle.last_record
         if record is None:
             raise self._parts.targets.gone(handle)
@@ -308,7 +308,7 @@ class Container:
     # --- calling
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
-        """Call a service and wait; what ``handle(...)`` does."""
+        """Calls a service and waits, as ``handle(...)`` does."""
         outer = running.get()
         if outer is not None and outer.ongoing is not None:
             return self._begin(handle, args, kwargs, deadline_s, here=True).result()
@@ -319,16 +319,16 @@ class Container:
         return self._look_up(handle).invoke(args, kwargs, request)
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
-        """Call a service without waiting; what ``handle.start(...)`` does."""
+        """Calls a service without waiting, as ``handle.start(...)`` does."""
         return self._begin(handle, args, kwargs, deadline_s, here=False)
 
     def _begin(
         self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None, *, here: bool
     ) -> Run:
-        """The same; what is made inside another call ends with that."""
+        """Calls a service without waiting; a call inside another one ends with that."""
         request, run, outer = new_request(deadline_s), Run(handle), running.get()
         target = self._known.get(handle.key) or self._look_up(handle)
-        alone = outer is None or outer.cancelled or target.is_stop  # one that was cancelled may look, and stop
+        alone = outer is None or outer.cancelled or target.is_stop  # a cancelled call may still read and stop
         ongoing = None if outer is None or alone else outer.ongoing
         forget = _nothing if ongoing is None else run.end_with(ongoing)
         try:
@@ -342,17 +342,17 @@ class Container:
         self._check_open()
         return self._parts.targets.look_up(handle)
 
-    # --- being
+    # --- its life
 
     def open_session(self, client: str, *, system: str = "") -> Session:
-        """A presence for one client of a program that acts for many: a page, a connection (S03).
+        """Opens a session for one client, such as a page or a connection, of a program that acts for many (S03).
 
-        Inside ``with container.open_session("page"):`` calls and locks are the client's: when it is closed, what the
-        client set moving stops and its locks fall, and nothing else does.
+        Inside ``with container.open_session("page"):`` calls and locks are the client's: when it is closed, the
+        client's motion stops and its locks are lost, but those of no other client.
 
         Args:
-            client: a word for it; others see ``identity/container/epoch/client.number``.
-            system: the other system that it is of, if any; others are told ``system/client via identity``.
+            client: a name for it; others see ``identity/container/epoch/client.number``.
+            system: the client's own system, if it is another one; others see ``system/client via identity``.
 
         Raises:
             ConfigurationError: the container is closed.
@@ -368,12 +368,12 @@ class Container:
 
     @property
     def registry(self) -> Registry:
-        """What is offered in its system."""
+        """The registry of the services in its system."""
         return self._parts.registry
 
     @property
     def session_end(self) -> Event[str]:
-        """A session has ended, with that name."""
+        """Emitted with the name of each session that ends."""
         return self._parts.session_end
 
     @property
@@ -382,28 +382,28 @@ class Container:
         return self.address.container
 
     def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
-        """The verb that callers of a service need over its group, and the roles of the policy here that have it."""
+        """The right over its group that callers of a service need, and the roles that have it by the policy here."""
         key, policy = handle.key, self.access.policy
         verb = verb_of(key.domain, key.name, handle.record.info.effect)
         return verb, policy.roles_with(verb, key.domain) if policy is not None and verb else ()
 
     def require_call(self, who: str, handle: Handle) -> None:
-        """Raises AccessDenied: somebody for whom this container acts may not call that service."""
+        """Raises AccessDenied if a client for whom this container acts may not call that service."""
         key, record = handle.key, handle.record
         self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
 
     @property
     def dropped_messages(self) -> int:
-        """Messages that were malformed or of another protocol version."""
+        """The number of messages that were malformed, or of another protocol version."""
         return self._parts.dropped_messages
 
     @property
     def catching_up(self) -> bool:
-        """Whether it is asking others for what it may have missed."""
+        """Whether it is requesting registry entries that it may have missed."""
         return self._parts.watch.busy
 
     def healthy(self) -> bool:
-        """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
+        """Whether it can take a call now; code that feeds hardware watchdogs checks this."""
         return not self._closed and self._parts.dispatcher.draining
 
     @property
@@ -417,22 +417,22 @@ class Container:
             raise container_closed(self.address)
 
     def close(self) -> None:
-        """Leave: services, handles and notifications end; nothing stays behind. Idempotent.
+        """Leaves the system: services, handles and notifications end; nothing remains. Idempotent.
 
-        Stops that are under way are waited for, up to 2 s; other calls end with ContainerLost.
+        It waits up to 2 s for stops under way; other calls end with ContainerLost.
         """
         if fork_guard.forked():
             return
-        with self._closing:  # who comes second waits until it is done
+        with self._closing:  # a second thread waits until it is done
             if self._closed:
                 return
-            self.locking.lease_client.close()  # gives back what it holds, while it can still be heard
+            self.locking.lease_client.close()  # releases its locks while it can still send
             self._parts.caller.finish_stops(_STOPPING_S)
             self._closed = True
             self._parts.close()
 
     def abandon(self) -> None:
-        """In a forked child: everything belongs to the parent; touch nothing, refuse everything."""
+        """Refuses everything in a forked child, and touches nothing: it all belongs to the parent."""
         self._closed = True
         self._parts.abandon()
 

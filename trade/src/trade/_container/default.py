@@ -18,16 +18,16 @@ _default: Container | None = None
 
 
 def start(settings: Settings | None = None) -> Container:
-    """Start the default container with settings of one's own.
+    """Starts the default container with the given settings.
 
     Raises:
-        errors.ConfigurationError: it runs already; start it before the first other use of ``trade``.
+        errors.ConfigurationError: it runs already; start it before any other use of ``trade``.
     """
     global _default  # noqa: PLW0603 - the one default
     with _lock:
         if _default is not None:
             problem = (
-                "the default container runs already; call trade.start before anything else, or trade.close() first"
+                "the default container runs already. Call trade.start before anything else, or trade.close() first"
             )
             raise ConfigurationError(problem=problem)
         _default = Container(settings)
@@ -35,7 +35,7 @@ def start(settings: Settings | None = None) -> Container:
 
 
 def container() -> Container:
-    """The default container, started if need be."""
+    """The default container; starts it if necessary."""
     running = _default
     if running is not None:
         return running
@@ -44,7 +44,7 @@ def container() -> Container:
 
 
 def close() -> None:
-    """Leave the system: close the default container. The next use starts a new one. Idempotent."""
+    """Closes the default container, which leaves the system. The next use starts a new one. Idempotent."""
     global _default
     with _lock:
         running, _default = _default, None
@@ -53,7 +53,7 @@ def close() -> None:
 
 
 def of_default(method: Callable[Concatenate[Container, _P], _R]) -> Callable[_P, _R]:
-    """A method of `Container` as a function of ``trade``: that of the default container."""
+    """A method of `Container` as a function of ``trade`` on the default container."""
 
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         return method(container(), *args, **kwargs)

@@ -1,4 +1,4 @@
-"""What another system sees of a container, and what the container offers of it."""
+"""Federation, a container's side: it lists its system's providers, and offers those of another system."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -20,11 +20,11 @@ from trade._services.providers import Providers
 from trade.errors import ConfigurationError, SessionEnded
 
 _PATIENCE_S = 1.0
-"""How long a call that came before its caller's sign of life waits for that."""
+"""How long a call that arrives before its caller's liveliness token waits for it."""
 
 
 class Exposed(NamedTuple):
-    """Where a provider is."""
+    """The place of a provider."""
 
     address: Address
     domain: str
@@ -36,18 +36,18 @@ class Exposed(NamedTuple):
 
 
 class MemberSystem(NamedTuple):
-    """How what is at home in another system is reached there."""
+    """Access to a provider in its home system."""
 
     place: Exposed
     handle: Callable[[ServiceKey], Handle]
     speaking: Speaking
     codec: Codec
     adopt: Callable[[str, str], SharedResource]
-    """The resource of a name here that has another one there."""
+    """Returns the resource of a name here for a name there."""
 
 
 class Federating:
-    """Offers what is at home elsewhere, and shows what is at home here; ``container.federating``."""
+    """Offers providers of another system, and lists those of this one; ``container.federating``."""
 
     def __init__(
         self, address: Address, registry: Registry, providers: Providers, locks: LockTable, event_loop: AsyncLoop
@@ -61,7 +61,7 @@ class Federating:
     # --- showing
 
     def offers(self) -> dict[Exposed, ProviderInfo]:
-        """Every provider of the system that may offer what it does, the middleware's own left out."""
+        """All providers of the system that the policy allows, without the middleware's own."""
         return {
             Exposed(state.address, entry.domain, name): entry.info
             for state in self._registry.containers()
@@ -70,26 +70,26 @@ class Federating:
         }
 
     def require_present(self, session: str) -> None:
-        """Raises SessionEnded: its container is not there, or it has ended."""
+        """Raises SessionEnded if the session has ended or its container is not present."""
         address = Address(*session.split("/")[:3])
         there = self._registry.wait_for(lambda: self._registry.is_alive(address), _PATIENCE_S)
         if (ended := self._locks.gone((session,))) is not None:
             raise ended
         if not there:
-            raise SessionEnded(session=session, reason="nobody of that name is here")
+            raise SessionEnded(session=session, reason="its container is not in this system")
 
     # --- offering
 
     def pass_on(self, provider: object, info: ProviderInfo, home: MemberSystem) -> Exposed:
-        """Offer what is at home elsewhere.
+        """Offers a provider of another system.
 
         Args:
-            provider: an object that stands for it here.
-            info: what is told of it here.
-            home: how it is reached.
+            provider: an object that represents it here.
+            info: its description here.
+            home: the access to it.
 
         Raises:
-            ConfigurationError: a resource of it has the name of another one here.
+            ConfigurationError: one of its resources has the name of another one here.
             AccessDenied: the policy does not let this container offer that.
         """
 
@@ -114,17 +114,17 @@ class Federating:
         resources = tuple(adopted[first:])
         return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._event_loop)
 
-    def tell_anew(self, provider: object, info: ProviderInfo) -> None:
-        """Tell something else about what is passed on; its services are the same."""
+    def update(self, provider: object, info: ProviderInfo) -> None:
+        """Replaces the description of a forwarded provider; its services are the same."""
         self._providers.alter(provider, lambda known: structs.replace(info, revision=known.revision))
 
     def withdraw(self, provider: object) -> None:
-        """Pass it on no more. Raises ConfigurationError: it was withdrawn already."""
+        """Withdraws a forwarded provider. Raises ConfigurationError if it was withdrawn already."""
         self._providers.remove(provider)
 
 
 def _lockable(place: str, service: ServiceInfo, home: Exposed) -> dict[str, str]:
-    """What locks of a service are about, here and at home. A stop has nothing: it is passed on, and judged there."""
+    """The resources that locks of a service hold, by the names here and at home; a stop has none."""
     if service.effect == "stop":
         return {}
     uses = {name: name for name in service.uses} if service.effect != "read" else {}
@@ -132,10 +132,10 @@ def _lockable(place: str, service: ServiceInfo, home: Exposed) -> dict[str, str]
 
 
 def shown(info: ProviderInfo, groups: Sequence[str]) -> tuple[str, ...]:
-    """Those of a provider's groups that lie in some others."""
+    """The groups of a provider that are inside other groups."""
     return tuple(group for group in info.groups if inside(group, groups))
 
 
 def inside(group: str, groups: Sequence[str]) -> bool:
-    """Whether a group is one of these or beneath one; ``*`` is all."""
+    """Whether a group is one of these or beneath one; ``*`` includes all."""
     return any(whole == "*" or group == whole or group.startswith(f"{whole}.") for whole in groups)

@@ -1,4 +1,4 @@
-"""Attaching hooks: call this before that service, or after it, wherever that runs."""
+"""The hook methods of a container: a hook calls a service before or after another one, in any container."""
 
 import contextlib
 import itertools
@@ -20,11 +20,11 @@ _logger = logging.getLogger("trade")
 
 
 class Hook:
-    """A hook that this container has attached; it ends when it is detached or this container does."""
+    """A hook that this container has attached; it ends when it is detached or this container ends."""
 
     def __init__(self, home: "Hooking", name: str, side: Side, target: Handle | Constraint, call: Handle) -> None:
         self.id: Final = name
-        """Names it in the whole system."""
+        """Its id, unique in the system."""
         self.told_as: Final = f"hook {name}"
         self.side: Final[Side] = side
         self.target: Final = target
@@ -34,7 +34,7 @@ class Hook:
         self._attached = True
 
     def begin(self) -> None:
-        """Attach it where services are now, and where containers come later. Raises what the first of them does."""
+        """Attaches it in all present and future containers. Raises the first error of the present ones."""
         if isinstance(self.target, Handle):
             self._attach(
                 self._home.lookup.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
@@ -49,7 +49,7 @@ class Hook:
             raise refusal
         self._later = self._home.notifying.joined(
             everywhere, self._join, existing=True
-        )  # to be told twice does no harm
+        )  # a second attachment of the same hook has no effect
 
     def _attach(self, handle: Handle) -> Run:
         if isinstance(self.target, Handle):
@@ -61,7 +61,7 @@ class Hook:
             return
         try:
             self._attach(handle).result()
-            if not self._attached:  # meanwhile, and perhaps before this got there
+            if not self._attached:  # detached meanwhile, perhaps before this arrived
                 self._home.lookup.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
         except (ContainerLost, ServiceGone):  # it has left already
             _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
@@ -69,16 +69,16 @@ class Hook:
             _logger.warning("hook %s is not attached in %s: %s", self.call.label, handle.container, error)
 
     def infos(self) -> list[HookInfo]:
-        """How it fares, by container."""
+        """Its state in each container."""
         return [info for info in self._home.hooks() if info.id == self.id]
 
     def detach(self) -> None:
-        """Call it no more; a call of it under way finishes. Idempotent."""
+        """Detaches it; a call of it under way finishes. Idempotent."""
         if self._attached:
             self._attached = False
             if self._later is not None:
                 self._later.cancel()
-            with contextlib.suppress(NoSuchHook):  # those it was attached to have gone
+            with contextlib.suppress(NoSuchHook):  # its containers are gone
                 self._home.detach_hook(self.id)
 
     def __repr__(self) -> str:
@@ -86,7 +86,7 @@ class Hook:
 
 
 class Hooking:
-    """Hooks of this container on services anywhere."""
+    """The hooks of this container on services of any container."""
 
     def __init__(self, lookup: Lookup, notifying: Notifying, access: Authorizer) -> None:
         self.lookup: Final = lookup
@@ -95,25 +95,25 @@ class Hooking:
         self._numbers = itertools.count(1)
 
     def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
-        """Have a service called before each call of another one, with what that is called with.
+        """Calls a service before each call of another one, with a copy of its arguments.
 
-        It runs where that one runs and holds its call up, for 0.1 s at most, and together with others 0.25 s. It
-        changes nothing of the call, whatever becomes of it. After three failures in a row it is suspended.
+        It runs in that service's container and delays its call by 0.1 s at most, together with other hooks by 0.25 s.
+        It never changes the call. After three failures in a row it is suspended.
 
         Args:
-            target: a service, or all that match: those that join later, too. Nothing comes before a stop.
+            target: a service, or all that match, later ones included. A stop has no hooks before it.
             call: takes one argument, a `Called`.
 
         Raises:
-            AccessDenied: the policy does not let this container ``instrument`` the service, or none of those here now.
-            ConfigurationError: nothing comes before a stop; or what is no handle.
+            AccessDenied: the policy does not let this container ``instrument`` the service, or any present one.
+            ConfigurationError: the target is a stop, or an argument is not a handle.
         """
         return self._hook("before", target, call)
 
     def after_service(self, target: Handle | Constraint, call: Handle) -> Hook:
-        """Have a service called after each call of another one, with how it ended; before its caller is answered.
+        """Calls a service after each call of another one, with its outcome, before the caller gets the answer.
 
-        After a stop it is called once that is answered. The rest is as for `before_service`.
+        After a stop it runs when the caller has the answer. The rest is as for `before_service`.
         """
         return self._hook("after", target, call)
 
@@ -130,7 +130,7 @@ class Hooking:
         return hook
 
     def _require_instrument(self, target: Handle | Constraint) -> None:
-        """Raises AccessDenied: by the policy as it is here, all of these would refuse it."""
+        """Raises AccessDenied if, by the policy here, all of these would refuse it."""
         known = [target] if isinstance(target, Handle) else self.lookup.services(target)
         mine = [one for one in known if one.key.domain != DOMAIN]
         who = self.lookup.home.address.identity
@@ -140,16 +140,16 @@ class Hooking:
             raise denied
 
     def hooks(self) -> list[HookInfo]:
-        """Every hook in the system, once for each container it is attached in."""
+        """All hooks in the system, one entry for each container where a hook is attached."""
         found = [info for infos in self.lookup.ask_all("hooks") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def detach_hook(self, hook: str) -> None:
-        """End a hook by its id, wherever it is attached and whoever did.
+        """Detaches a hook by its id, in all containers, also one of another client.
 
         Raises:
-            NoSuchHook: none has that id.
-            AccessDenied: it is another's, and the policy does not let this container administer the system.
+            NoSuchHook: no hook has that id.
+            AccessDenied: it is another client's, and the policy does not let this container administer the system.
         """
         if not any(self.lookup.ask_all("detach_hook", hook)):
             raise NoSuchHook(id=hook)

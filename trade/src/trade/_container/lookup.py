@@ -1,4 +1,4 @@
-"""Looking services up, and calling them by what they are."""
+"""Lookup: finds services by constraints, and calls them."""
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ from trade.errors import AccessDenied
 
 
 class Lookup:
-    """Finds services here and elsewhere."""
+    """Finds and calls the services of the whole system."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class Lookup:
     # --- looking up
 
     def services(self, constraint: Constraint | None = None) -> list[Handle]:
-        """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
+        """Handles of all matching services, ordered by group and name; without a constraint, of all services."""
         self._check_open()
         wanted = where() if constraint is None else constraint
         return [Handle(self.home, record.key, record) for record in self._registry.select(wanted)]
@@ -64,15 +64,15 @@ class Lookup:
         return Handle(self.home, matches[0].key, matches[0])
 
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
-        """Wait until something holds of what the constraint is to match.
+        """Waits until a condition on the services of a constraint holds.
 
         Args:
-            constraint: what was asked for; the error says what there is instead.
-            ready: whether it holds; asked now and after every change.
-            wait_s: how long to wait for it, in seconds.
+            constraint: what the services match; the error suggests similar ones.
+            ready: the condition; checked now and after every change.
+            wait_s: how long to wait, in seconds.
 
         Raises:
-            NoSuchService: it does not hold within ``wait_s`` seconds.
+            NoSuchService: the condition does not hold within ``wait_s`` seconds.
         """
         wait_s = patience_s(wait_s)
         if self._registry.wait_for(ready, wait_s):
@@ -82,20 +82,20 @@ class Lookup:
         raise no_such_service(constraint, self._registry.select(where()), wait_s, apart, hidden)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
-        """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
+        """Endpoints without a container; the reasons, at half a second each, only if the caller does not wait."""
         reach = self._dialer
         if wait_s > 0 or reach is None:
             return self.reachability(limit_s=0).unanswered
         return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
 
     def reachability(self, *, limit_s: float = 3.0) -> Reachability:
-        """Whom it has found: what nobody tells is only told by nobody if somebody was there to tell.
+        """The containers that it has found: without them, an empty answer of the system means nothing.
 
         Returns at once when it is `Reachability.complete`.
 
         Args:
-            limit_s: how long to wait for that, in seconds; also if nobody is found. Finding out why there is no link to
-                an endpoint takes up to 3 s more for each.
+            limit_s: how long to wait for that, in seconds; also if no container is found. Finding the reason for each
+                missing link takes up to 3 s more.
         """
         self._check_open()
         return look_around(self._registry, self._dialer, self.home.address, self._system, limit_s)
@@ -107,33 +107,33 @@ class Lookup:
     # --- calling
 
     def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
-        """Call the only service that matches. Raises what `find` raises, and what the call does."""
+        """Calls the only service that matches. Raises the errors of `find` and of the call."""
         return self.find(constraint)(*args, **kwargs)
 
     def call_all(
         self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
     ) -> list[batch.Outcome]:
-        """Call several services at once and wait for all of them.
+        """Calls several services at once and waits for all of them.
 
         Args:
-            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
-            args: for each.
-            kwargs: for each.
+            which: a constraint (all that match now), or handles; bound calls have their own arguments.
+            args: for each call.
+            kwargs: for each call.
 
         Returns:
-            An outcome for each, in order; what one raises is its own outcome and stops no other.
+            An outcome for each call, in order; an error is the outcome of its call and stops no other.
         """
         return batch.all_outcomes(self._bound(which, args, kwargs))
 
     def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[batch.Outcome]:
-        """Make calls one after the other.
+        """Makes calls one after the other.
 
         Args:
             calls: bound calls, or handles of services without arguments.
-            go_on: also after an error, at which it stops otherwise.
+            go_on: whether to continue after an error; else it stops there.
 
         Returns:
-            Outcomes of those that ran.
+            The outcomes of the calls that ran.
         """
         return batch.sequence(self._bound(calls, (), {}), go_on=go_on)
 
@@ -153,7 +153,7 @@ class Lookup:
         return await batch.sequence_async(self._bound(calls, (), {}), go_on=go_on)
 
     def ask_all(self, name: str, *args: Any) -> list[Any]:
-        """What a function of the middleware's own says in each container; those that leave meanwhile say nothing.
+        """The results of one of the middleware's own services in all containers, except those that leave meanwhile.
 
         Raises:
             AccessDenied: one of them does not allow it.

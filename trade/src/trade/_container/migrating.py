@@ -1,4 +1,4 @@
-"""Moving providers, and taking and giving their state."""
+"""Migration of providers, and saving and restoring their state."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -16,7 +16,7 @@ _HEARD_S: Final = 1.0
 
 
 class Migrating:
-    """Asks the containers that providers are in."""
+    """Requests migrations and states from the containers of the providers."""
 
     def __init__(self, lookup: Lookup, registry: Registry) -> None:
         self._lookup = lookup
@@ -25,39 +25,39 @@ class Migrating:
     def migrate(
         self, which: Handle | Constraint, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
     ) -> tuple[Handle, ...]:
-        """Have a provider go on in another container, on this host or another one, with its state.
+        """Moves a provider with its state to another container, on this host or another one.
 
-        Nobody can call it meanwhile, and at no time it is offered twice. What its class gives with ``save_state()`` is
-        given to another object of the class with ``restore_state(state)``; classes without them begin anew. Its groups
-        and metadata go with it, the object that stays behind is closed (``close()``, if it has that). Handles do not
-        follow: they raise ServiceGone, which says where it is; constraints find it.
+        No client can call it meanwhile, and it is never offered twice. The state from ``save_state()`` goes to another
+        object of the class with ``restore_state(state)``; classes without these methods start without state. Its groups
+        and metadata move with it, and the old object is closed (``close()``, if it has that). Handles do not follow:
+        they raise ServiceGone, which names the new place; constraints find it.
 
         Args:
-            which: a service of the provider, or what matches services of no other.
+            which: a service of the provider, or a constraint that only its services match.
             to: name of the container; with ``*`` or ``?`` the least busy one that fits. It must allow the class.
-            args: for the constructor there; by default those it was instantiated with, if it was.
+            args: for the constructor there; by default those that it was instantiated with, if any.
 
         Returns:
             Handles of its services there.
 
         Raises:
-            LockedByOther: somebody has it locked, it moves, or a call of it does not end.
-            Stopped: a stop holds, and nobody has resumed it.
+            LockedByOther: another client has locked it, it moves, or a call of it does not end.
+            Stopped: a stop holds, and has not been resumed.
             NoSuchService, TooManyServices: not one provider, or no such container.
-            NotInstantiable, NoSuchClass, CannotInstantiate: it cannot be made there.
-            CannotMigrate: the class is another version there, its state is not given or taken, or it took too long.
+            NotInstantiable, NoSuchClass, CannotInstantiate: it cannot be created there.
+            CannotMigrate: the class is another version there, its state was not saved or restored, or it took too long.
             ConfigurationError: it drives hardware of its host, or shares something with other providers.
-            AccessDenied: the policy does not let this container administer its groups, or those not offer it.
+            AccessDenied: the policy does not let this container administer its groups, or the other one offer it.
             Busy: the other container has no room at the moment.
-            MigrationUnknown: the other container was lost at the moment it moved; it is withdrawn here. With all the
-                others it is offered as before.
+            MigrationUnknown: the other container was lost during the move; it is withdrawn here. After all other errors
+                it is offered as before.
         """
         moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
         self._registry.wait_for(lambda: all(self._registry.get(one.key) is not None for one in moved), _HEARD_S)
         return moved
 
     def save_state(self, which: Handle | Constraint) -> Any:
-        """What a provider gives with ``save_state()``, while nothing of it runs or moves: plain data.
+        """The state that a provider returns from ``save_state()``, while it neither runs nor moves: plain data.
 
         Raises:
             ConfigurationError: its class has no such method.
@@ -66,7 +66,7 @@ class Migrating:
         return self._of(which, "save_state")
 
     def restore_state(self, which: Handle | Constraint, state: Any) -> None:
-        """Give a provider what it gave before. What it commands to move meanwhile is refused (S18).
+        """Gives a provider an earlier state back. Motion that it commands meanwhile is refused (S18).
 
         Raises:
             ConfigurationError, LockedByOther, Stopped, NoSuchService, TooManyServices, AccessDenied: as for

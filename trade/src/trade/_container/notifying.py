@@ -1,4 +1,4 @@
-"""Asking for notifications: on this occasion, if this holds, make that call."""
+"""The notification methods of a container: when an event occurs and a condition holds, make a call."""
 
 import time
 from datetime import datetime
@@ -19,7 +19,7 @@ POLL_S: Final = 1.0
 
 
 class Notifying:
-    """Standing requests of this container, and those that others keep for it."""
+    """The notifications of this container, here and in others."""
 
     def __init__(self, lookup: Lookup, notifier: Notifier, registry: Registry) -> None:
         self._lookup = lookup
@@ -31,33 +31,32 @@ class Notifying:
     def joined(
         self, constraint: Constraint, call: What, *, existing: bool = False, if_: What | None = None, host: str = ""
     ) -> Notification:
-        """Call with the handle of every service that comes and matches, one after the other.
+        """Makes a call, with its handle, for every matching service that appears, one after the other.
 
         Args:
             constraint: which services.
             call: a handle, a bound call (the handle comes before its own arguments), a constraint that one service
-                fits, or a function of this process.
-            existing: also once for each that is there already.
-            if_: only if this answers True then; asked without arguments.
-            host: the container it is to live in; by default this one. It ends with this one all the same, unless
-                it is detached.
+                matches, or a function of this process.
+            existing: also once for each present service.
+            if_: only if this returns True then; called without arguments.
+            host: the container that keeps it; by default this one. It also ends with this one, unless it is detached.
 
         Raises:
-            ConfigurationError: what cannot be called, a function for another container, too many there.
+            ConfigurationError: the call is not callable, is a function for another container, or too many exist there.
             AccessDenied: with ``host=``, by the policy.
         """
         terms = TriggerSpec(occasion="joined", constraint=constraint, existing=existing)
         return self._notify(terms, call, if_, None, host)
 
     def left(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
-        """Call with the (dead) handle of every service that goes and matched; the rest as for `joined`."""
+        """Makes a call, with its (stale) handle, for every matching service that disappears; else like `joined`."""
         return self._notify(TriggerSpec(occasion="left", constraint=constraint), call, if_, None, host)
 
     def changed(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
-        """Call with the handle of every service whose groups, metadata, health or description become others.
+        """Makes a call for every service whose groups, metadata, health or description change, with its handle.
 
-        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
-        one. The rest is as for `joined`.
+        It fires for services that match, and once more when they no longer do. One call may report several quick
+        changes. The rest is as for `joined`.
         """
         return self._notify(TriggerSpec(occasion="changed", constraint=constraint), call, if_, None, host)
 
@@ -72,18 +71,17 @@ class Notifying:
         poll_s: float = POLL_S,
         host: str = "",
     ) -> Notification:
-        """Make that call once, without waiting for it.
+        """Makes a call once, without waiting for it.
 
         Args:
-            call: a handle, a bound call, a constraint that one service fits, or a function of this process.
-            if_: make it only if this answers True at that moment.
-            when: wait for this to answer True; it is asked now and every ``poll_s`` seconds.
-            poll_s: how often, in seconds.
-            host: the container it is to live in; by default this one. It ends with this one all the same, unless
-                it is detached.
+            call: a handle, a bound call, a constraint that one service matches, or a function of this process.
+            if_: make it only if this returns True at that moment.
+            when: wait until this returns True; it is called now and every ``poll_s`` seconds.
+            poll_s: the interval, in seconds.
+            host: the container that keeps it; by default this one. It also ends with this one, unless it is detached.
 
         Raises:
-            ConfigurationError: what cannot be called, a function for another container, no such time.
+            ConfigurationError: the call is not callable, is a function for another container, or the time is not valid.
             AccessDenied: with ``host=``, by the policy.
         """
         return self._notify(TriggerSpec(occasion="once", poll_s=poll_s), call, if_, when, host)
@@ -98,7 +96,7 @@ class Notifying:
         poll_s: float = POLL_S,
         host: str = "",
     ) -> Notification:
-        """Make that call after so many seconds, counted from when ``when`` holds; the rest as for `once`."""
+        """Makes a call after ``s`` seconds, counted from the time when ``when`` holds; else like `once`."""
         return self._notify(TriggerSpec(occasion="after", s=s, poll_s=poll_s), call, if_, when, host)
 
     def at(
@@ -111,9 +109,9 @@ class Notifying:
         poll_s: float = POLL_S,
         host: str = "",
     ) -> Notification:
-        """Make that call at a moment, by the clock on the wall of the container it lives in, also if that is set.
+        """Makes a call at a time of day, by the wall clock of the container that keeps it, even if that is adjusted.
 
-        If ``when`` holds later only, it is made then. The rest is as for `once`.
+        If ``when`` holds only later, the call is made then. The rest is as for `once`.
 
         Args:
             moment: with a time zone; not in the past.
@@ -137,16 +135,16 @@ class Notifying:
         poll_s: float = POLL_S,
         host: str = "",
     ) -> Notification:
-        """Make that call every so many seconds, for the first time after so many; the rest as for `once`.
+        """Makes a call every ``s`` seconds, the first one after ``s`` seconds; else like `once`.
 
-        A call that takes longer than that holds up the next: ticks that pass meanwhile become one.
+        A call that takes longer delays the next: the ticks that pass meanwhile become one.
 
         Args:
             s: the interval in seconds, from 0.001.
             call: as for `once`.
-            if_: skip ticks at which this does not answer True.
-            edge: skip those, too, at which it did so already at the tick before.
-            when: begin when this answers True.
+            if_: skip ticks at which this does not return True.
+            edge: also skip ticks if it returned True at the tick before.
+            when: begin when this returns True.
             poll_s: as for `once`.
             host: as for `once`.
         """
@@ -155,16 +153,16 @@ class Notifying:
     # --- seeing and ending
 
     def notifications(self) -> list[NotificationInfo]:
-        """Every notification that stands anywhere in the system."""
+        """All notifications in the system."""
         found = [info for infos in self._lookup.ask_all("notifications") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def cancel_notification(self, notification: str) -> None:
-        """End a notification, wherever it lives and whoever asked for it.
+        """Ends a notification by its id, in any container, also one of another client.
 
         Raises:
             NoSuchNotification: none has that id, or it has ended.
-            AccessDenied: it is another's, and the policy does not let this container administer the system.
+            AccessDenied: it is another client's, and the policy does not let this container administer the system.
         """
         if not any(self._lookup.ask_all("cancel_notification", notification)):
             raise NoSuchNotification(id=notification)

@@ -1,4 +1,4 @@
-"""A policy's files are looked at again and again: who is revoked in them is refused without anybody telling."""
+"""Automatic reload of the policy: its files are checked every second, so that revoked identities are refused."""
 
 import logging
 import time
@@ -16,7 +16,7 @@ __all__ = ["begin_watching", "different"]
 _logger = logging.getLogger("trade")
 _EVERY_NS: Final = 1_000_000_000
 _AGAIN_NS: Final = 10 * _EVERY_NS
-"""Files that were refused are tried again although they look the same: what kept them from being read may be over."""
+"""Refused files are read again after this time although they look the same: an error of reading may be over."""
 
 
 class _Audit(Protocol):
@@ -24,13 +24,13 @@ class _Audit(Protocol):
 
 
 def begin_watching(access: Authorizer, scheduler: Scheduler, audit: _Audit, recheck_access: Callable[[], None]) -> None:
-    """Have a container go by its policy as the files are; those that are wrong are refused, and the old one stays.
+    """Keeps a container's policy as its files are; wrong files are refused, and the earlier policy stays.
 
     Args:
-        access: what it goes by.
-        scheduler: does it, once a second.
-        audit: told of what has changed.
-        recheck_access: applies another policy.
+        access: the policy in force.
+        scheduler: checks the files, once a second.
+        audit: records the changes.
+        recheck_access: applies a changed policy.
     """
     _Watching(access, scheduler, audit, recheck_access)
 
@@ -41,9 +41,9 @@ class _Watching:
     ) -> None:
         self._access, self._audit, self._recheck_access = access, audit, recheck_access
         self._last: Seen = access.seen
-        """At the look before: what is being written is let come to rest."""
+        """The files at the last check: files that are being written get time to finish."""
         self._refused: Seen | None = None
-        """Files that were wrong, which is said once."""
+        """Wrong files, which are logged once."""
         self._again_ns = 0
         scheduler.begin(self._look, time.monotonic_ns() + _EVERY_NS)
 
@@ -57,12 +57,12 @@ class _Watching:
 
     def _read(self, now: Seen) -> None:
         before, path = self._access.policy, self._access.path
-        assert before is not None and path is not None  # noqa: S101 - who has none is not watched
+        assert before is not None and path is not None  # noqa: S101 - without a policy nothing is watched
         try:
             self._access.load(path)
         except ConfigurationError as wrong:
             if now != self._refused:
-                _logger.warning("the policy was changed and is wrong; going on by the old one: %s", wrong)
+                _logger.warning("the policy was changed and is wrong, so the earlier one stays: %s", wrong)
             self._refused, self._again_ns = now, time.monotonic_ns() + _AGAIN_NS
             return
         self._refused = None
@@ -74,11 +74,11 @@ class _Watching:
         try:
             self._recheck_access()
         except Exception:
-            _logger.exception("not all could be judged anew by %s", path)
+            _logger.exception("the changed policy %s could not be applied everywhere", path)
 
 
 def different(before: Policy, after: Policy) -> list[str]:
-    """What has become different, in words."""
+    """The differences between two policies, in words."""
     changed = [f"{name} is revoked now" for name in sorted(after.revoked - before.revoked)]
     changed += [f"{name} is revoked no more" for name in sorted(before.revoked - after.revoked)]
     parts = ("roles", "identities", "gateways", "approval")

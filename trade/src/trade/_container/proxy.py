@@ -1,4 +1,4 @@
-"""A service of another system as it is offered here: each call goes on there, the answer comes back as it is."""
+"""A proxy for a service of another system: it forwards each call, and returns the answer unchanged."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -20,14 +20,14 @@ from trade._services.signature import Signature
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
 
 _AT_LEAST_S: Final = 0.001
-"""A call whose deadline has come is refused where all calls are, not for its option."""
+"""The shortest deadline of a forwarded call: the home refuses expired calls, as it does all others."""
 
 Speaking = Callable[[CallContext], AbstractContextManager[None]]
-"""While this lasts, calls are made in the other system on behalf of one that came here."""
+"""A context in which calls in the other system are made on behalf of a call here."""
 
 
 class _ProxyMethod(Signature):
-    """Checks nothing: where the service is at home all is checked, and handles are translated on the way."""
+    """A signature that checks nothing: the service's home does, and handles are translated on the way."""
 
     def __init__(self, info: ServiceInfo, codec: Codec) -> None:
         self.info = info
@@ -36,7 +36,7 @@ class _ProxyMethod(Signature):
         self._positional = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
         properties: dict[str, Any] = read_schema(info.arguments_schema).get("properties", {})
         self._secrets = frozenset(name for name, schema in properties.items() if schema.get("writeOnly"))
-        self.has_secrets = False  # what is secret was left out of errors where the service is at home
+        self.has_secrets = False  # its home has removed secrets from errors
 
     def decode(self, service: str, raw: Raw | bytes) -> tuple[Sequence[Any], dict[str, Any]]:
         try:
@@ -75,7 +75,7 @@ class _ProxyMethod(Signature):
 
 
 class ProxyProvider(LocalService):
-    """A service of this container that is at home in another system."""
+    """A service of this container whose home is another system."""
 
     __slots__ = ()
 
@@ -92,16 +92,16 @@ def passed_on_service(
     resources: tuple[Resource, ...],
     loop: AsyncLoop,
 ) -> ProxyProvider:
-    """What stands here for a service that is called by a handle of its own system.
+    """A proxy for a service, called through a handle in its own system.
 
     Args:
-        label: as errors name it.
-        info: what is told of it.
+        label: its name in errors.
+        info: its description.
         home: the service itself.
-        speaking: makes calls there those of whoever calls here.
+        speaking: makes calls there on behalf of the caller here.
         codec: translates handles from this system to that one and back.
-        resources: what it needs for itself, or locks.
-        loop: of its container.
+        resources: what it needs exclusively, or what locks of it hold.
+        loop: the event loop of its container.
     """
 
     def forward(*args: Any, **kwargs: Any) -> Any:
@@ -120,6 +120,6 @@ def passed_on_service(
 
 
 def _effect(named: str) -> Effect:
-    """What it is called by; a word that this version does not know is taken for the one that needs most rights."""
+    """The effect of that name; an unknown one counts as the effect that needs most rights."""
     known: dict[str, Effect] = {"read": "read", "note": "note", "stop": "stop"}
     return known.get(named, "actuate")

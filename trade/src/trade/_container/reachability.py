@@ -1,4 +1,4 @@
-"""Whom a container has found, and at which of the endpoints that it dials there is nobody."""
+"""Reachability: the containers that one has found, and the dialled endpoints at which it found none."""
 
 import time
 from typing import Final
@@ -14,43 +14,43 @@ __all__ = ["Reachability", "look_around"]
 
 _LOOK_S: Final = 0.02
 _HIDDEN: Final = (
-    "there is a link, and nobody shows himself to {identity}; is its certificate revoked, does the policy there not "
-    "know it, or is it another system than {system} there?"
+    "the link is up, but no container is visible to {identity}. Is its certificate revoked, is it unknown to the "
+    "policy there, or is the system there another one than {system}?"
 )
 
 
 class Reachability(Struct, frozen=True):
-    """Whom a container has found so far."""
+    """The containers that one has found so far."""
 
     others: tuple[str, ...]
-    """The other containers (``identity/container``) that are there."""
+    """The other present containers (``identity/container``)."""
     silent: tuple[str, ...] = ()
-    """Those of them that have not said yet what is theirs."""
+    """The present containers that have not listed their services yet."""
     apart: dict[str, str] = {}
-    """The endpoints of ``Settings.connect`` where nobody was found, and why, as far as is known."""
+    """The endpoints of ``Settings.connect`` where no container was found, and the reasons, as far as is known."""
 
     @property
     def unanswered(self) -> tuple[str, ...]:
-        """The same in words, as errors tell it."""
+        """These endpoints and reasons, as text for errors."""
         return tuple(f"{endpoint} (TRADE_CONNECT): {why}" for endpoint, why in self.apart.items())
 
     @property
     def complete(self) -> bool:
-        """Whether somebody was found, at each endpoint, and all have said what is theirs."""
+        """Whether it found a container at each endpoint, and all have listed their services."""
         return bool(self.others) and not self.silent and not self.apart
 
     def nobody(self, system: str, so: str = "") -> NobodyFound:
-        """The error of who could not be told something.
+        """The error of a request that has no reliable answer, because containers are missing.
 
         Args:
-            system: where it was asked.
-            so: what cannot be told therefore.
+            system: the system of the request.
+            so: what is unknown therefore.
         """
         return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
 
 
 def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Reachability:
-    """Wait until it is complete, for ``limit_s`` seconds at most; what it is then."""
+    """Waits until it is complete, at most ``limit_s`` seconds, and returns it."""
     until = time.monotonic() + limit_s
     while not (found := _reachability(registry, reach, own)).complete and time.monotonic() < until:
         time.sleep(_LOOK_S)
@@ -68,7 +68,7 @@ def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Rea
 
 
 def _apart(reach: Dialer, own: Address, system: str, found: Reachability) -> dict[str, str]:
-    """Those without a link, and why; an endpoint may be linked by a link that leads from there to here."""
+    """The endpoints without a link, and why; a link from there to here counts, too."""
     reasons = {endpoint: reach.why_apart(endpoint, certain=not found.others) for endpoint in found.apart}
     apart = {endpoint: why for endpoint, why in reasons.items() if why}
     if not found.others:

@@ -1,4 +1,4 @@
-"""Registering objects, altering and withdrawing them."""
+"""The registration methods of a container: register, alter and deregister providers."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -37,19 +37,19 @@ class Registering:
         implements: Sequence[type] = (),
         meta: Mapping[str, Scalar] | None = None,
     ) -> tuple[Handle, ...]:
-        """Offer an object's services to the whole system.
+        """Offers an object's services to the whole system.
 
         Args:
             provider: an object whose class, bases or interfaces have ``@service`` methods.
             groups: dotted labels such as ``"rosie.head"``.
-            implements: interfaces (protocols) the object fits without inheriting from them.
-            meta: numbers, texts, booleans by name; holds for all its services, over what they say themselves.
+            implements: interfaces (protocols) that the object fits without inheriting from them.
+            meta: numbers, texts and booleans by name, for all its services; they override the services' own metadata.
 
         Returns:
             Handles of its services.
 
         Raises:
-            ConfigurationError: nothing to offer, a type that cannot be sent, a malformed group, or it is registered
+            ConfigurationError: it has no services, a type cannot be sent, a group is malformed, or it is registered
                 already.
             AccessDenied: the policy does not let this container offer it in one of these groups.
         """
@@ -61,29 +61,29 @@ class Registering:
         return tuple(self._lookup.handle(key) for key in keys)
 
     def register_functions(self, functions: object, name: str) -> tuple[Handle, ...]:
-        """Offer further functions of the middleware in group ``trade``; what they need is in the table of access.
+        """Offers further services of the middleware in group ``trade``; the access table lists the rights they need.
 
         Args:
             functions: an object with services.
-            name: of the provider; one name, one object.
+            name: the provider's name, of one object only.
         """
         return tuple(self._lookup.handle(key) for key in self._providers.add(functions, (DOMAIN,), name=name))
 
     def deregister(self, provider: object) -> None:
-        """Withdraw an object's services from the whole system; handles of them fail from now on.
+        """Withdraws an object's services from the whole system; handles of them fail from now on.
 
-        What it moves is stopped first, because afterwards nobody could. It is withdrawn even if that fails.
+        Its motion is stopped first, because afterwards no client could. It is withdrawn even if that fails.
 
         Raises:
             ConfigurationError: it is not registered here.
         """
         if not self._withdrawn.forget(provider):
             for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
-                _logger.error("withdrawn without having been stopped: %s", problem)
+                _logger.error("a provider was withdrawn but could not be stopped: %s", problem)
             self._providers.remove(provider)
 
     def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
-        """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
+        """Puts a registered provider into other groups. Handles stay valid, since its place does not change.
 
         Raises:
             ConfigurationError: a malformed group, or it is not registered here.
@@ -93,32 +93,32 @@ class Registering:
         self._alter(provider, lambda info: structs.replace(info, groups=named))
 
     def add_group(self, provider: object, group: str) -> None:
-        """Put a live provider into one more group. Raises like `set_groups`."""
+        """Puts a registered provider into one more group. Raises like `set_groups`."""
         [named] = checked_groups(provider, (group,))
         self._alter(provider, lambda info: structs.replace(info, groups=tuple(dict.fromkeys((*info.groups, named)))))
 
     def remove_group(self, provider: object, group: str) -> None:
-        """Take a live provider out of a group; one it is not in is fine. Raises like `set_groups`."""
+        """Takes a registered provider out of a group; other groups are ignored. Raises like `set_groups`."""
         self._alter(
             provider,
             lambda info: structs.replace(info, groups=tuple(known for known in info.groups if known != group)),
         )
 
     def set_health(self, provider: object, health: str = HEALTHY) -> None:
-        """Say what is wrong with a provider, such as ``"degraded: overheating"``, or that nothing is any more.
+        """Reports a provider's problem, such as ``"degraded: overheating"``, or that it is healthy again.
 
         Raises:
-            ConfigurationError: no text, or it is not registered here.
+            ConfigurationError: the health is not a text, or it is not registered here.
         """
         said = checked_health(provider, health)
         self._alter(provider, lambda info: structs.replace(info, health=said))
 
     def alter(self, provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
-        """Read a live provider again, as if it were registered anew: its class's marks, its resources. Handles hold.
+        """Reads a registered provider again: its class's ``@service`` marks and its resources. Handles stay valid.
 
         Args:
             provider: the object.
-            meta: instead of the metadata it was registered with; by default that stays.
+            meta: replaces its metadata; by default that stays.
 
         Raises:
             ConfigurationError: like `register`, or it is not registered here.

@@ -1,4 +1,4 @@
-"""The end of a container because somebody asks for it from anywhere."""
+"""The shutdown of a container on request of any client."""
 
 import logging
 import threading
@@ -15,7 +15,7 @@ _LOOK_EVERY_S: Final = 0.01
 
 
 class Shutdown:
-    """Brings what moves to rest at once, then closes the container as soon as whoever asked has been answered."""
+    """Stops all motion at once, then closes the container when the client has its answer."""
 
     def __init__(
         self,
@@ -30,14 +30,14 @@ class Shutdown:
         self._resources = resources
         self._running = running
         self.close = close
-        """What ends it; a program that lives for its container puts its own end here, which closes the container."""
+        """Closes it; a program that exists for its container replaces this with its own end, which closes it, too."""
         self._first = threading.Lock()
 
     def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]:
-        """Stop what moves, and see to it that the container closes; what could not be stopped, and why.
+        """Stops all motion, and closes the container afterwards; returns what could not be stopped, and why.
 
         Raises:
-            InUse: something is locked or moves, and it was to end ``only_at_rest``; nothing was done.
+            InUse: a resource is locked or moves, with ``only_at_rest``; nothing was done.
         """
         if only_at_rest and (uses := _uses(self._resources())):
             raise InUse(container=self._name, uses=uses)
@@ -55,7 +55,7 @@ class Shutdown:
 
 
 def _uses(resources: Sequence[Resource]) -> list[str]:
-    """What speaks against an end, a text for each resource."""
+    """The resources in use, as text."""
     uses: list[str] = []
     for resource in resources:
         holder = resource.pending or resource.holder

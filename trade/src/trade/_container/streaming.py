@@ -1,4 +1,4 @@
-"""Listening: services are sampled for a container as long as it does."""
+"""The stream methods of a container: a service is sampled while the stream is open."""
 
 import contextlib
 import logging
@@ -20,11 +20,11 @@ from trade.errors import ConfigurationError, ServiceGone, SourceLost
 _logger = logging.getLogger("trade")
 
 _MOST_KEPT = 100_000
-_AGAIN: Final = "; trade.joined(where(...), call=listen, existing=True) has another one opened whenever it comes again"
+_AGAIN: Final = ". trade.joined(where(...), call=listen, existing=True) can open another stream when it is back"
 
 
 class Streaming:
-    """Streams that this container has opened."""
+    """The streams of this container."""
 
     def __init__(self, lookup: Lookup, subscriptions: Subscriptions, scheduler: Scheduler) -> None:
         self._lookup = lookup
@@ -41,25 +41,24 @@ class Streaming:
         call: What | None = None,
         keep: int = 16,
     ) -> Stream:
-        """Have a service sampled as long as one listens: ``with container.stream(state, hz=20) as samples:``.
+        """Samples a service while the stream is open: ``with container.stream(state, hz=20) as samples:``.
 
-        It is called by its own container, once for all who listen, as often as the quickest of them asks; while nobody
-        listens it is not called at all. The stream ends with `Stream.close`, the session it was opened in, or this
-        container.
+        Its own container calls it, once for all subscribers, at the highest of their rates; without subscribers it is
+        not called at all. The stream ends with `Stream.close`, the session that opened it, or this container.
 
         Args:
-            target: a service that only reads and needs no arguments, or a constraint that one such fits.
-            hz: how many samples a second at most, from 0.001 to 1000.
+            target: a service that only reads and needs no arguments, or a constraint that one such service matches.
+            hz: the most samples per second, from 0.001 to 1000.
             on_change: only samples that differ from the one before.
-            if_: only samples whose value this answers True for; a function of this process.
-            call: call this with the value of each instead of keeping them: a handle, a bound call, a constraint that
-                one service fits, or a function. One at a time; who is slow is given the newest.
-            keep: how many wait to be taken; the oldest goes first.
+            if_: only samples for whose value this returns True; a function of this process.
+            call: call this with each value instead of buffering them: a handle, a bound call, a constraint that one
+                service matches, or a function. One call at a time; a slow one gets the newest value.
+            keep: how many samples are buffered; the oldest is dropped first.
 
         Raises:
-            NoSuchService, TooManyServices: no service fits, or more than one.
+            NoSuchService, TooManyServices: no service matches, or more than one.
             AccessDenied: the policy does not let this container read it.
-            ConfigurationError: it cannot be sampled; no such rate; nothing that can be called.
+            ConfigurationError: it cannot be sampled, the rate is not valid, or ``call`` is not callable.
             ServiceGone: it was deregistered.
         """
         _check("hz", hz, LEAST_HZ, MOST_HZ)
@@ -82,7 +81,7 @@ class Streaming:
 
 
 class _Push:
-    """Calls something with each value of a stream, one at a time."""
+    """Calls a target with each value of a stream, one at a time."""
 
     def __init__(self, lookup: Lookup, stream: Stream, target: Target, scheduler: Scheduler) -> None:
         self._lookup = lookup
@@ -91,7 +90,7 @@ class _Push:
         self._problem = ""
         due = scheduler.due(self._act)
         stream.tell(lambda: due.at(time.monotonic_ns()))
-        due.at(time.monotonic_ns())  # some may have come already
+        due.at(time.monotonic_ns())  # samples may have arrived already
 
     def _act(self) -> None:
         while True:
@@ -101,7 +100,7 @@ class _Push:
                     return
                 self._do(sample.value)
                 self._problem = ""
-            except BaseException as error:  # noqa: BLE001 - whatever it raises ends nothing
+            except BaseException as error:  # noqa: BLE001 - an error of the target must not end the stream
                 over = error is self._stream.why_ended
                 if not (over and isinstance(error, ConfigurationError)):  # closed on purpose
                     self._failed(error)
@@ -122,7 +121,7 @@ class _Push:
 
     def _failed(self, error: BaseException) -> None:
         kind = type(error).__name__
-        if kind != self._problem:  # the same again says nothing new, whatever numbers are in its text
+        if kind != self._problem:  # a repeated kind of error is not logged again
             hint = _AGAIN if isinstance(error, SourceLost | ServiceGone) else ""
             _logger.warning("a sample of %r was not passed on: %s: %s%s", self._stream, kind, error, hint)
         self._problem = kind

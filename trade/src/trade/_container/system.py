@@ -1,4 +1,4 @@
-"""The middleware's own functions as services, in group ``trade`` of every container."""
+"""The middleware's own services about a container, in group ``trade`` of every container."""
 
 import contextlib
 import time
@@ -45,7 +45,7 @@ class _Terminating(Protocol):
 
 
 class _Member(Protocol):
-    """The container the switches belong to."""
+    """The container that is controlled."""
 
     address: Final[Address]
     meter: LoadMeter
@@ -69,45 +69,45 @@ class _Member(Protocol):
 
 
 class System:
-    """Switches of a running container: whom it is linked to, and whether it finds and is found.
+    """The controls of a running container: its links, its discovery, its providers and its end.
 
-    None of them disturbs calls under way, and each is a service in group ``trade`` of every container as well.
+    None of them disturbs calls under way. Each is also a service in group ``trade`` of every container.
     """
 
     def __init__(self, member: Callable[[], _Member]) -> None:
         self._member = member
 
     def set_discovery(self, on: bool) -> None:
-        """Look for containers of this system that broadcast, and link to each; off: what is linked stays linked.
+        """Switches discovery: links to all containers of this system that broadcast; existing links stay.
 
-        It looks as far as the container listens: on this host, or on its networks.
+        It searches where the container listens: on this host, or on its networks.
         """
         self._member().reach.set_discovery(on)
 
     def set_broadcast(self, on: bool) -> None:
-        """Answer those who look for containers of this system."""
+        """Switches broadcasting: answers the discovery of other containers of this system."""
         self._member().reach.set_broadcast(on)
 
     def connect(self, endpoint: str) -> None:
-        """Link to the container that listens there, and again whenever the link is lost.
+        """Links to the container at an endpoint, and again whenever the link is lost.
 
         Args:
-            endpoint: such as ``tcp/127.0.0.1:7450`` or ``tcp/robot.example:7450``; names are looked up at every try.
+            endpoint: such as ``tcp/127.0.0.1:7450`` or ``tcp/robot.example:7450``; names are resolved at every attempt.
 
         Raises:
-            CannotConnect: nobody there lets us in.
+            CannotConnect: no container there accepts this one.
             ConfigurationError: no endpoint, or a network, with neither system id nor credentials (S21).
         """
         self._member().reach.connect(endpoint)
 
     def disconnect(self, endpoint: str) -> None:
-        """Dial an endpoint no more.
+        """Stops dialling an endpoint.
 
         Args:
-            endpoint: what was given to `connect`; the name of a container is understood, too.
+            endpoint: the endpoint that `connect` got, or the name of a container.
 
         Raises:
-            LinkStays: the link is there, and stays until one of its containers closes; it is dialled no more.
+            LinkStays: the link stays until one of its containers closes, but is not dialled again.
         """
         if any(info.name == endpoint for info in self.containers()):
             raise LinkStays(to=endpoint)
@@ -118,14 +118,14 @@ class System:
         return self._member().containers()
 
     def load(self) -> LoadInfo:
-        """How busy this container, its process and its host are."""
+        """The load of this container, its process and its host."""
         return self._member().meter.read()
 
     def deregister(self, service: Handle) -> str:
-        """Withdraw the provider of a service of this container, which keeps the object to register it again.
+        """Withdraws the provider of a service of this container, which keeps the object to register it again.
 
         Returns:
-            The name to `register` it by. Handles of its services fail from now on.
+            The name to `register` it with. Handles of its services fail from now on.
 
         Raises:
             ConfigurationError: it is not registered here, or is the middleware's own.
@@ -133,19 +133,19 @@ class System:
         member = self._member()
         home = service.key.address
         if home != member.address:
-            problem = f"it belongs to another container, or to an earlier boot; call deregister of {home.container}"
+            problem = f"it belongs to another container, or to an earlier epoch; call deregister of {home.container}"
             raise ConfigurationError(where=service.label, problem=problem)
         return member.withdrawn.take_off(service.key)
 
     def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
-        """Offer an object again that was deregistered through this container.
+        """Offers an object again that was deregistered through this container.
 
         Args:
             provider: the name that `deregister` returned.
-            groups: other groups than before.
+            groups: new groups, in place of the earlier ones.
 
         Returns:
-            Handles of its services; those from before stay dead.
+            Handles of its services; earlier handles stay stale.
 
         Raises:
             ConfigurationError: no such provider was deregistered, or a malformed group.
@@ -154,7 +154,7 @@ class System:
         return tuple(member.handle(key) for key in member.withdrawn.put_back(provider, groups))
 
     def withdrawn(self) -> list[WithdrawnInfo]:
-        """What `register` can offer again, by name."""
+        """The providers that `register` can offer again, by name."""
         return self._member().withdrawn.infos()
 
     def instantiate(
@@ -164,23 +164,23 @@ class System:
         groups: str | Sequence[str] = (),
         state: Any = None,
     ) -> tuple[Handle, ...]:
-        """Make an object of a class and offer its services.
+        """Creates an object of a class and offers its services.
 
         Args:
             class_path: such as ``mypkg.vision:Camera``; the container's ``instantiable`` must allow it.
             args: for its constructor, in order or by name; plain data.
             groups: as for `register`.
-            state: what another object of the class gave with ``save_state()``; this one takes it before anybody can
-                call it, and moves nothing (S18). None: it begins anew.
+            state: the result of another object's ``save_state()``; the new object takes it before any client can call
+                it, and moves nothing (S18). None: it starts without state.
 
         Returns:
             Handles of its services.
 
         Raises:
             NotInstantiable: the container's settings do not allow it; nothing was imported.
-            NoSuchClass: there is no such class there.
+            NoSuchClass: the container has no such class.
             CannotInstantiate: its module or its constructor raised, or it does not take the state.
-            ConfigurationError: nothing to offer, or a malformed group; what was made is closed again.
+            ConfigurationError: it has no services, or a group is malformed; the object is closed again.
         """
         member = self._member()
         making, named = member.making, (groups,) if isinstance(groups, str) else tuple(groups)
@@ -200,25 +200,25 @@ class System:
         ssh_config: Path | None = None,
         wait_s: float = 10.0,
     ) -> ContainerInfo:
-        """Start an empty container of this system on another host, and wait until it is seen here.
+        """Starts an empty container of this system on another host, and waits until it is visible here.
 
-        The ``ssh`` program does it, with the keys and the configuration of this user. Nothing is asked of people, and
-        only hosts whose key is known are talked to. What the container needs to come into the system (certificate,
-        policy, credentials) is set up there, or given in ``environment``, which others on either host may see.
+        It uses the ``ssh`` program with this user's keys and configuration, without prompts, and connects only to hosts
+        with a known key. What the container needs to join the system (certificate, policy, credentials) must exist on
+        the host, or is given in ``environment``, which others on either host may see.
 
         Args:
             host: ``HOST`` or ``USER@HOST``, as for ssh.
-            name: of the container.
-            allow: classes that may be made in it.
-            connect: endpoints it dials, as seen from there; none: what its environment says.
-            command: what ``trade`` is there; a path, or more words.
+            name: the container's name.
+            allow: classes that may be created in it.
+            connect: endpoints that it dials, as seen from there; none: those of its environment.
+            command: the ``trade`` command there; a path, or several words.
             environment: variables for it.
-            ssh_config: instead of the user's own.
-            wait_s: how long it may take to be seen, once it is up there.
+            ssh_config: a file to use instead of the user's own.
+            wait_s: how long it may take to become visible after its start.
 
         Raises:
             CannotStart: with the reason, and what to do.
-            ConfigurationError: what cannot be a host or a variable.
+            ConfigurationError: the host or a variable is not valid.
         """
         member = self._member()
         started = start(
@@ -231,113 +231,113 @@ class System:
             environment=environment,
             ssh_config=ssh_config,
         )
-        with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
+        with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
             member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
         found = next((info for info in self.containers() if info.epoch == started.epoch), None)
         if found is None:
             said = f"it is up there as process {started.pid}, and not seen here within {wait_s:g} s"
-            remedy = "tell it whom to dial (connect=...), and give it the credentials or certificates of this system"
+            remedy = "set its endpoints (connect=...), and give it the credentials or certificates of this system"
             raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
         return found
 
     def terminate(self, service: Handle) -> None:
-        """End a provider that `instantiate` made in this container: what it moves stops, then it is closed.
+        """Ends a provider that `instantiate` created in this container: its motion stops, then it is closed.
 
         ``close()`` of the object is called, if it has one.
 
         Raises:
-            ConfigurationError: it was not made by this container, or has ended.
+            ConfigurationError: this container did not create it, or it has ended.
             DeviceFault: it could not be stopped; it is offered as before.
         """
         self._member().making.terminate(service)
 
     def terminate_container(self, reason: str = "", *, only_at_rest: bool = False, who: str = "itself") -> list[str]:
-        """End this container: what moves stops, its services are withdrawn. Does not wait for its end.
+        """Ends this container: its motion stops, and its services are withdrawn. Does not wait for its end.
 
-        The process goes on, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
+        The process continues, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
 
         Args:
             reason: why, for people; it is logged.
-            only_at_rest: not while something of it is locked or moves.
-            who: asks for it; likewise.
+            only_at_rest: not while one of its resources is locked or moves.
+            who: the requesting client; it is logged.
 
         Returns:
             What could not be stopped, and why; it ends all the same.
 
         Raises:
-            InUse: it was to end ``only_at_rest``, and something is locked or moves.
+            InUse: a resource is locked or moves, with ``only_at_rest``.
         """
         return self._member().terminating.begin(reason, who, only_at_rest=only_at_rest)
 
     def load_policy(self, path: str) -> None:
-        """Go by another access policy, or by the same file as it is now; calls under way go on.
+        """Loads another access policy, or the same file again; calls under way continue.
 
         Args:
             path: of the policy, as this container's host sees it.
 
         Raises:
-            ConfigurationError: it is wrong, and says where; what was loaded before stays.
+            ConfigurationError: the policy is wrong; the message says where. The earlier policy stays in force.
         """
         self._member().load_policy(path)
 
 
 class SystemServices:
-    """What every container offers about itself."""
+    """The services of every container about itself."""
 
     def __init__(self, system: System) -> None:
         self._system = system
 
     @service(effect="read")
     def clock(self) -> int:
-        """Monotonic clock of this container, in nanoseconds; the basis of every expiry."""
+        """The monotonic clock of this container, in nanoseconds; the basis of every expiry."""
         return time.monotonic_ns()
 
     @service(effect="read")
     def containers(self) -> list[ContainerInfo]:
-        """The containers that this one knows of, itself included."""
+        """The containers that this one knows, itself included."""
         return self._system.containers()
 
     @service(effect="read")
     def load(self) -> LoadInfo:
-        """How busy this container, its process and its host are."""
+        """The load of this container, its process and its host."""
         return self._system.load()
 
     @service
     def deregister(self, service: Handle) -> str:
-        """Withdraw the provider of a service of this container; returns the name to register it by again."""
+        """Withdraws the provider of a service of this container; returns the name to register it with again."""
         return self._system.deregister(service)
 
     @service
     def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
-        """Offer an object again that was deregistered through this container, in other groups if some are given."""
+        """Offers an object again that was deregistered through this container, in other groups if given."""
         return self._system.register(provider, groups)
 
     @service(effect="read")
     def withdrawn(self) -> list[WithdrawnInfo]:
-        """What can be registered again, by name."""
+        """The providers that can be registered again, by name."""
         return self._system.withdrawn()
 
     @service
     def set_discovery(self, on: bool) -> None:
-        """Look for containers of the system that broadcast, and link to each."""
+        """Switches discovery: links to all containers of the system that broadcast."""
         self._system.set_discovery(on)
 
     @service
     def set_broadcast(self, on: bool) -> None:
-        """Answer those who look for containers of the system."""
+        """Switches broadcasting: answers the discovery of other containers of the system."""
         self._system.set_broadcast(on)
 
     @service
     def connect(self, endpoint: str) -> None:
-        """Link to the container that listens there; CannotConnect if nobody there lets this one in."""
+        """Links to the container at an endpoint; CannotConnect if no container there accepts this one."""
         self._system.connect(endpoint)
 
     @service
     def disconnect(self, endpoint: str) -> None:
-        """Dial an endpoint no more; LinkStays if a link is there, which only the end of a container ends."""
+        """Stops dialling an endpoint; LinkStays if its link exists, which stays until one of its containers ends."""
         self._system.disconnect(endpoint)
 
     @service
     def load_policy(self, path: str) -> None:
-        """Go by another access policy, or by its file as it is now; a wrong one leaves the old one running."""
+        """Loads another access policy, or the same file again; a wrong one leaves the earlier one in force."""
         self._system.load_policy(path)

@@ -1,4 +1,4 @@
-"""Looking at calls and log lines of the whole system."""
+"""The tracing methods of a container: spans and log lines of the whole system."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -19,53 +19,53 @@ NOT_TRACED: Final = "(not traced)"
 
 
 class Trace(Struct, frozen=True, kw_only=True):
-    """A call, and those it led to."""
+    """The trace of a call, and of the calls that it led to."""
 
     call_id: int
     asked: Span | None
-    """By who called; None if that was in the same container, or one that is not traced."""
+    """The caller's span; None if the caller was in the same container, or is not traced."""
     served: Span | None
-    """By who ran it; None if that one is not traced, or it never ran."""
+    """The callee's span; None if it is not traced, or the call never ran."""
     lines: tuple[LogLine, ...]
-    """Logged while it ran."""
+    """The log lines while it ran."""
     calls: tuple["Trace", ...]
-    """Those it made, in order."""
+    """The calls that it made, in order."""
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """What is known of it, the caller's side first."""
+        """Its known spans, the caller's first."""
         return tuple(span for span in (self.asked, self.served) if span is not None)
 
     @property
     def service(self) -> str:
-        """What was called; ``(not traced)`` if only calls are known that it led to."""
+        """The called service; ``(not traced)`` if only the calls that it led to are known."""
         return next((span.service for span in self.spans), NOT_TRACED)
 
     @property
     def began(self) -> float:
-        """``time.time()`` of the host that noted it."""
+        """Its start, by ``time.time()`` of the host that recorded it."""
         return next((span.began for span in self.spans), None) or min((call.began for call in self.calls), default=0.0)
 
 
 class SystemLookup(Protocol):
-    """Finds services of the system and calls them, as a container does."""
+    """Finds and calls services of the system, as a container does."""
 
     def services(self, constraint: Constraint | None = None) -> list[Handle]: ...
     def call_all(self, which: Constraint | Iterable[Handle | Bound], /) -> list[Outcome]: ...
 
 
 class LogReader:
-    """Reads on where it was: each line of the system once."""
+    """Reads the log lines of the system, each one once."""
 
     def __init__(self, lookup: SystemLookup, container: str) -> None:
         self._lookup = lookup
         self._where = where(name="log_lines", group=DOMAIN, container=container)
         self._read: dict[ServiceKey, int] = {}
         self._known: dict[str, int] = {}
-        """By process, the last line given."""
+        """The last returned line of each process."""
 
     def read(self) -> list[LogLine]:
-        """What came since the last time, in order of time by the clocks of their hosts.
+        """The lines since the last reading, in order of time by the clocks of their hosts.
 
         Raises:
             AccessDenied: the policy does not let this container read group ``trade``.
@@ -86,22 +86,23 @@ class LogReader:
 
 
 class Tracing:
-    """Notes of calls and log lines, from everywhere."""
+    """The spans and log lines of all containers."""
 
     def __init__(self, lookup: Lookup) -> None:
         self._lookup = lookup
 
     def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:
-        """Have containers note every call they make and serve, or no more; what was noted stays.
+        """Switches the tracing of all calls that containers make and serve on or off; earlier spans stay.
 
-        Each keeps its newest 10,000 notes. Those that start later do not know of it; `TRADE_TRACE=1` does that.
+        Each container keeps its newest 10,000 spans. This does not affect containers that start later; `TRADE_TRACE=1`
+        does.
 
         Args:
-            on: whether to.
-            container: which; ``*`` and ``?`` stand for anything.
+            on: whether to trace.
+            container: which; ``*`` and ``?`` match anything.
 
         Returns:
-            The names of those that do.
+            The names of the containers that were switched.
 
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
@@ -110,7 +111,7 @@ class Tracing:
         return sorted(outcome.handle.container for outcome in granted(outcomes))
 
     def spans(self, *, container: str = "*") -> list[Span]:
-        """What the containers noted of calls while they were traced, by time.
+        """The spans that the containers recorded while they were traced, by time.
 
         Raises:
             AccessDenied: the policy does not let this container ``read`` group ``trade``.
@@ -118,16 +119,16 @@ class Tracing:
         return self._spans_of(None, container)
 
     def trace(self, call_id: int) -> Trace:
-        """The whole tree that a call belongs to, from all containers, with what was logged in it.
+        """The whole tree of a call, from all containers, with its log lines.
 
-        Times are those of each host's clock on the wall: between hosts they are as good as these agree.
+        Times are of each host's wall clock, so they are comparable only as far as these clocks agree.
 
         Raises:
-            NoSuchCall: no container noted it, or not any more.
+            NoSuchCall: no container has recorded it, or it was dropped since.
             AccessDenied: the policy does not let this container ``read`` group ``trade``.
         """
         wanted, asked_for, spans = {call_id}, set[int](), list[Span]()
-        while wanted - asked_for:  # what a hook calls knows the call it watches, but not what led to that
+        while wanted - asked_for:  # a hook's call knows the observed call, but not the calls that led to it
             asked_for = set(wanted)
             spans = self._spans_of(sorted(wanted), "*")
             wanted.update(*(span.ids for span in spans))
@@ -136,9 +137,9 @@ class Tracing:
         return _tree(spans, self.logs())
 
     def logs(self, *, container: str = "*") -> list[LogLine]:
-        """What the processes of the system logged lately to the logger ``trade``, by the clocks of their hosts.
+        """The recent lines of the logger ``trade`` in all processes of the system, by the clocks of their hosts.
 
-        Each keeps its newest 2,000 lines, of those that its level lets pass.
+        Each process keeps its newest 2,000 lines of its log level.
 
         Raises:
             AccessDenied: the policy does not let this container ``read`` group ``trade``.
@@ -151,7 +152,7 @@ class Tracing:
 
 
 def granted(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Those that said something: who leaves meanwhile says nothing. Raises AccessDenied if one does not allow it."""
+    """The successful outcomes; containers that leave meanwhile have none. Raises AccessDenied if one forbids it."""
     found: list[Outcome] = []
     for outcome in outcomes:
         if isinstance(outcome.error, AccessDenied):
@@ -166,7 +167,7 @@ def _when(span: Span) -> tuple[float, int]:
 
 
 def _tree(spans: Sequence[Span], lines: Iterable[LogLine]) -> Trace:
-    """The tree of these spans, which have a call in common that led to all of them."""
+    """The tree of these spans, which share an outermost call."""
     known: dict[int, dict[str, Span]] = {}
     for span in spans:
         known.setdefault(span.call_id, {}).setdefault(span.side, span)

@@ -158,7 +158,7 @@ class BorderDirection:
                 if known is None:
                     self._offer(place, info)
                 elif structs.replace(info, revision=known.info.revision) != known.info:
-                    self._abroad.federating.tell_anew(known.provider, info)
+                    self._abroad.federating.update(known.provider, info)
                     known.info = info
             except TradeError as refused:
                 self._complain(place, str(refused))
