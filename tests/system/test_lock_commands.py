@@ -235,7 +235,7 @@ def test_where_there_is_a_link_and_nobody_it_may_be_another_system(
     door = start_container("door", listen=[free_endpoint()])
     said = trade_command("--system", "hoem", "--connect", door.settings.listen[0], "containers")
     assert said.returncode == 1
-    assert "or is it another system than hoem there?" in said.stderr
+    assert "or is the system there another one than hoem?" in said.stderr
 
 
 def test_resume_of_nothing_is_of_no_such_service(trade_command: Command) -> None:

@@ -167,7 +167,7 @@ def test_S22_what_is_beyond_the_limits_or_no_trajectory_is_refused_whole(
 def test_S22_it_begins_where_the_joints_are_or_not_at_all(head: Rig, group: JointGroup) -> None:
     group.enable()
     mark = written_now()
-    with pytest.raises(ToleranceExceeded, match="begin where it is") as refused:
+    with pytest.raises(ToleranceExceeded, match="Begin where it is") as refused:
         group.follow(through((0.0, [0.3, 0.0]), (1.0, [0.4, 0.0])))
     assert (refused.value.device, refused.value.what) == ("rosie.neck.pan", "start")
     assert refused.value.error_rad == pytest.approx(-0.3, abs=0.01)

@@ -164,7 +164,7 @@ def test_who_may_not_read_what_he_looks_for_is_told_that(policy: Path) -> None:
 def test_a_look_up_says_that_the_policy_hides_it(member: Member, neck: Neck, monkeypatch: pytest.MonkeyPatch) -> None:
     dash = member("dash")
     monkeypatch.setattr(dash.access, "_certified", True)
-    with pytest.raises(NoSuchService, match=r"dash may not read cellar: .*nothing of it is seen here"):
+    with pytest.raises(NoSuchService, match=r"dash may not read cellar: .*such services are hidden here"):
         dash.find(where(group="cellar", name="light"), wait_s=0)
 
 

@@ -97,5 +97,5 @@ def test_what_is_told_of_a_lock_and_is_cut_off_is_no_failure(
         me.close()
         closed.set()
         assert ended.wait(20)
-        wait_until(lambda: any("cut off as its own container closed" in one for one in caplog.messages))
+        wait_until(lambda: any("cut off, because its container closed" in one for one in caplog.messages))
     assert [one for one in caplog.records if one.levelno >= logging.WARNING] == []

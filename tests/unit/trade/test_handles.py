@@ -358,4 +358,4 @@ def test_whoever_is_told_of_an_end_and_fails_keeps_it_from_nobody(
     run.when_done(lambda _: told.append(1 // 0))
     run.when_done(lambda ended: told.append(ended.result()))
     assert told == [5]
-    assert "has ended failed" in caplog.text
+    assert "a callback at the end of" in caplog.text

@@ -117,7 +117,7 @@ def test_S13_what_a_lock_selects_and_does_not_hold_is_not_commanded_under_it(rob
         assert (lock.resources, lock.missing) == (("a",), ("group='robot.c'",))
         joint = comes(robot, "c")
         handle = robot.find("c")
-        with pytest.raises(NotLocked, match=r"robot\.c\.move.*take the lock again"):
+        with pytest.raises(NotLocked, match=r"robot\.c\.move.*Release the lock and take it again"):
             command(lock, handle)
         assert joint.written == []
         assert command(lock, robot.find("a")) == 0.9  # what it holds
