@@ -42,7 +42,7 @@ CHECKS = [
     ("planner", "call", "rosie", 1, "denied: no rule of role operator allows call in rosie"),
     ("dash-1", "read", "_", 0, "allowed: role viewer: read *"),
     ("thief", "read", "rosie", 1, "denied: thief is revoked"),
-    ("dash-1", "call", "trade.clock", 0, "allowed: everybody may"),
+    ("dash-1", "call", "trade.clock", 0, "allowed: every identity may"),
     ("dash-1", "call", "trade.connect", 1, "denied: no rule of role viewer allows administer in trade"),
     ("dash-1", "lock", "trade.clock", 1, "denied: no rule of role viewer allows lock in trade.clock"),
 ]

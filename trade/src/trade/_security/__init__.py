@@ -1,1 +1,1 @@
-"""Access policies, the decisions they lead to, and certificates."""
+"""Access policies, the decisions that follow from them, and certificates."""

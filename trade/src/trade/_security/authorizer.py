@@ -1,7 +1,7 @@
-"""What the access policy means for one container: who may call, offer and lock here, and what it may do elsewhere.
+"""Authorises calls, offers and locks of one container by the access policy.
 
-A call is judged twice, by whoever makes it and by whoever serves it, and by the same rules. It is made, and judged, as
-the identity of the container that makes it; for whom that one acts gives it no rights and takes none away.
+Each call is checked twice, by its caller and by its provider, with the same rules. It is authorised as the identity of
+the calling container. Acting on behalf of another client neither adds nor removes rights.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,35 +20,35 @@ FUNCTIONS: Final = {
     "load": _ALL,
     "withdrawn": _ALL,
     "locks": _ALL,
-    "renew": _ALL,  # only what is one's own
-    "release": _ALL,  # only what is one's own
+    "renew": _ALL,  # own ones only
+    "release": _ALL,  # own ones only
     "request_release": _ALL,
     "release_requested": _ALL,
     "estop": _ALL,
     "estops": _ALL,
-    "notify": "instrument",  # and the right to make the call, looked at whenever it is made
+    "notify": "instrument",  # and the right to make the call, checked at each call
     "notifications": _ALL,
-    "cancel_notification": _ALL,  # asks itself for administer if it is another's
+    "cancel_notification": _ALL,  # checks administer itself for another owner's
     "detach_notification": _ALL,  # likewise
     "notification_failed": _ALL,
-    "attach_hook": _ALL,  # asks itself for instrument over each service
-    "detach_hook": _ALL,  # asks itself for administer if it is another's
+    "attach_hook": _ALL,  # checks instrument itself over each service
+    "detach_hook": _ALL,  # checks administer itself for another owner's
     "hooks": _ALL,
     "hook_suspended": _ALL,
     "set_tracing": "instrument",
     "spans": "read",
     "log_lines": "read",
-    "listen": _ALL,  # asks itself for read over the service
-    "unlisten": _ALL,  # only what is one's own
-    "acquire": _ALL,  # asks itself for lock over the groups of the resources
-    "break_lock": _ALL,  # asks itself for administer over them
-    "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
-    "migrate": _ALL,  # asks itself for administer over the groups of the provider
+    "listen": _ALL,  # checks read itself over the service
+    "unlisten": _ALL,  # own ones only
+    "acquire": _ALL,  # checks lock itself over the groups of the resources
+    "break_lock": _ALL,  # checks administer itself over them
+    "resume": _ALL,  # checks administer itself over other owners' locks
+    "migrate": _ALL,  # checks administer itself over the groups of the provider
     "save_state": _ALL,  # likewise
     "restore_state": _ALL,  # likewise
-    "prepare_arrival": _ALL,  # asks itself for register over the groups of the provider
-    "arrive": _ALL,  # only what is one's own; likewise
-    "arrived": _ALL,  # only what is one's own
+    "prepare_arrival": _ALL,  # checks register itself over the groups of the provider
+    "arrive": _ALL,  # own ones only; likewise
+    "arrived": _ALL,  # own ones only
     "deregister": "administer",
     "register": "administer",
     "instantiate": "administer",
@@ -62,68 +62,68 @@ FUNCTIONS: Final = {
     "load_policy": "administer",
     "estop_clear": "administer",
 }
-"""What the middleware's own functions need over group ``trade``; empty: open to everybody who is not revoked."""
+"""The verb that each of the middleware's functions needs over group ``trade``; empty: any identity not revoked."""
 
 SOME_HAVE: Final = {
     "children": "read",
     "restart_child": "administer",
     "hand_back_child": "administer",
-    "lease_child": _ALL,  # asks itself for the gateway that is stood in for
+    "lease_child": _ALL,  # checks itself for the gateway that it replaces
     "keep_child": _ALL,  # likewise
 }
-"""Likewise, of functions that only a container has which looks after others."""
+"""Likewise, for functions of containers that supervise others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
 _OF_EVERYBODY: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor")
-"""The providers of these functions: who offers them needs no right, as whoever calls them is asked for one."""
+"""The providers of these functions: offering them needs no right, as each of their callers is checked."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}
-"""What other services need over their group, by effect; a stop is open to everybody (S07)."""
+"""The verb that other services need over their group, by effect; a stop is open to every identity (S07)."""
 
 
 def verb_of(domain: str, name: str, effect: str) -> str:
-    """What a service of a group asks of its callers over that group; empty: nothing but not to be revoked."""
+    """The verb that a service requires over its group; empty: the caller only must not be revoked."""
     return _ALL_FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
 
 
 def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:
-    """Whether somebody may call a service of a group. Returns the verb that it needs, and the decision."""
+    """Whether an identity may call a service of a group: the verb that the call needs, and the decision."""
     verb = verb_of(domain, name, effect)
     return (verb, policy.decide(who, verb, domain)) if verb else ("call", policy.authenticated(who))
 
 
 class Authorizer:
-    """The policy a container goes by; without one everybody may do everything."""
+    """Applies the policy of one container; without a policy every identity may do everything."""
 
     def __init__(self, path: Path | None = None, *, certified: bool = False) -> None:
-        """Read the policy; ``certified``: links tell who is who. Raises ConfigurationError: it is wrong."""
+        """Read the policy; ``certified``: links prove identities. Raises ConfigurationError: the policy is wrong."""
         self._certified = certified
         self.policy: Policy | None = None
         self.path: Path | None = None
-        """Where it was read from."""
+        """The file that it was read from."""
         self._files: tuple[Path, ...] = ()
         self.seen: Seen = ()
-        """What its files were like before they were read."""
+        """The state of its files before they were read."""
         if path is not None:
             self.load(path)
 
     def load(self, path: Path) -> None:
-        """Go by another one from now on. Raises ConfigurationError: it is wrong, and the old one stays."""
+        """Replace the policy. Raises ConfigurationError: the new one is wrong, and the old one stays."""
         files = policy_files(path.absolute())
         seen = look_at(files)
         self.policy = read_policy(path)
         self.path, self._files, self.seen = path.absolute(), files, seen
 
     def look(self) -> Seen:
-        """What its files are like now."""
+        """The current state of its files."""
         return look_at(self._files)
 
     def callers(self) -> list[str]:
-        """Who can call, one by one; nobody where that cannot be told."""
+        """The identities that can call; empty where identities are not proven."""
         policy = self.policy if self._certified else None
         return [] if policy is None else [*policy.names(), *policy.gateways]
 
     def hidden(self, who: str, group: str) -> str:
-        """Why it is not told what there is in a group, in words of the policy; empty: it is, as far as is known."""
+        """Why the contents of a group are hidden from an identity, in the policy's words; empty: they are not."""
         if self.policy is None or not self._certified or group in ("", DOMAIN):
             return ""
         decision = self.policy.decide(who, "read", group)
@@ -134,12 +134,12 @@ class Authorizer:
     def denied_call(
         self, policy: Policy, who: str, domain: str, name: str, effect: str, what: str
     ) -> AccessDenied | None:
-        """Why somebody may not call a service; None if it may."""
+        """Why an identity may not call a service; None if it may."""
         verb, decision = decide_call(policy, who, domain, name, effect)
         return None if decision.allowed else AccessDenied(who=who, verb=verb, what=what, rule=decision.rule)
 
     def require_call(self, who: str, domain: str, name: str, effect: str, what: str) -> None:
-        """Raises AccessDenied: it may not call the service."""
+        """Raises AccessDenied: the identity may not call the service."""
         if self.policy is not None:
             denied = self.denied_call(self.policy, who, domain, name, effect, what)
             if denied is not None:
@@ -148,15 +148,15 @@ class Authorizer:
     # --- everything else
 
     def require(self, who: str, verb: str, group: str, what: str) -> None:
-        """Raises AccessDenied: it may not do that in the group."""
+        """Raises AccessDenied: the identity does not have the verb over the group."""
         self.require_any(who, verb, (group,), what)
 
     def denied(self, who: str, verb: str, group: str, what: str) -> AccessDenied | None:
-        """Why it may not do that in the group; None if it may."""
+        """Why the identity does not have the verb over the group; None if it has."""
         return self._denied_all(who, verb, (group,), what)
 
     def require_any(self, who: str, verb: str, groups: Iterable[str], what: str) -> None:
-        """Raises AccessDenied: it may do that in none of the groups."""
+        """Raises AccessDenied: the identity has the verb over none of the groups."""
         denied = self._denied_all(who, verb, groups, what)
         if denied is not None:
             raise denied
@@ -164,7 +164,7 @@ class Authorizer:
     def _denied_all(self, who: str, verb: str, groups: Iterable[str], what: str) -> AccessDenied | None:
         if self.policy is None:
             return None
-        rule = f"nothing that is offered uses {what}"
+        rule = f"no offered service uses {what}"
         for group in sorted(groups):
             decision = self.policy.decide(who, verb, group)
             if decision.allowed:
@@ -173,12 +173,12 @@ class Authorizer:
         return AccessDenied(who=who, verb=verb, what=what, rule=rule)
 
     def denied_lock(self, who: str, resources: Iterable[tuple[str, Iterable[str]]]) -> AccessDenied | None:
-        """Why somebody may not lock these, told with the groups of the services that use each; None if it may."""
+        """Why an identity may not lock resources, each given with the groups that use it; None if it may."""
         denials = (self._denied_all(who, "lock", groups, name) for name, groups in resources)
         return next((denied for denied in denials if denied is not None), None)
 
     def denied_order(self, who: str, *, clears: bool) -> AccessDenied | None:
-        """Why an e-stop order is not heeded: everybody may stop, and who clears has to administer the system."""
+        """Why an e-stop order is refused: any identity may stop, but only an administrator of the system may clear."""
         if self.policy is None:
             return None
         verb = "administer" if clears else "call"
@@ -186,11 +186,11 @@ class Authorizer:
         return None if decision.allowed else AccessDenied(who=who, verb=verb, what="estop", rule=decision.rule)
 
     def may_have_stops(self, who: str) -> bool:
-        """Whether an identity may offer anything at all: else it has nothing to stop."""
+        """Whether an identity may offer any service: otherwise it has nothing to stop."""
         return self.policy is None or bool(self.policy.groups_of(who, ("register",)))
 
     def may_offer(self, who: str, domain: str, provider: str, groups: Sequence[str]) -> bool:
-        """Whether an identity may have offered what a registry entry tells of: its own functions, and what it may."""
+        """Whether an identity may offer what a registry entry describes: own functions, or what the policy allows."""
         if self.policy is None:
             return True
         if domain == DOMAIN and provider in _OF_EVERYBODY and tuple(groups) == (DOMAIN,):
@@ -198,6 +198,6 @@ class Authorizer:
         return all(self.policy.decide(who, "register", group).allowed for group in (domain, *groups))
 
     def require_offer(self, who: str, groups: tuple[str, ...], what: str) -> None:
-        """Raises AccessDenied: it may not offer something in all of these groups."""
+        """Raises AccessDenied: the identity may not offer something in all of these groups."""
         for group in groups or (domain_of(groups),):
             self.require(who, "register", group, f"{what} in {group}")

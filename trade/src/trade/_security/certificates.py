@@ -1,7 +1,7 @@
-"""Certificates: who a container is, proven on every link, and how the transport is given them.
+"""Certificates: they prove a container's identity on every link; also their settings for the transport.
 
-Whether the files of a folder fit together is found out by a handshake with ourselves, in memory, before anything opens:
-the transport itself says nothing of what is wrong with them.
+A handshake with ourselves, in memory, checks that the files of a folder fit together before anything opens: the
+transport does not report what is wrong with them.
 """
 
 import contextlib
@@ -28,9 +28,9 @@ _KEY: Final = "key.pem"
 _MARKS: Final = {_CA: "BEGIN CERTIFICATE", _CERTIFICATE: "BEGIN CERTIFICATE", _KEY: "PRIVATE KEY"}
 _OTHERS: Final = 0o007
 _FLIGHTS: Final = 4
-"""More than a handshake has in either direction."""
+"""More flights than a handshake has in either direction."""
 _REFUSALS: Final = {
-    9: "is not valid yet; is the clock of this host right?",
+    9: "is not valid yet. Is the clock of this host right?",
     10: "has expired, or its authority has; renew it: trade pki issue NAME",
     26: "may not be used for both ends of a link; issue it with trade pki issue NAME",
 }
@@ -40,41 +40,41 @@ _ISSUE: Final = "trade pki issue NAME makes a folder that has all three"
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a folder with ``ca.pem``, ``cert.pem`` and ``key.pem`` says of its container."""
+    """The contents of a folder with ``ca.pem``, ``cert.pem`` and ``key.pem``."""
 
     folder: Path
     identity: str
-    """Its common name."""
+    """The common name of the certificate."""
     hosts: frozenset[str]
-    """Names and addresses under which its container may be dialled."""
+    """Names and addresses under which other containers may dial this one."""
     until: datetime
 
     @classmethod
     def read(cls, folder: Path) -> "Certificate":
-        """Raises ConfigurationError: a file is missing, or others do not accept the certificate; says which and why."""
+        """Raises ConfigurationError: a file is missing, or peers would reject the certificate; names file and cause."""
         for name, mark in _MARKS.items():
             _check_file(folder / name, mark)
         fields = _proven(folder)
         names = [text for part in fields["subject"] for kind, text in part if kind == "commonName"]
         if len(names) != 1 or not is_chunk(names[0]):
-            problem = f"has the common name {', '.join(names) or 'of nobody'}, which is no identity; {_ISSUE}"
+            problem = f"has the common name {', '.join(names) or '(none)'}, which is no identity; {_ISSUE}"
             raise ConfigurationError(where=str(folder / _CERTIFICATE), problem=problem)
         until = datetime.fromtimestamp(ssl.cert_time_to_seconds(fields["notAfter"]), timezone.utc)
         hosts = frozenset(_plain(host) for _, host in fields.get("subjectAltName", ()))
         return cls(folder, names[0], hosts, until)
 
     def check_is_for(self, host: str) -> None:
-        """Raises ConfigurationError: whoever dials that host would not accept it."""
+        """Raises ConfigurationError: a peer that dials this host would reject the certificate."""
         if _plain(host) not in self.hosts:
             problem = (
-                f"is for {', '.join(sorted(self.hosts)) or 'no host'}, not for {host}, so nobody would link to it "
+                f"is for {', '.join(sorted(self.hosts)) or 'no host'}, not for {host}, so no peer would link to it "
                 f"there; add it: trade pki issue {self.identity} --address {host} (or --host, for a name)"
             )
             raise ConfigurationError(where=str(self.folder / _CERTIFICATE), problem=problem)
 
 
 def transport_settings(certificate: Certificate) -> dict[str, Any]:
-    """The same as zenoh names it: both ends show certificates, and a link ends when one of them expires."""
+    """The certificate in zenoh's settings: both ends present certificates, and a link ends when one of them expires."""
     key, shown = (str(certificate.folder / name) for name in (_KEY, _CERTIFICATE))
     return {
         "root_ca_certificate": str(certificate.folder / _CA),
@@ -89,7 +89,7 @@ def transport_settings(certificate: Certificate) -> dict[str, Any]:
 
 
 def line_context(certificate: Certificate, *, server: bool) -> ssl.SSLContext:
-    """What the stop line is encrypted with: both ends show certificates, and who dials looks at the name."""
+    """The TLS context of the stop line: both ends present certificates, and the client checks the server's name."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
@@ -99,21 +99,21 @@ def line_context(certificate: Certificate, *, server: bool) -> ssl.SSLContext:
 
 
 def common_name(sock: ssl.SSLSocket) -> str:
-    """Who is at the other end, by the certificate it has proven; empty: by none that is an identity."""
+    """The identity at the other end, from its verified certificate; empty if that contains no valid identity."""
     fields = cast("dict[str, Any]", sock.getpeercert() or {})
     names = [text for part in fields.get("subject", ()) for kind, text in part if kind == "commonName"]
     return names[0] if len(names) == 1 and is_chunk(names[0]) else ""
 
 
 def authority(settings: dict[str, Any]) -> bytes:
-    """What all of one authority have in common and nobody hears on the network."""
+    """A secret common to all containers of one authority, which never travels over the network."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(settings["root_ca_certificate"])
     return hashlib.sha256(b"".join(sorted(context.get_ca_certs(binary_form=True)))).digest()
 
 
 def _plain(host: str) -> str:
-    """An address in its one form, or a name."""
+    """An address in its canonical form, or a name."""
     try:
         return str(ipaddress.ip_address(host.strip("[]")))
     except ValueError:
@@ -137,7 +137,7 @@ def _check_file(path: Path, mark: str) -> None:
 
 
 def _closed(path: Path) -> str:
-    """What keeps this user from reading a file, and what helps."""
+    """Why this user cannot read a file, and what to do."""
     folder = next((above for above in reversed(path.absolute().parents) if not os.access(above, os.X_OK)), None)
     what, mode = (path, "0640") if folder is None else (folder, "0750")
     try:
@@ -186,13 +186,13 @@ def _refusal(refused: ssl.SSLCertVerificationError) -> str:
 _logger = logging.getLogger("trade")
 
 _TOLD: Final = (timedelta(days=1), timedelta(hours=1))
-"""How long before the end it is told, each once; what has passed already at the start is told as one."""
+"""Times before the end at which a warning is logged, each once; times already past at the start cause one warning."""
 _LOOK_S: Final = 600.0
-"""A computer that slept finds out by then what time it is."""
+"""A computer that slept checks the time again within this interval."""
 
 
 class ExpiryWatch:
-    """Warns until it is closed."""
+    """Warns before the certificate expires, until it is closed."""
 
     def __init__(self, certificate: Certificate) -> None:
         self._certificate = certificate
@@ -219,9 +219,8 @@ class ExpiryWatch:
             self._told = due
             who, until = self._certificate.identity, f"{self._certificate.until:%Y-%m-%d %H:%M} UTC"
             _logger.warning(
-                "the certificate of %s ends %s: renew it (trade pki issue %s) and start this container again before "
-                "that (`trade gateway` takes the new one by itself); it listens with the one it was started with, "
-                "and else all its links end then",
+                "the certificate of %s ends %s: renew it (`trade pki issue %s`) and start this container again before "
+                "that, or all its links end then (`trade gateway` loads the new one by itself)",
                 *(who, until, who),
             )
 

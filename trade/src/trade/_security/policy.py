@@ -1,4 +1,4 @@
-"""The access policy: which identity may do what in which groups. Pure data, compiled once and never changed."""
+"""The access policy: which identity may do what in which groups. Pure data, compiled once and immutable."""
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,31 +9,31 @@ from msgspec import Struct
 __all__ = ["EVERYTHING", "VERBS", "Decision", "Policy", "Role"]
 
 VERBS: Final = ("call", "read", "register", "lock", "instrument", "administer")
-"""What one may do: call what actuates, call what reads, offer providers, lock, attach hooks, change the system."""
+"""The rights: call what actuates, call what reads, offer providers, lock, attach hooks, change the system."""
 
 EVERYTHING: Final = "*"
-"""In a rule: every group, and what is in none."""
+"""In a rule: every group, and services without a group."""
 
 _MOST_STRANGERS: Final = 4096
-"""Identities without a name of their own in the policy whose rights are kept; of more they are worked out again."""
+"""The most unnamed identities whose rights are cached; for more, rights are computed again."""
 
 
 class Decision(NamedTuple):
-    """Whether somebody may do something, and why."""
+    """Whether an identity may do something, and why."""
 
     allowed: bool
     rule: str
-    """The rule that says so, in words."""
+    """The deciding rule, in words."""
 
 
 class Role(Struct, frozen=True):
-    """What identities of one kind may do."""
+    """The rights of one kind of identity."""
 
     name: str
     rights: Mapping[str, Sequence[str]]
     """Verb to groups."""
     includes: Sequence[str] = ()
-    """Roles whose rights it has, too; without cycles."""
+    """Roles whose rights this one has, too; without cycles."""
 
 
 _Rights = dict[tuple[str, str], str]
@@ -41,9 +41,9 @@ _Rights = dict[tuple[str, str], str]
 
 
 class Policy:
-    """Who may do what: nobody anything that no rule allows.
+    """Which identity may do what; denies everything that no rule allows.
 
-    ``decide`` costs a few look-ups in dictionaries, however long the policy is.
+    ``decide`` costs a few dictionary look-ups, whatever the size of the policy.
     """
 
     def __init__(
@@ -55,15 +55,15 @@ class Policy:
         gateways: Iterable[str] = (),
         approval: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
-        """Compile it.
+        """Compile the policy.
 
         Args:
-            roles: all there are.
+            roles: all roles.
             identities: names, or patterns with ``*`` and ``?``, to the names of roles.
-            revoked: identities that may do nothing at all any more, stopping included.
-            source: where it was read from, for people.
-            gateways: identities that the transport believes whatever they pass on, as they have checked it.
-            approval: names, or patterns, to groups in which an agent of that name does nothing without a person's word.
+            revoked: identities that may do nothing any more, stopping included.
+            source: the file it was read from, for messages.
+            gateways: identities whose forwarded messages the transport accepts, as they have checked them.
+            approval: names, or patterns, to the groups in which an agent of that name needs a person's approval.
         """
         self.source: Final = source
         self.roles: Final = {role.name: role for role in roles}
@@ -99,11 +99,11 @@ class Policy:
         return Decision(True, rule)
 
     def authenticated(self, who: str) -> Decision:
-        """Whether what everybody may do is open to an identity: to all but the revoked ones."""
-        return Decision(False, f"{who} is revoked") if who in self.revoked else Decision(True, "everybody may")
+        """Whether an identity may do what needs no right: every one that is not revoked."""
+        return Decision(False, f"{who} is revoked") if who in self.revoked else Decision(True, "every identity may")
 
     def asks_first(self, who: str, group: str) -> bool:
-        """Whether an agent of that name needs a person's word for what does something in a whole dotted group."""
+        """Whether an agent of that name needs a person's approval for what acts in a whole dotted group."""
         marked = {one for name, groups in self.approval.items() if fnmatch.fnmatchcase(who, name) for one in groups}
         words = group.split(".")
         return not marked.isdisjoint({EVERYTHING, *(".".join(words[:count]) for count in range(1, len(words) + 1))})
@@ -122,7 +122,7 @@ class Policy:
         return tuple(name for name, rights in self._of_role.items() if any((verb, one) in rights for one in covering))
 
     def groups_of(self, who: str, verbs: Iterable[str]) -> list[str]:
-        """The groups an identity has one of these verbs over, as the rules name them, sorted; ``*`` alone if all."""
+        """The groups an identity has one of these verbs over, as the rules name them, sorted; only ``*`` if all."""
         wanted = set(verbs)
         groups = {group for verb, group in self._rights(who) if verb in wanted}
         return [EVERYTHING] if EVERYTHING in groups else sorted(groups)
@@ -132,7 +132,7 @@ class Policy:
         return [name for name in self.identities if not _is_pattern(name) and name not in self.revoked]
 
     def patterns(self) -> list[str]:
-        """What stands for several identities."""
+        """The patterns that match several identities."""
         return [name for name in self.identities if _is_pattern(name)]
 
     # --- compiling

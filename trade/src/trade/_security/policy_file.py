@@ -1,4 +1,4 @@
-"""Reading a policy from its TOML file: everything in it is checked before any of it counts."""
+"""Reads a policy from its TOML file: checks the whole file before any of it applies."""
 
 import difflib
 import re
@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Seen", "look_at", "policy_files", "read_policy"]
 
 Seen = tuple[tuple[int, int, int, int] | None, ...]
-"""What files are like: inode, times of change of contents and of rights, and size of each; None: it is not there."""
+"""The state of files: inode, times of change of contents and of rights, and size of each; None: it does not exist."""
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_.@:*?-]{1,80}")
 _KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file", "approval")
@@ -31,7 +31,7 @@ def read_policy(path: Path) -> Policy:
     """Read a policy, and the file of revoked identities that it names.
 
     Raises:
-        ConfigurationError: names the file, the key and what would be right.
+        ConfigurationError: names the file, the key and the right form.
     """
     raw = _load(path)
     where = str(path)
@@ -56,7 +56,7 @@ def read_policy(path: Path) -> Policy:
 
 
 def policy_files(path: Path) -> tuple[Path, ...]:
-    """A policy's file, and that of revoked identities which it names; of one that cannot be read, it alone."""
+    """The policy's file and the file of revoked identities that it names; only the former if it cannot be read."""
     try:
         beside = read_toml_text(path.read_text(encoding="utf-8")).get("revoked_file")
     except (OSError, ValueError):
@@ -65,7 +65,7 @@ def policy_files(path: Path) -> tuple[Path, ...]:
 
 
 def look_at(files: Iterable[Path]) -> Seen:
-    """What files are like: other ones, once somebody has written one of them."""
+    """The state of files; it differs once one of them has been written."""
     return tuple(_stamp(file) for file in files)
 
 
@@ -82,7 +82,7 @@ def _load(path: Path) -> _Table:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as bad:
         reason = bad.strerror if isinstance(bad, OSError) and bad.strerror else str(bad)
-        raise _wrong(str(path), f"the policy cannot be read: {reason}; write the file, or name another one") from None
+        raise _wrong(str(path), f"the policy cannot be read: {reason}. Write the file, or name another one") from None
     try:
         return read_toml_text(text)
     except ValueError as bad:
@@ -95,7 +95,7 @@ def _roles(raw: _Table, where: str) -> dict[str, Role]:
     for name, table in tables.items():
         at = f"{where}: roles.{name}"
         if not is_chunk(name):
-            raise _wrong(at, f"{name!r} is no name of a role; use letters, digits, . _ - (at most 80)")
+            raise _wrong(at, f"{name!r} is not a valid name of a role; use letters, digits, . _ - (at most 80)")
         if not isinstance(table, dict):
             raise _wrong(at, f'must be a table: [roles.{name}] and, for instance, call = ["rosie"]')
         rights = cast("_Table", table)
@@ -161,14 +161,14 @@ def _names(raw: _Table, key: str, where: str) -> tuple[str, ...]:
 def _revoked_elsewhere(path: Path, named_in: str) -> tuple[str, ...]:
     if not path.exists():
         problem = (
-            f"there is no {path}; copy revoked.toml there from the authority's folder (trade pki keeps it beside "
-            "ca.pem), and again after each trade pki revoke: an empty one in its place would let the revoked in"
+            f"there is no {path}. Copy revoked.toml there from the authority's folder (`trade pki` keeps it beside "
+            "ca.pem), and again after each `trade pki revoke`: an empty file would admit revoked identities"
         )
         raise _wrong(f"{named_in}: revoked_file", problem)
     raw = _load(path)
     _only_known(raw, ("revoked",), str(path))
-    if "revoked" not in raw:  # half of a file that is being copied would take everybody off the list
-        raise _wrong(f"{path}: revoked", 'missing; write revoked = [] if it is nobody, or revoked = ["name"]')
+    if "revoked" not in raw:  # a partly copied file would clear the list
+        raise _wrong(f"{path}: revoked", 'missing; write revoked = [] if no identity is revoked, or revoked = ["name"]')
     return _names(raw, "revoked", str(path))
 
 

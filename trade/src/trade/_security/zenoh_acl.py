@@ -1,7 +1,7 @@
-"""The transport's own access rules, made from the policy: they pin every identity to its keys at the first hop.
+"""The transport's access rules, generated from the policy: the first hop limits every identity to its keys.
 
-docs/access-control.md has the table and how it was found. One table serves a container's own session and a gateway's:
-what an identity may send to whoever holds the rules, and what it may be sent.
+docs/access-control.md has the table and its derivation. One table serves a container's own session and a gateway's:
+what an identity may send to the session with the rules, and what it may receive.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ _ALL_MESSAGES: Final = (
     "liveliness_query",
 )
 _SEEING: Final = tuple(verb for verb in VERBS if verb != "register")
-"""Who may do one of these in a group may know what is offered there."""
+"""An identity with one of these verbs over a group may see the services of that group."""
 
 _BEHIND: Final = {
     "id": "calls behind",
@@ -39,7 +39,7 @@ _BEHIND: Final = {
 }
 
 _ANYBODY: Final = "*"
-"""In place of an identity where nothing tells who is who: on links without certificates."""
+"""In place of an identity where peers are not identified: on links without certificates."""
 
 
 class Crossing(NamedTuple):
@@ -48,18 +48,18 @@ class Crossing(NamedTuple):
     offered: Sequence[str]
     """Groups whose services of this network the others see and call."""
     seen: Sequence[str]
-    """Groups of the others that are seen and called from this network."""
+    """Groups of the others that are visible and callable from this network."""
     offered_hz: Mapping[str, float] = MappingProxyType({})
-    """Of the groups offered whose streams are limited: samples a second."""
+    """Rate limits of streams of offered groups, in samples a second."""
     seen_hz: Mapping[str, float] = MappingProxyType({})
 
 
 def crossings(
     exports: Mapping[str, Sequence[str]], limits: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 ) -> dict[str, Crossing]:
-    """From what each network lets out, by interface, and how fast, to what crosses at each.
+    """Turns the exports of each network, by interface and with their rates, into what crosses at each.
 
-    A group that several let out is seen at the highest of their limits; each one's own holds where it is offered.
+    A group that several networks export is visible at the highest of their limits; each limit applies at its network.
     """
     made: dict[str, Crossing] = {}
     for name, groups in exports.items():
@@ -76,7 +76,7 @@ def crossings(
 _EVERYTHING_CROSSES: Final = Crossing((EVERYTHING,), (EVERYTHING,))
 
 _SLOWER: Final = "0.$*"
-"""All rates below 1 Hz, as they stand in keys."""
+"""All rates below 1 Hz, as keys name them."""
 
 _Row = tuple[str, str, Sequence[str]]
 """Flow, message, keys."""
@@ -91,21 +91,21 @@ def acl(
     subject: Literal["cert_common_names", "usernames"] = "cert_common_names",
     calls_hz: float | None = None,
 ) -> dict[str, Any]:
-    """Settings of a zenoh session that let each identity send and hear what the policy allows, and nothing else.
+    """Settings of a zenoh session that let each identity send and receive what the policy allows, and nothing else.
 
     Args:
-        policy: who may what; none: everybody may everything that crosses, and nobody can be told from others.
-        namespace: the system id: rules go by the keys on the wire, which begin with it.
-        identities: everybody there is; by default those the policy names in full, as rules know no patterns.
+        policy: the rights; None: every identity may do everything that crosses, as identities are not distinguished.
+        namespace: the system id; the rules match the keys on the wire, which begin with it.
+        identities: all identities; by default those the policy names in full, as rules know no patterns.
         networks: of a gateway, what crosses at the interfaces of each of its networks; none: everything.
-        subject: what tells who is at the other end of a link; user names are known to the end that was dialled only.
-        calls_hz: how often an identity may call at most, evenly spread: of two calls that come closer together than
-            that the second is dropped. None: as often as it likes.
+        subject: what identifies the other end of a link; only the end that was dialled knows user names.
+        calls_hz: the highest rate of calls of an identity, evenly spread: of two calls that are closer together, the
+            second is dropped. None: no limit.
 
     Returns:
-        ``access_control``, ``downsampling`` and ``qos/network``, as zenoh names them. They are read when a session
-        opens: another policy needs another session. The last one sends calls on behind everything else, so that who
-        floods with them holds up nobody's stops and answers.
+        ``access_control``, ``downsampling`` and ``qos/network``, in zenoh's names. They are read when a session opens:
+        another policy needs another session. The last one gives calls the lowest priority, so that a flood of them
+        delays no stops and answers.
     """
     places = networks or {(): _EVERYTHING_CROSSES}
     if policy is None:
@@ -145,7 +145,7 @@ def acl(
 
 
 def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
-    """What one identity may send to us, and what we may send to it."""
+    """What one identity may send to this session, and what this session may send to it."""
     calls = _over(policy, me, ("call", "read"), crossing.seen, f"call/{me}/*/*/*/{{}}/*")
     offers = _over(policy, me, ("register",), crossing.offered, f"registry/{{}}/{me}/*/*/*")
     sees = _over(policy, me, _SEEING, crossing.seen, "registry/{}/*/*/*/*")
@@ -172,7 +172,7 @@ def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
 
 
 def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence[str], pattern: str) -> list[str]:
-    """Keys of the groups among some that an identity has one of the verbs over, and of the middleware's own."""
+    """Keys of those of some groups over which an identity has one of the verbs, and of the middleware's own."""
     groups = _both([EVERYTHING] if policy is None else policy.groups_of(who, verbs), among)
     if groups == [EVERYTHING]:
         return [pattern.format("*")]
@@ -189,7 +189,7 @@ def _paced(
     limits: Mapping[str, float],
     pattern: str,
 ) -> list[str]:
-    """Keys of the streams of these groups, of limited ones at those rates only."""
+    """Keys of the streams of these groups; of limited ones only at those rates."""
     keys: list[str] = []
     for limit in sorted({limits.get(group, inf) for group in among} or {inf}):
         groups = [group for group in among if limits.get(group, inf) == limit]
@@ -199,7 +199,7 @@ def _paced(
 
 
 def _both(some: Sequence[str], others: Sequence[str]) -> list[str]:
-    """The groups that both name, where each stands for all beneath it."""
+    """The groups that both lists name, where each group includes all beneath it."""
     return sorted({narrow for one in some for other in others if (narrow := _narrower(one, other))})
 
 
@@ -224,6 +224,6 @@ def _rule(who: str, flow: str, message: str, keys: Sequence[str], namespace: str
 
 
 def _limits(identities: Iterable[str], namespace: str, calls_hz: float) -> list[dict[str, Any]]:
-    """One rule is one clock, of one link: so one for each identity."""
+    """One rule is one clock for one link: hence one rule for each identity."""
     rules = [{"key_expr": f"{namespace}/call/{name}/**", "freq": calls_hz} for name in sorted(identities)]
     return [{"id": "calls", "flows": [_IN], "messages": ["put"], "rules": rules}] if rules else []

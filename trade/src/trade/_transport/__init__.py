@@ -1,1 +1,1 @@
-"""What carries bytes: the base class, its implementation on eclipse-zenoh, and one in memory."""
+"""The transport: its base class, the implementation on eclipse-zenoh, and one in memory."""

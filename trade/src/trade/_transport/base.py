@@ -1,6 +1,6 @@
-"""The seam between the middleware and whatever carries its bytes.
+"""The interface between the middleware and the transport that carries its bytes.
 
-Five verbs: publish, subscribe, announce (and answer who asks what stands), be present, close. Everything above is the
+Five operations: publish, subscribe, announce (and answer queries), presence, close. Everything above is the
 same on any implementation; ``zenoh`` is the real one.
 """
 
@@ -14,23 +14,23 @@ class ChannelClosed(Exception):
 
 
 class Message(Struct, frozen=True, gc=False):
-    """Bytes and the key they were put on; no payload says that what stood there is gone."""
+    """Bytes and the key they were published on; a payload of None says that the value of the key is gone."""
 
     key: str
     payload: bytes | None
 
 
 class Answer(Struct, frozen=True):
-    """All that one who was asked has said."""
+    """Everything that one transport replied to a query."""
 
     who: str
-    """Tells those apart that answer."""
+    """Distinguishes the transports that replied."""
     messages: list[Message]
-    """In the order they were said."""
+    """In the order in which they were sent."""
 
 
 class Channel(ABC):
-    """A queue filled by the transport and read by our own threads; several may read one."""
+    """A queue that the transport fills and our own threads read; several threads may read one."""
 
     @abstractmethod
     def receive(self) -> Message:
@@ -42,11 +42,11 @@ class Channel(ABC):
 
 
 class Publisher(ABC):
-    """A key one may put on, declared once."""
+    """A key declared once for publishing."""
 
     @abstractmethod
     def put(self, payload: bytes) -> None:
-        """Send; may wait for a stalled receiver up to a second, never drops for one that is alive.
+        """Send; waits up to a second for a stalled receiver, and never drops a message to a live one.
 
         Raises ChannelClosed once closed.
         """
@@ -57,26 +57,26 @@ class Publisher(ABC):
 
 
 class Question(ABC):
-    """Somebody asks what stands, and waits until it is closed."""
+    """A query for the current announcements; the asking side waits until it is closed."""
 
     @abstractmethod
     def answer(self, key: str, payload: bytes) -> None:
-        """Say one thing that stands; what does not match what was asked is left out.
+        """Reply with one announcement; one that does not match the query is left out.
 
-        May wait like a put. Raises ChannelClosed if nobody can hear it any more.
+        May wait like a put. Raises ChannelClosed if the asking side can no longer receive it.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """That was all. Idempotent."""
+        """End the reply. Idempotent."""
 
 
 class Questions(ABC):
-    """A queue of questions, filled by the transport and read by our own threads."""
+    """A queue of queries that the transport fills and our own threads read."""
 
     @abstractmethod
     def receive(self) -> Question:
-        """Wait for the next question. Raises ChannelClosed once closed."""
+        """Wait for the next query. Raises ChannelClosed once closed."""
 
     @abstractmethod
     def close(self) -> None:
@@ -84,98 +84,98 @@ class Questions(ABC):
 
 
 class Presence(ABC):
-    """A sign of life that falls by itself when this process ends or cannot be reached."""
+    """A sign of life that disappears when this process ends or becomes unreachable."""
 
     @abstractmethod
     def close(self) -> None:
-        """Take the sign down. Idempotent."""
+        """Withdraw the sign of life. Idempotent."""
 
 
 class Transport(ABC):
-    """What carries keys and bytes between the containers of one system.
+    """Carries keys and bytes between the containers of one system.
 
     Guarantees: messages on one key from one publisher arrive in order, and so do all announcements of one transport;
-    what is subscribed before something is announced hears all that follows the announcement; once a sign of life has
-    risen, its transport can be asked; presence falls within the lease. Nothing is kept of an announcement: who must
-    have heard it asks. Channels, publishers and signs of life last while they are kept. Once closed, every verb but
-    ``wake`` and ``close`` raises ChannelClosed.
+    a subscription made before an announcement receives everything that follows the announcement; once a sign of life
+    has appeared, its transport can be queried; presence ends within the lease. The transport stores no announcements:
+    a container that missed one queries for it. Channels, publishers and signs of life last while they are referenced.
+    Once closed, every method but ``wake`` and ``close`` raises ChannelClosed.
     """
 
     beat_s: float = 2.0
-    """How soon after an announcement who made it says how far it is: so long a lost one may go unnoticed."""
+    """The interval at which a container announces its revision, and so the longest time a loss stays unnoticed."""
 
     @abstractmethod
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
-        """Declare a key to put on.
+        """Declare a key for publishing.
 
         Args:
-            key: a literal one.
-            urgent: what is put overtakes all others.
-            droppable: ``put`` waits for nobody; what a stalled receiver cannot take at once it never gets. What is
-                droppable and not urgent goes behind all others.
+            key: a literal key, not a pattern.
+            urgent: messages overtake all others.
+            droppable: ``put`` never waits; a stalled receiver loses what it cannot take at once. Messages that are
+                droppable and not urgent are sent after all others.
         """
 
     @abstractmethod
     def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
-        """Hear what is put on keys that match.
+        """Subscribe to keys that match a pattern.
 
-        Whoever puts faster than it is read waits, and with it whatever else comes by the same link.
+        A publisher that is faster than the reader waits, and so does everything else on the same link.
 
         Args:
-            pattern: of keys.
-            newest: nobody waits, and of what is not read in time only so many are kept; the oldest is lost first.
+            pattern: the pattern of keys.
+            newest: keep only this many unread messages and drop the oldest first; the publisher never waits.
         """
 
     @abstractmethod
     def announce(self, key: str, payload: bytes) -> None:
-        """Put once on one of very many keys: nothing is declared. Waits like a put of a publisher."""
+        """Publish once, without declaring the key; for a large number of keys. Waits like a put of a publisher."""
 
     @abstractmethod
     def announcements(self, pattern: str) -> Channel:
-        """Hear what others announce from now on."""
+        """Subscribe to the announcements that others make from now on."""
 
     @abstractmethod
     def questions(self, pattern: str) -> Questions:
-        """Be asked what stands on keys that match."""
+        """Receive the queries for keys that match."""
 
     @abstractmethod
     def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
-        """Ask all others at once what stands; what they have said when all are done, or when the time is over.
+        """Query all other transports at once; returns their replies when all are done or the timeout has passed.
 
-        Who is lost meanwhile is not waited for.
+        A transport that is lost meanwhile is not waited for.
         """
 
     @abstractmethod
     def appear(self, key: str) -> Presence:
-        """Put up a sign of life."""
+        """Publish a sign of life."""
 
     @abstractmethod
     def presences(self, pattern: str) -> Channel:
-        """Hear signs of life rise (empty payload) and fall (no payload), those standing now first; one's own, too."""
+        """Subscribe to all signs of life, current ones first; an empty payload appears, None disappears."""
 
     @abstractmethod
     def present(self, pattern: str, timeout_s: float) -> list[str]:
-        """The signs of life that stand now, one's own included."""
+        """The current signs of life, own ones included."""
 
     def bridged(self) -> bool:
-        """Whether it is linked to a bridge, or was a moment ago: others may be seen through that only."""
+        """Whether the transport is or was just linked to a bridge: other containers may be visible only through it."""
         return False
 
     def bridge_lost(self) -> bool:
-        """Whether a bridge to others went a moment ago: who is out of sight now may be behind it, and come back."""
+        """Whether a link to a bridge was just lost: containers behind it are out of sight and may come back."""
         return False
 
     def settle(self) -> None:
-        """Whoever has this is here to stay: say so, where it makes a difference to others.
+        """Declare that this container stays, if that makes a difference to the transport.
 
-        While it does, what is heard may come twice.
+        During the change a message may arrive twice.
         """
         return
 
     @abstractmethod
     def wake(self, key: str, payload: bytes) -> None:
-        """Put for the readers of this very transport only; nothing leaves the process."""
+        """Publish to the readers of this transport only; nothing leaves the process."""
 
     @abstractmethod
     def close(self) -> None:
-        """End every channel and leave. Idempotent."""
+        """Close every channel and leave the network. Idempotent."""

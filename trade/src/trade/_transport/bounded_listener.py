@@ -1,4 +1,4 @@
-"""A listening socket that takes so many connections at once, so that no stranger takes all descriptors."""
+"""A listening socket with a limit on its connections, so that strangers cannot exhaust all file descriptors."""
 
 import socket
 import threading
@@ -18,7 +18,7 @@ class _Counted(socket.socket):
         super().close()
 
     def detach(self) -> int:
-        """Somebody else closes it: it counts no more."""
+        """Another object closes the socket: it is no longer counted."""
         listener, self.listener = self.listener, None
         if listener is not None:
             listener.closed()
@@ -26,11 +26,11 @@ class _Counted(socket.socket):
 
 
 class BoundedListener(socket.socket):
-    """Takes the place of a socket that listens.
+    """A listening socket that limits its connections.
 
     Args:
-        bound: it; it is this one's from now on.
-        most: connections at once, whether or not they have said anything yet.
+        bound: the socket to replace; this object takes its descriptor.
+        most: the largest number of connections at once, whether or not they have sent anything yet.
     """
 
     def __init__(self, bound: socket.socket, most: int) -> None:
@@ -42,7 +42,7 @@ class BoundedListener(socket.socket):
         self._guard = threading.Lock()
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Raises BlockingIOError: there are as many as there may be; who came is gone."""
+        """Raises BlockingIOError: the limit is reached; the new connection was closed."""
         plain, address = super().accept()
         made = _Counted(plain.family, plain.type, plain.proto, fileno=plain.detach())
         with self._guard:
@@ -55,6 +55,6 @@ class BoundedListener(socket.socket):
         return made, address
 
     def closed(self) -> None:
-        """Told by a connection."""
+        """Called by a connection when it closes."""
         with self._guard:
             self._open -= 1

@@ -1,7 +1,7 @@
-"""User and password of a system: where those come from that nobody chose, and how the transport is given them.
+"""User and password of a system: the default pair of a user, and the file that passes a pair to the transport.
 
-Both ends of every link hold the same pair. The end that is dialled checks, so a container without it, or with another
-one, is not linked in either direction.
+Both ends of every link hold the same pair. The end that is dialled checks it, so a container without the pair, or with
+another one, is not linked in either direction.
 """
 
 import contextlib
@@ -19,30 +19,30 @@ from trade.errors import ConfigurationError
 __all__ = ["dictionary_file", "user_secret"]
 
 _FILE: Final = "@secret"
-"""No system can have this name: those have folders beside it."""
+"""No system can have this name: the folders of systems are beside this file."""
 _USER: Final = "host"
 _OPEN_FILES: Final = Path("/proc/self/fd")
 
 
 def user_secret() -> tuple[str, str]:
-    """The pair of all containers of this user on this host that were given none; made by the first of them.
+    """The default pair of all containers of this user on this host; the first container creates it.
 
     Raises:
-        ConfigurationError: others could read or have planted it.
+        ConfigurationError: other users can read the file or could have planted it.
     """
     path = runtime_folder() / _FILE
     if not path.exists():
         with _private_file(secrets.token_urlsafe(32)) as fresh, contextlib.suppress(FileExistsError):
-            os.link(fresh, path)  # who comes second takes the first one's
+            os.link(fresh, path)  # the second container takes the first one's
     _check_private(path)
     return _USER, path.read_text(encoding="ascii").strip()
 
 
 @contextlib.contextmanager
 def dictionary_file(credentials: tuple[str, str]) -> Generator[Path]:
-    """Whom a session lets in, in the one form the transport takes it: a file, there while the session opens.
+    """Yields the credentials that a session accepts, as the file that zenoh reads while the session opens.
 
-    It is in memory where there are such files, so that nobody is kept out by a full disk.
+    The file is in memory where the platform supports that, so that a full disk keeps no container out.
     """
     text = ":".join(credentials) + "\n"
     if not (hasattr(os, "memfd_create") and _OPEN_FILES.is_dir()):

@@ -9,25 +9,25 @@ from trade.errors import ConfigurationError
 __all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "loopback_interface", "with_free_port"]
 
 
-_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody listens on: how to dial it
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - wildcard address -> address to dial
 
 _PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws")
 _LAST_PORT: Final = 65535
 
 
 class Endpoint(NamedTuple):
-    """One endpoint in its parts."""
+    """The parts of one endpoint."""
 
     protocol: str
     host: str
-    """As in the text: an IPv6 address has its brackets."""
+    """As in the text: an IPv6 address keeps its brackets."""
     port: int
     rest: str = ""
-    """What zenoh takes after ``?`` or ``#``."""
+    """The part after ``?`` or ``#``, which zenoh interprets."""
 
     @classmethod
     def read(cls, text: str) -> "Endpoint":
-        """Raises ConfigurationError: it is none."""
+        """Raises ConfigurationError: the text is not an endpoint."""
         protocol, slash, where = text.partition("/")
         plain = where.split("#")[0].split("?")[0]
         host, colon, port = plain.rpartition(":")
@@ -43,7 +43,7 @@ class Endpoint(NamedTuple):
 
     @property
     def loopback(self) -> bool:
-        """Whether it stays on this host."""
+        """Whether the endpoint stays on this host."""
         try:
             return ipaddress.ip_address(self.host.strip("[]")).is_loopback
         except ValueError:
@@ -51,11 +51,11 @@ class Endpoint(NamedTuple):
 
     @property
     def everywhere(self) -> bool:
-        """Whether it listens on all networks of this host."""
+        """Whether the endpoint listens on all networks of this host."""
         return self.host in _EVERYWHERE
 
     def resolved(self) -> list[str]:
-        """The same with each address its host has now; none if its name means nothing."""
+        """The endpoint with each current address of its host; empty if the host cannot be resolved."""
         try:
             found = socket.getaddrinfo(self.host.strip("[]"), self.port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError, OverflowError):
@@ -68,7 +68,7 @@ class Endpoint(NamedTuple):
 
 
 def with_free_port(endpoint: Endpoint) -> Endpoint:
-    """A port nobody listens on now in place of port 0."""
+    """Replaces port 0 with a port that is free now."""
     if endpoint.port:
         return endpoint
     host = endpoint.host.strip("[]")
@@ -76,12 +76,12 @@ def with_free_port(endpoint: Endpoint) -> Endpoint:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.bind((host, 0))
             return endpoint._replace(port=probe.getsockname()[1])
-    except OSError:  # the transport will say what is wrong with it
+    except OSError:  # the transport will report what is wrong with it
         return endpoint
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on now."""
+    """A loopback endpoint with a port that is free now."""
     return str(with_free_port(Endpoint("tcp", "127.0.0.1", 0)))
 
 
@@ -91,12 +91,12 @@ def loopback_interface() -> str:
 
 
 def dialled_from_here(endpoint: Endpoint) -> str:
-    """How this host dials what listens there."""
+    """The endpoint under which this host dials a listener."""
     return str(endpoint._replace(host=_EVERYWHERE.get(endpoint.host, endpoint.host)))
 
 
 def accepts(endpoint: str) -> bool:
-    """Whether anything accepts connections there; a name or text that means nothing is no such thing."""
+    """Whether an endpoint accepts connections; False for a text or name that is not valid."""
     try:
         where = Endpoint.read(endpoint)
         with socket.create_connection((where.host.strip("[]"), where.port), timeout=0.5):

@@ -1,8 +1,8 @@
-"""Keeps strangers from filling the transport's ports: while too many are there, no further one is let in.
+"""Protects the transport's ports against floods: with too many unlinked connections, no new one is accepted.
 
-The transport accepts every connection and ends those that fail ten times a second (zenoh 1.10, measured): of 1,000
-connections a second each would keep a descriptor for minutes. A socket filter on its listening sockets has the kernel
-drop who comes meanwhile. Links that stand are not touched, and the stop line is elsewhere. Linux only.
+The transport accepts every connection and ends those that fail at ten a second (zenoh 1.10, measured): at 1,000
+connections a second, each would hold a descriptor for minutes. A socket filter on the listening sockets makes the
+kernel drop new connections meanwhile. Existing links are not affected, and the stop line is separate. Linux only.
 """
 
 import contextlib
@@ -27,15 +27,15 @@ _ESTABLISHED: Final = "01"
 _SO_ATTACH_FILTER: Final = 26
 _SO_DETACH_FILTER: Final = 27
 _DROP_ALL: Final = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))
-"""A program of one instruction, for Linux's socket filters: keep nothing of the packet."""
+"""A Linux socket filter of one instruction: drop the packet."""
 
 
 class PortGuard:
-    """Looks after the ports that this process's transport listens on, until it is closed.
+    """Watches the ports that this process's transport listens on, until it is closed.
 
     Args:
-        ports: those ports.
-        links: how many links stand.
+        ports: the ports to watch.
+        links: returns the number of links.
     """
 
     def __init__(self, ports: Iterable[int], links: Callable[[], int]) -> None:
@@ -51,18 +51,18 @@ class PortGuard:
     def _run(self) -> None:
         while not self._ending.wait(_LOOK_S):
             try:
-                if self._shut or _open_files() > MOST_STRANGERS:  # to count connections costs more
+                if self._shut or _open_files() > MOST_STRANGERS:  # counting connections costs more
                     self._mind(_connections(self._ports) - self._links())
             except OSError as bad:
-                _logger.debug("the ports of the transport cannot be looked at: %s", bad)
+                _logger.debug("the ports of the transport cannot be inspected: %s", bad)
         if self._shut:
             self._filter(shut=False)
 
     def _mind(self, strangers: int) -> None:
         if not self._shut and strangers > MOST_STRANGERS:
             _logger.warning(
-                "%d connections that are no links at port %s: nobody else is let in until they have ended; stops and "
-                "e-stops still are, on the stop line",
+                "%d connections at port %s are not links: no new connection is accepted until they end. Stops and "
+                "e-stops still arrive on the stop line",
                 strangers,
                 ", ".join(map(str, sorted(self._ports))),
             )
@@ -73,7 +73,7 @@ class PortGuard:
     def _filter(self, *, shut: bool) -> None:
         program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(_DROP_ALL))
         for door in self._doors:
-            with contextlib.suppress(OSError):  # it is closed
+            with contextlib.suppress(OSError):  # the socket is closed
                 if shut:
                     door.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
                 else:
@@ -81,7 +81,7 @@ class PortGuard:
         self._shut = shut
 
     def close(self) -> None:
-        """Look no more; who comes is let in. Idempotent."""
+        """Stop watching; new connections are accepted. Idempotent."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(2)
@@ -90,7 +90,7 @@ class PortGuard:
 
 
 def _listening(ports: frozenset[int]) -> list[socket.socket]:
-    """Copies of the sockets of this process that listen at one of these ports."""
+    """Copies of the sockets of this process that listen on one of these ports."""
     found: list[socket.socket] = []
     for file in list(_OPEN_FILES.iterdir()):
         with contextlib.suppress(OSError, ValueError):
@@ -111,12 +111,12 @@ def _is_door(sock: socket.socket, ports: frozenset[int]) -> bool:
 
 
 def _open_files() -> int:
-    """Of this process: each stranger is one."""
+    """The number of open files of this process, strangers' connections included."""
     return sum(1 for _ in os.scandir(_OPEN_FILES))
 
 
 def _connections(ports: frozenset[int]) -> int:
-    """How many connections there are at these ports of this host."""
+    """The number of connections to these ports of this host."""
     ends = {f":{port:04X}" for port in ports}
     count = 0
     for path in _CONNECTIONS:

@@ -2,8 +2,8 @@
 # pyright: reportUnknownLambdaType=false, reportCallIssue=false
 """The transport on eclipse-zenoh.
 
-No Python runs on zenoh's threads: every subscriber is a channel that our threads read. Puts block for a stalled
-receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
+No Python runs on zenoh's threads: every subscriber is a channel that our threads read. Puts are sent at once, and wait
+for a stalled receiver instead of dropping (zenoh's default). All sessions have the same short lease.
 """
 
 import contextlib
@@ -38,12 +38,12 @@ _MOST_KNOWN_KEYS: Final = 1024
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
 _DROP: Final = zenoh.CongestionControl.DROP
 _CLOSED: Final = (zenoh.ZError, RuntimeError)
-"""What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
+"""What zenoh raises for an object that is closed already, or that another thread closes or uses right now."""
 _PUT: Final = zenoh.SampleKind.PUT
 
 
 _SHARED_FROM_BYTES: Final = 32 << 10
-"""Larger messages go through shared memory on one host; what containers tell of their services is smaller."""
+"""Larger messages go through shared memory on one host; registry messages of containers are smaller."""
 
 
 def configuration(
@@ -56,9 +56,9 @@ def configuration(
     bridge: Sequence[Sequence[str]] = (),
     rules: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
+    """The settings of one session, in zenoh's names; ``bridge`` has the interfaces of each network that it joins.
 
-    Certificates, or else credentials, decide whom it lets in; rules decide what they may send (see `zenoh_acl`).
+    Certificates, or else credentials, decide which peers may link; rules decide what those may send (see `zenoh_acl`).
     """
     entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
     if credentials is not None:
@@ -67,7 +67,7 @@ def configuration(
         "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
         "mode": "router" if bridge else "peer",
         "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
-        # A bridge's neighbours are on other hosts; what it would share with those of its own takes 16 MiB for each.
+        # A bridge's neighbours are on other hosts; sharing with those on its own host would take 16 MiB for each.
         "transport/shared_memory/enabled": not bridge,
         "namespace": namespace,
         "listen/endpoints": list(listen),
@@ -76,8 +76,8 @@ def configuration(
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
-        # Two that hear of each other at once must not both dial: each would refuse the other as a second link.
-        # Of a bridge its neighbours do not hear by gossip; it dials them.
+        # Two peers that discover each other at once must not both dial: each would refuse the other's second link.
+        # A bridge is not announced to its neighbours by gossip; it dials them.
         "scouting/gossip/autoconnect": {"router": ["peer"], "peer": ["router", "peer"]},
         "scouting/gossip/autoconnect_strategy": {
             "peer": {"to_router": "always", "to_peer": "greater-zid"},
@@ -87,7 +87,7 @@ def configuration(
         **rules,
         # The first message above it takes a pool of 16 MiB of locked memory that lives as long as the process.
         "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_FROM_BYTES,
-        # Whoever is slow to come in takes one of 100 places; zenoh would leave it that for 10 s.
+        # A slow handshake takes one of 100 places; zenoh would leave it there for 10 s.
         "transport/unicast/accept_timeout": _COMING_IN_MS,
         "transport/unicast/open_timeout": _COMING_IN_MS,
         "transport/link/tx/lease": LEASE_MS,
@@ -97,21 +97,21 @@ def configuration(
 
 
 def _region(interfaces: Sequence[str]) -> dict[str, Any]:
-    """Who comes by these is of one network; routers are not: those are other bridges."""
+    """The peers on these interfaces form one network; routers do not belong to it, as they are other bridges."""
     return {"filters": [{"modes": ["peer", "client"], "interfaces": list(interfaces)}]}
 
 
 class ZenohChannel(Channel):
     """A subscriber of any of zenoh's three kinds.
 
-    Where the same few keys are heard over and over, they are declared on the session: zenoh keeps the route of a key it
-    knows, and works it out for every message of one it does not.
+    For a few keys that repeat, the keys are declared on the session: zenoh caches the route of a declared key, and
+    computes it for every message of any other.
     """
 
     def __init__(self, subscriber: Any, declare_on: zenoh.Session | None = None) -> None:
         self._subscriber = subscriber
         self._next_recv: Callable[[], zenoh.Sample] | None = None
-        """Of another subscriber, for when all is read that the one before it has got."""
+        """The reader of the next subscriber, used once everything from the previous one has been read."""
         self._closed = False
         self._moving = threading.Lock()
         self._session = declare_on
@@ -142,7 +142,7 @@ class ZenohChannel(Channel):
             _quietly(lambda declared=declared: session.undeclare(declared))
 
     def move(self, declare: Callable[[], Any]) -> None:
-        """Hear another subscriber from now on; what both have got is heard twice. Raises ZError of a closed session."""
+        """Switch to another subscriber; messages that both have are read twice. Raises ZError for a closed session."""
         with self._moving:
             if self._closed:
                 return
@@ -151,7 +151,7 @@ class ZenohChannel(Channel):
         _quietly(before.undeclare)
 
     def _go_on(self, ended: Any) -> bool:
-        """A subscriber has no more; returns whether there is another one."""
+        """Switch to the next subscriber after one has ended; returns whether one exists."""
         with self._moving:
             if self._next_recv is not None:
                 self._recv, self._next_recv = self._next_recv, None
@@ -206,7 +206,7 @@ class ZenohQuestion(Question):
 class ZenohQuestions(Questions):
     def __init__(self, queryable: Any) -> None:
         self._queryable = queryable
-        self._recv = queryable.handler.recv  # to ask for it while another thread closes is refused
+        self._recv = queryable.handler.recv  # reading it while another thread closes is refused
 
     def receive(self) -> Question:
         try:
@@ -231,14 +231,14 @@ class ZenohTransport(Transport):
         try:
             self._session = open_session(settings)
         except zenoh.ZError as bad:
-            reason = str(bad).partition(" at /")[0]  # what follows is a place in zenoh's sources
+            reason = str(bad).partition(" at /")[0]  # the rest is a line in zenoh's sources
             raise ConfigurationError(
                 where=f"listen {', '.join(settings['listen/endpoints'])}",
                 problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
         self.links: Final = Links(self._session, settings)
         self._passing: list[tuple[ZenohChannel, Callable[[], Any]]] = []
-        """What is heard under another pattern until this is known to stay, and how to hear it then."""
+        """Channels with a temporary pattern, and how to subscribe with the final one once the container stays."""
 
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         behind = droppable and not urgent
@@ -267,10 +267,10 @@ class ZenohTransport(Transport):
         return self._hear(pattern, heard)
 
     def _hear(self, pattern: str, heard: Callable[[str], Any], declare_on: zenoh.Session | None = None) -> ZenohChannel:
-        """Who passes by hears what everybody hears under another pattern that matches the same keys.
+        """Short-lived containers subscribe with separate patterns that match the same keys.
 
-        zenoh 1.10 keeps the link to whoever subscribed to a pattern, 6 KiB and more, for as long as anybody
-        subscribes to that one (https://github.com/eclipse-zenoh/zenoh/issues/2393).
+        zenoh 1.10 keeps the link to each subscriber of a pattern, 6 KiB and more, for as long as any subscriber of that
+        pattern exists (https://github.com/eclipse-zenoh/zenoh/issues/2393).
         """
         with _refusing():
             channel = ZenohChannel(heard(PASSING.get(pattern, pattern)), declare_on)
@@ -339,7 +339,7 @@ def _fifo() -> Any:
 
 @contextlib.contextmanager
 def _refusing() -> Generator[None, None, None]:
-    """What a closed session refuses is refused in our words."""
+    """Turns the errors of a closed session into ChannelClosed."""
     try:
         yield
     except zenoh.ZError:
@@ -347,9 +347,9 @@ def _refusing() -> Generator[None, None, None]:
 
 
 def _quietly(action: Any) -> None:
-    """Do it unless the session is closed already: closing is idempotent and never fails.
+    """Run an action unless the session is closed already: closing is idempotent and never fails.
 
-    What another thread uses at this moment zenoh lets go of when that is done.
+    zenoh releases an object that another thread uses right now when that thread is done.
     """
     try:
         action()

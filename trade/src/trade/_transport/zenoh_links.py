@@ -1,9 +1,8 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-"""The small zenoh sessions beside a container's main one, which link it to others while it runs.
+"""Short-lived zenoh sessions next to a container's main one, which link it to others while it runs.
 
-zenoh can neither dial nor answer scouts anew in an open session, and the main one is never reopened. What a second,
-short-lived session that is linked to two others hears of one it tells the other (gossip); they link, and stay linked
-when it closes.
+An open zenoh session can neither dial nor answer scouts, and the main one is never reopened. A second session that is
+linked to two others introduces them to each other by gossip; the two link, and stay linked when it closes.
 """
 
 import hashlib
@@ -26,8 +25,8 @@ _NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
 _DIGITS: Final = 32
 _TAG: Final = 16
 _NAME: Final = 12
-"""Hexadecimal digits: the id of a beacon is made of its system's tag, of so much of the id of the main session as names
-it, and of the port that the main session listens on. So a scout knows whom it found, and dials the main session."""
+"""Hexadecimal digits. A beacon's id consists of its system's tag, this many digits of the main session's id, and the
+port that the main session listens on, so a scout knows which container it found, and dials its main session."""
 _LOOK_S: Final = 0.01
 _MOMENT_S: Final = 1.0
 
@@ -39,16 +38,16 @@ _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of 
 def new_session_id(*, dials: bool = False) -> str:
     """An id that zenoh keeps as it is written: its first digit is not zero.
 
-    Of two that hear of each other the one with the greater id dials; zenoh compares the last byte first. Who listens on
-    this host only can dial others, but not be dialled from elsewhere: its id is greater than theirs.
+    Of two sessions that discover each other the one with the greater id dials; zenoh compares the last byte first. A
+    session that listens on this host only can dial others but cannot be dialled from elsewhere: its id is the greater.
     """
     digits = secrets.token_hex(_DIGITS // 2)
     return f"{secrets.choice('123456789abcdef')}{digits[1:-2]}{secrets.randbelow(128) + 128 * dials:02x}"
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
-    """Open what the settings say, as zenoh names them; it lets in who has its own credentials, or a certificate of its
-    authority. Raises zenoh.ZError.
+    """Open a session with settings in zenoh's names; it accepts peers with its own credentials, or with a certificate
+    of its authority. Raises zenoh.ZError.
     """
     if _USER not in settings:
         return zenoh.open(_config(settings))
@@ -74,15 +73,15 @@ class Beacon:
 
 
 class Found(NamedTuple):
-    """A container of this system that lets itself be found."""
+    """A discoverable container of this system."""
 
     session: str
-    """How the id of its main session begins."""
+    """The first digits of its main session's id."""
     endpoints: tuple[str, ...]
 
 
 class Links:
-    """Who the main session is linked to, and how to link it to more."""
+    """The links of the main session, and the way to add more."""
 
     def __init__(self, session: zenoh.Session, settings: dict[str, Any]) -> None:
         self._session = session
@@ -98,7 +97,7 @@ class Links:
         self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
 
     def bridge_lost(self) -> bool:
-        """Whether the main session's link to a bridge went within the last second, as far as was looked."""
+        """Whether the main session lost its link to a bridge within the last second, as far as checks have seen."""
         try:
             there = {str(router) for router in self._session.info.routers_zid()}
         except zenoh.ZError:  # closed
@@ -113,21 +112,21 @@ class Links:
         return self.bridge_lost() or bool(self._routers)
 
     def count(self) -> int:
-        """How many links the main session has."""
+        """The number of links of the main session."""
         try:
             return len(_others(self._session))
         except zenoh.ZError:  # closed
             return 0
 
     def linked(self, session: str) -> bool:
-        """Whether the main session is linked to one whose id begins so."""
+        """Whether the main session is linked to one whose id begins with this text."""
         try:
             return any(other.startswith(session) for other in _others(self._session))
         except zenoh.ZError:  # closed
             return False
 
     def interfaces(self, endpoint: str) -> list[str]:
-        """By which interfaces one comes to the main session at that endpoint of its own; none if one cannot."""
+        """The interfaces that reach the main session at one of its endpoints; empty if it is unreachable there."""
         asking = self._beside([], [endpoint], {})
         try:
             return [name for link in asking.info.links() for name in link.interfaces]
@@ -135,7 +134,7 @@ class Links:
             asking.close()
 
     def linked_at(self, endpoint: str) -> bool:
-        """Whether one of the main session's links leads there."""
+        """Whether one of the main session's links leads to an endpoint."""
         wanted = set(Endpoint.read(endpoint).resolved())
         try:
             return any(_plain(str(link.dst)) in wanted for link in self._session.info.links())
@@ -143,12 +142,12 @@ class Links:
             return False
 
     def beacon(self) -> Beacon:
-        """A session linked to the main one that answers scouts and dials nobody, until it is closed."""
+        """Opens a session, linked to the main one, that answers scouts and does not dial, until it is closed."""
         listen = str(self._shown._replace(port=0))
         return Beacon(self._beside([listen], [self._door()], {**self._scouting(), "id": self._beacon_id}))
 
     def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
-        """Ask who is there; each container of this system that lets itself be found, once."""
+        """Scouts for containers; yields each discoverable container of this system once."""
         seen = {self._beacon_id}
         asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=_config(self._scouting()))
         try:
@@ -166,10 +165,10 @@ class Links:
             asking.stop()
 
     def join(self, endpoints: Sequence[str], session: str, wait_s: float, ended: Callable[[], bool]) -> str:
-        """Link the main session with one whose id begins so, or else with whoever listens there.
+        """Link the main session with the one whose id begins with ``session``, or else with any listener there.
 
         Returns:
-            The id of whom it is linked to now; empty if nobody lets us in within ``wait_s``.
+            The id of the session it is linked to now; empty if none accepts it within ``wait_s``.
         """
         helper = self._beside([], [self._door(), *endpoints], {})
         try:
@@ -184,7 +183,7 @@ class Links:
             helper.close()
 
     def _door(self) -> str:
-        """Where a session of this process reaches the main one."""
+        """The endpoint at which a session of this process reaches the main one."""
         return dialled_from_here(self.listen[0])
 
     def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
@@ -212,7 +211,7 @@ class Links:
         }
 
     def _interface(self) -> str:
-        """S21: who listens on this host only asks and answers on this host only."""
+        """S21: a container that listens on this host only scouts and answers on this host only."""
         if not all(own.loopback for own in self.listen):
             return "auto"
         loopback = loopback_interface()
@@ -223,7 +222,7 @@ class Links:
 
 
 def _others(session: zenoh.Session) -> list[str]:
-    """Ids of whom a session is linked to."""
+    """The ids of the sessions that a session is linked to."""
     return [str(other) for other in (*session.info.peers_zid(), *session.info.routers_zid())]
 
 
@@ -234,8 +233,8 @@ def _found(beacon: str, locators: Iterable[str]) -> Found:
 
 
 def _tag(settings: dict[str, Any]) -> str:
-    """What the ids of one system's beacons begin with; without its password, or its authority's certificate, nobody can
-    tell which system it is.
+    """The prefix of the ids of one system's beacons; without the system's password, or its authority's certificate, the
+    system cannot be identified from it.
     """
     known = authority(settings[_TLS]) if _TLS in settings else str(settings[_PASSWORD]).encode()
     digest = hmac.digest(known, str(settings["namespace"]).encode(), hashlib.sha256).hex()

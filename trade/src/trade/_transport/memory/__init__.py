@@ -1,8 +1,8 @@
-"""The transport in memory: a whole network in one process, with a clock of its own and faults on demand.
+"""The transport in memory: a whole network in one process, with its own clock and with faults on demand.
 
-Its guarantees are those of `_transport.base`; where that leaves something open it does what zenoh does. Messages that
-nothing delays arrive before ``put`` returns; the others when the network's clock is moved on. Readers are real threads
-on real queues.
+It has the guarantees of `_transport.base`; where those leave something open it behaves like zenoh. Messages without a
+delay arrive before ``put`` returns, the others when the network's clock advances. Readers are real threads on real
+queues.
 """
 
 from trade._transport.memory.clock import Clock

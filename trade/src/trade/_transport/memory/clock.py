@@ -1,4 +1,4 @@
-"""Time that moves only when it is told to, and what is to happen at its moments."""
+"""A clock that a test moves, and the actions scheduled on it."""
 
 import heapq
 import itertools
@@ -9,10 +9,10 @@ __all__ = ["Clock"]
 
 
 class Clock:
-    """A monotonic clock that stands still until somebody moves it.
+    """A monotonic clock that advances only when a test moves it.
 
-    What was put off happens on the thread that moves the time: at its moment, in order of its moment, and what falls on
-    one moment in the order it was asked for, urgent things first.
+    Scheduled actions run on the thread that moves the time, in order of their times. Actions of one time run in the
+    order in which they were scheduled, urgent ones first.
     """
 
     def __init__(self) -> None:
@@ -27,12 +27,12 @@ class Clock:
         return self._now_ns
 
     def at(self, when_ns: int, action: Callable[[], None], *, urgent: bool = False) -> None:
-        """Do something at a time; what lies in the past happens when time moves next."""
+        """Schedule an action; one in the past runs when the time moves next."""
         with self._lock:
             heapq.heappush(self._due, (when_ns, not urgent, next(self._order), action))
 
     def advance(self, duration_s: float) -> None:
-        """Move the time on by so many seconds; everything due on the way happens."""
+        """Advance the time by some seconds and run every action that becomes due."""
         with self._moving:
             until_ns = self._now_ns + round(duration_s * 1e9)
             while self._step(until_ns):
@@ -40,7 +40,7 @@ class Clock:
             self._now_ns = until_ns
 
     def step(self) -> bool:
-        """Move the time on to what is due next and do it. Returns whether there was anything."""
+        """Advance the time to the next action and run it. Returns False if none was scheduled."""
         with self._moving:
             return self._step(None)
 

@@ -9,9 +9,9 @@ _ANY: Final = "**"
 
 @functools.lru_cache(maxsize=4096)
 def meet(one: str, other: str) -> bool:
-    """Whether some key fits both; either may be a pattern or a plain key.
+    """Whether some key matches both arguments; each is a pattern or a plain key.
 
-    As in zenoh, a chunk that begins with ``@`` is met by nothing but itself.
+    As in zenoh, a chunk that begins with ``@`` matches only itself.
     """
     return _meet(one.split("/"), other.split("/"))
 

@@ -1,4 +1,4 @@
-"""What lies between two transports of a memory network: a link of two ways, with delays and cuts."""
+"""A bidirectional link between two transports of a memory network, with delays and cuts."""
 
 import enum
 import itertools
@@ -11,27 +11,27 @@ from trade._transport.memory.traffic import Arrive, Traffic
 
 
 class Kind(enum.Enum):
-    """What a message between two transports is."""
+    """The kind of a message between two transports."""
 
     PUT = "put"
     URGENT = "urgent"
     DROPPABLE = "droppable"
-    """Urgent, and lost where it would have to wait."""
+    """Urgent, and dropped where it would have to wait."""
     ANNOUNCE = "announce"
     RISE = "rise"
-    """A sign of life goes up."""
+    """A sign of life appears."""
     FALL = "fall"
-    """A sign of life is taken down."""
+    """A sign of life is withdrawn."""
     ASK = "ask"
-    """What stands?"""
+    """A query for the current announcements."""
     ANSWER = "answer"
-    """Something that stands."""
+    """One current announcement."""
     LEAVE = "leave"
     """The transport closes."""
 
 
 class Lane(enum.Enum):
-    """Messages of one lane stay in order; those of different ones may overtake each other."""
+    """Messages of one lane keep their order; messages of different lanes may overtake each other."""
 
     URGENT = enum.auto()
     DATA = enum.auto()
@@ -52,13 +52,13 @@ _LANES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """How long messages travel: ``least_s``, and up to ``jitter_s`` more, evenly spread."""
+    """How long messages travel: ``least_s``, plus up to ``jitter_s``, evenly distributed."""
 
     least_s: float = 0.0
     jitter_s: float = 0.0
 
     def draw_ns(self, generator: random.Random) -> int:
-        """One message's travel time."""
+        """The travel time of one message."""
         jitter_s = generator.uniform(0.0, self.jitter_s) if self.jitter_s else 0.0
         return round((self.least_s + jitter_s) * 1e9)
 
@@ -66,15 +66,15 @@ class Delay:
 class Way:
     """One direction of a link, used under the network's lock.
 
-    What is sent while it is cut waits, as on a TCP connection, and arrives after it heals; unless the link is given up
-    before.
+    Messages sent during a cut wait, as on a TCP connection, and arrive after the link heals, unless the link is given
+    up first.
     """
 
     def __init__(self, traffic: Traffic, generator: random.Random, delay: Delay) -> None:
         self.delay = delay
         self.cut = False
         self.cuts = 0
-        """How often it was cut: tells one cut from the next."""
+        """The number of cuts so far; distinguishes one cut from the next."""
         self._traffic = traffic
         self._random = generator
         self._held: list[tuple[Kind, Arrive]] = []
@@ -82,7 +82,7 @@ class Way:
         self.drop()
 
     def send(self, kind: Kind, arrive: Arrive) -> None:
-        """Let something arrive after its delay, behind what went before it in its lane; leaving goes behind all."""
+        """Deliver a message after its delay, behind earlier messages of its lane; leaving goes behind all lanes."""
         if self.cut:
             if kind is not Kind.DROPPABLE:
                 self._held.append((kind, arrive))
@@ -114,7 +114,7 @@ class Way:
             self.send(kind, arrive)
 
     def drop(self) -> None:
-        """Begin anew: nothing of what is under way or waits will arrive."""
+        """Reset: drop everything that is in flight or waits."""
         self._connection = next(self._connections)
         self._held.clear()
         self._under_way = dict.fromkeys(Lane, 0)
@@ -127,7 +127,7 @@ class Link:
     def __init__(self, one: Node, other: Node, traffic: Traffic, generator: random.Random, delay: Delay) -> None:
         self.ends: Final = (one, other)
         self.ways: Final = {node: Way(traffic, generator, delay) for node in self.ends}
-        """By the node they lead from."""
+        """By the node that each direction starts from."""
         self.up = True
 
     def drop(self) -> None:
@@ -136,6 +136,6 @@ class Link:
             way.drop()
 
     def far_end(self, node: Node) -> Node:
-        """The other one."""
+        """The node at the other end."""
         one, other = self.ends
         return other if node is one else one

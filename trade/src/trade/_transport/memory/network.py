@@ -1,4 +1,4 @@
-"""A network in memory: which nodes can reach each other, what passes between them, and what goes wrong on the way."""
+"""A network in memory: which nodes reach each other, the messages between them, and simulated faults."""
 
 import itertools
 import math
@@ -20,11 +20,11 @@ from trade._transport.memory.traffic import Arrive, Traffic
 
 @dataclass(frozen=True, slots=True)
 class InFlightMessage:
-    """A message between two transports, as a tap sees it: once when it is sent, once when it has arrived."""
+    """A message between two transports, as a tap sees it: once when it is sent, and once when it has arrived."""
 
     kind: Kind
     source: str
-    """Name of the sender."""
+    """Name of the sending node."""
     target: str
     key: str
     payload: bytes | None
@@ -37,22 +37,22 @@ Tap = Callable[[InFlightMessage], None]
 
 
 class Network:
-    """Where the memory transports of one system meet.
+    """The network on which the memory transports of one system meet.
 
     Messages arrive at once, before ``put`` returns, unless their link has a delay or is cut. Nothing else takes time:
-    questions (``ask``, ``present``) and answers arrive at once wherever the link has not been given up, and who joins
-    is linked with all others. Time is the network's own and stands still until it is moved: see ``clock`` and
-    ``traffic``. Containers keep their deadlines by the real clock.
+    queries (``ask``, ``present``) and replies arrive at once wherever the link has not been given up, and a new node is
+    linked with all others. The network has its own time, which stops until it is moved: see ``clock`` and ``traffic``.
+    Containers measure their deadlines with the real clock.
 
-    A link that is cut (``partition``) keeps what is put on it, as a TCP connection would. Healed within the lease, it
-    delivers all of that. Else the link is given up: signs of life fall on both sides and what it kept is lost; when it
-    heals, they rise again. Single messages are lost where ``lose`` says so.
+    A link that is cut (``partition``) keeps what is sent on it, as a TCP connection would. If it heals within the
+    lease, it delivers all of that. Otherwise the link is given up: signs of life disappear on both sides and the kept
+    messages are lost; when it heals, the signs reappear. Single messages are lost where ``lose`` selects them.
 
     Args:
-        seed: of the generator that draws jitter.
-        lease_s: how long a cut is borne.
-        beat_s: see ``Transport``, in seconds of the real clock; never, by default.
-        clock: another one than a new one at zero.
+        seed: seed of the generator of jitter.
+        lease_s: the time after which a cut link is given up.
+        beat_s: see ``Transport``, in seconds of the real clock; no beats by default.
+        clock: the clock to use instead of a new one at zero.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Network:
         """How many messages of each kind were sent from one transport to another."""
         self.lock: Final = threading.RLock()
         self.changed: Final = threading.Condition(self.lock)
-        """Told when a question may have ended."""
+        """Notified when a query may have ended."""
         self.beat_s: Final = beat_s
         self._lease_s = lease_s
         self.traffic: Final = Traffic(self.clock, self._under_lock)
@@ -72,9 +72,9 @@ class Network:
         self._nodes: list[Node] = []
         self._named: dict[str, Node] = {}
         self._links: dict[Node, dict[Node, Link]] = {}
-        """Of each node, by its neighbour: what one sends costs nothing for the links of others."""
+        """By node and neighbour: a send does not search the links of other nodes."""
         self._routes: dict[str, list[Node]] = {}
-        """Who hears a key, in the order in which they joined; of keys that were put on since anybody listened anew."""
+        """The nodes that receive a key, in the order in which they joined; each new subscription clears this cache."""
         self._taps: list[Tap] = []
         self._losing: list[Callable[[InFlightMessage], bool]] = []
         self._numbers = itertools.count(1)
@@ -83,10 +83,10 @@ class Network:
         with self.lock:
             arrive()
 
-    # --- who is there
+    # --- membership
 
     def join(self, name: str) -> Node:
-        """A new node, linked with all others; it knows their signs of life when this returns."""
+        """Add a node that is linked with all others; it knows their signs of life when this returns."""
         with self.lock:
             node = self._named[name] = Node(name)
             others, self._nodes = self._nodes, [*self._nodes, node]
@@ -102,11 +102,11 @@ class Network:
             return node
 
     def node(self, name: str) -> Node | None:
-        """The one that joined last under a name, even if it has ended."""
+        """The node that joined last under a name, even if it has ended."""
         return self._named.get(name)
 
     def leave(self, node: Node) -> None:
-        """An orderly end: what was sent before arrives, then all signs of life fall. Idempotent."""
+        """End a node in order: its earlier messages arrive, then all its signs of life disappear. Idempotent."""
         with self.lock:
             if node.closed:
                 return
@@ -117,7 +117,7 @@ class Network:
                 self.pass_on(Kind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
 
     def kill(self, node: Node) -> None:
-        """The end of a process without a goodbye: what it sent and has not arrived is lost. Idempotent."""
+        """End a node like a killed process: its messages that have not arrived are lost. Idempotent."""
         with self.lock:
             if node.closed:
                 return
@@ -146,14 +146,14 @@ class Network:
             if node.closed and not links:
                 self._links.pop(node, None)
 
-    # --- what passes
+    # --- messages
 
     def next_number(self) -> int:
-        """A number nobody else in this network has."""
+        """A number that is unique in this network."""
         return next(self._numbers)
 
     def spread(self, source: Node, message: Message, kind: Kind) -> None:
-        """To all who would read it; to readers of the source itself at once."""
+        """Send to all nodes that would read the message; readers of the source itself get it at once."""
         with self.lock:
             _check_open(source)
             source.take(message, own=True)
@@ -170,11 +170,11 @@ class Network:
         return found
 
     def route_anew(self) -> None:
-        """Somebody hears something else now. Used under the network's lock."""
+        """Clear the routes after a subscription changed. Used under the network's lock."""
         self._routes.clear()
 
     def show(self, source: Node, token: int, key: str) -> None:
-        """A sign of life for everybody."""
+        """Show a sign of life to all nodes."""
         with self.lock:
             _check_open(source)
             source.tokens[token] = key
@@ -183,7 +183,7 @@ class Network:
                 self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
 
     def hide(self, source: Node, token: int) -> None:
-        """Take a sign of life down. Idempotent."""
+        """Withdraw a sign of life. Idempotent."""
         with self.lock:
             key = source.tokens.pop(token, None)
             if key is None:
@@ -193,7 +193,7 @@ class Network:
                 self.pass_on(Kind.FALL, source, target, Message(key, None), _losing(target, token))
 
     def ask(self, source: Node, pattern: str, timeout_s: float) -> list[Answer]:
-        """Ask all others; wait, by the real clock, until those that are not lost have said all."""
+        """Query all others; wait, by the real clock, until all that are not lost have replied."""
         with self.lock:
             _check_open(source)
             questions = [
@@ -209,19 +209,19 @@ class Network:
             return [question.said for question in questions if question.said.messages]
 
     def linked(self, one: Node, other: Node) -> bool:
-        """Whether there is a link that is up, between two that are open."""
+        """Whether a link between two open nodes is up."""
         link = self._link(one, other)
         return link is not None and link.up and not (one.closed or other.closed)
 
     def _others(self, node: Node) -> list[Node]:
-        """Those it has a link to that is up."""
+        """The nodes to which it has a link that is up."""
         others = [link.far_end(node) for link in self._links_of(node) if link.up]
         return [other for other in others if not other.closed]
 
     def pass_on(
         self, kind: Kind, source: Node, target: Node, message: Message, arrive: Arrive, *, at_once: bool = False
     ) -> None:
-        """One message over one link; the link may be gone by the time a tap has seen it."""
+        """Send one message over one link; a tap may have removed the link meanwhile."""
         self.sent[kind] += 1
         passage = InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=False)
         self._tell_taps(passage)
@@ -238,25 +238,25 @@ class Network:
         arrived() if at_once else link.ways[source].send(kind, arrived)
 
     def tap(self, hear: Tap) -> Callable[[], None]:
-        """Show somebody every message between two transports, before it is sent and after it arrived.
+        """Show a function every message between two transports, before it is sent and after it has arrived.
 
-        It is told under the network's lock, on the thread that sends or moves the time: it may kill, partition and
-        heal, but neither wait, nor move the time, nor use a container.
+        The function runs under the network's lock, on the thread that sends or moves the time: it may kill, partition
+        and heal, but neither wait, nor move the time, nor use a container.
 
         Returns:
-            A function that ends it.
+            A function that removes the tap.
         """
         self._taps.append(hear)
         return lambda: self._taps.remove(hear)
 
     def lose(self, which: Callable[[InFlightMessage], bool]) -> Callable[[], None]:
-        """Lose messages on their way; both ends stay linked.
+        """Drop selected messages in flight; both ends stay linked.
 
         Args:
-            which: tells of a message before it is sent whether it is lost. It may do what a tap may.
+            which: decides before a message is sent whether it is lost. It may do what a tap may.
 
         Returns:
-            A function that ends it.
+            A function that ends the loss.
         """
         self._losing.append(which)
         return lambda: self._losing.remove(which)
@@ -265,10 +265,10 @@ class Network:
         for tap in list(self._taps):
             tap(passage)
 
-    # --- what goes wrong
+    # --- faults
 
     def delay(self, least_s: float, *, jitter_s: float = 0.0, between: tuple[Node, Node] | None = None) -> None:
-        """Let messages travel for ``least_s`` and up to ``jitter_s`` more, on one link or on all, later ones, too."""
+        """Delay messages by ``least_s`` plus up to ``jitter_s``, on one link or on all, including later ones."""
         delay = Delay(least_s, jitter_s)
         with self.lock:
             if between is None:
@@ -278,7 +278,7 @@ class Network:
                     way.delay = delay
 
     def partition(self, one: Node, other: Node, *, one_way: bool = False) -> None:
-        """Cut a link; ``one_way``: only from the first to the second. A cut that outlasts the lease ends the link."""
+        """Cut a link; ``one_way``: only from the first node to the second. A cut beyond the lease ends the link."""
         with self.lock:
             link = self._link(one, other)
             if link is None:
@@ -310,7 +310,7 @@ class Network:
             self.changed.notify_all()
 
     def heal(self, one: Node | None = None, other: Node | None = None) -> None:
-        """Mend the link of two nodes, or all links of one, or all."""
+        """Heal the link of two nodes, all links of one node, or all links."""
         with self.lock:
             named = {node for node in (one, other) if node is not None}
             for link in [link for link in self._all_links() if named <= {*link.ends}]:
@@ -321,7 +321,7 @@ class Network:
                     self._link_again(link)
 
     def _link_again(self, link: Link) -> None:
-        """Both tell what they show."""
+        """Show each node the signs of life of the other."""
         link.up = True
         for source in link.ends:
             target = link.far_end(source)

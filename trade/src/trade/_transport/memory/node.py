@@ -1,4 +1,4 @@
-"""One transport as its network sees it: what it announces, which signs it shows, what it hears."""
+"""One transport as its network sees it: its announcements, signs of life and subscriptions."""
 
 import contextlib
 import queue
@@ -12,7 +12,7 @@ _T = TypeVar("_T")
 
 
 class Inbox(Generic[_T]):
-    """A queue of one node. Like zenoh's, it gives what came before it was closed, and ends then."""
+    """A queue of one node. Like zenoh's, it still delivers what came before it was closed."""
 
     def __init__(self, pattern: str, forget: Callable[["Inbox[_T]"], None]) -> None:
         self.pattern: Final = pattern
@@ -22,7 +22,7 @@ class Inbox(Generic[_T]):
 
     @property
     def busy(self) -> bool:
-        """Whether its reader, if there is one only, still has something to take up or is at work on it."""
+        """Whether its only reader still has an item to take or is working on one."""
         return self._dealt_with < self._given
 
     def fits(self, key: str) -> bool:
@@ -47,25 +47,25 @@ class Inbox(Generic[_T]):
 
 
 class MemoryChannel(Inbox[Message], Channel):
-    """What one subscription hears."""
+    """The messages of one subscription."""
 
     def __init__(
         self, pattern: str, forget: Callable[[Inbox[Message]], None], *, of_others: bool = False, newest: int = 0
     ) -> None:
         super().__init__(pattern, forget)
         self.of_others: Final = of_others
-        """Whether it hears announcements, those of others."""
+        """Whether it receives announcements of other nodes."""
         self._newest = newest
 
     def take(self, item: Message) -> None:
         if self._newest and self._queue.qsize() >= self._newest:
-            with contextlib.suppress(queue.Empty):  # its reader was quicker
+            with contextlib.suppress(queue.Empty):  # its reader took it meanwhile
                 self._queue.get_nowait()
         super().take(item)
 
 
 class MemoryQuestions(Inbox[Question], Questions):
-    """What one is asked."""
+    """The queries that one node receives."""
 
 
 class Node:
@@ -77,7 +77,7 @@ class Node:
         self.tokens: dict[int, str] = {}
         """Its own signs of life."""
         self.seen: dict[int, tuple[Node, str]] = {}
-        """Signs of life that it knows to stand, its own included."""
+        """The signs of life that it currently sees, its own included."""
         self.ears: list[MemoryChannel] = []
         self.watches: list[MemoryChannel] = []
         self.asked: list[MemoryQuestions] = []
@@ -86,29 +86,29 @@ class Node:
         return f"<Node {self.name}>"
 
     def hears(self, key: str) -> bool:
-        """Whether anybody here would read what is put on a key."""
+        """Whether some reader of this node would receive a message on a key."""
         return any(ear.fits(key) for ear in self.ears)
 
     def take(self, message: Message, *, own: bool) -> None:
-        """A message arrives."""
+        """Receive a message."""
         for ear in self.ears:
             if ear.fits(message.key) and not (own and ear.of_others):
                 ear.take(message)
 
     def see(self, owner: "Node", token: int, key: str) -> None:
-        """A sign of life rises."""
+        """A sign of life appears."""
         if token not in self.seen:
             self.seen[token] = (owner, key)
             self._tell(key, b"")
 
     def lose_sight(self, token: int) -> None:
-        """A sign of life falls."""
+        """A sign of life disappears."""
         _, key = self.seen.pop(token, (None, None))
         if key is not None:
             self._tell(key, None)
 
     def lose_all_of(self, owner: "Node") -> None:
-        """Another node is gone or out of reach."""
+        """Another node is gone or unreachable."""
         for token, (of, _) in list(self.seen.items()):
             if of is owner:
                 self.lose_sight(token)
@@ -120,7 +120,7 @@ class Node:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody still has to take up an announcement, a sign of life or a question."""
+        """Whether an announcement, a sign of life or a query still waits for its reader."""
         return any(inbox.busy for inbox in [*self.watches, *self.asked, *(ear for ear in self.ears if ear.of_others)])
 
     def end(self) -> None:

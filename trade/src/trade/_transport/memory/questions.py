@@ -1,4 +1,4 @@
-"""Asking in memory: a question goes to one who is asked, what that says goes back, and both take no time."""
+"""Queries in memory: a query goes to one node, its replies come back, and neither takes time."""
 
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class MemoryQuestion(Question):
-    """One question to one who is asked."""
+    """One query to one node."""
 
     def __init__(self, network: "Network", source: Node, target: Node, pattern: str, asked: MemoryQuestions) -> None:
         self.said = Answer(f"{target.name}-{network.next_number()}", [])
@@ -24,7 +24,7 @@ class MemoryQuestion(Question):
         self._closed = False
 
     def send(self) -> None:
-        """Used under the network's lock."""
+        """Send the query. Used under the network's lock."""
         message = Message(self._pattern, None)
         self._network.pass_on(
             Kind.ASK, self._source, self._target, message, lambda: self._asked.take(self), at_once=True
@@ -32,7 +32,7 @@ class MemoryQuestion(Question):
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will be said; used under the network's lock."""
+        """Whether no more replies will come; used under the network's lock."""
         return self._closed or not self._network.linked(self._source, self._target)
 
     def answer(self, key: str, payload: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What is under way in a network, and moving the time on for it."""
+"""The messages in flight in a network, and advancing the time for them."""
 
 import contextlib
 import math
@@ -17,8 +17,8 @@ Arrive = Callable[[], None]
 class Traffic:
     """Messages that have a delay, until they arrive.
 
-    Time moves only when told to. ``settle`` is for what a test sent itself; ``drive`` and ``flowing`` are for what real
-    threads answer: the time goes on with the messages, as fast as they come, and stands while nothing is under way.
+    Time advances only on request. ``settle`` is for messages that a test sent itself. ``drive`` and ``flowing`` are
+    for replies of real threads: the time advances with the messages, as fast as they come, and stops without any.
     """
 
     def __init__(self, clock: Clock, locked: Callable[[Arrive], None]) -> None:
@@ -27,7 +27,7 @@ class Traffic:
         self._locked = locked
 
     def later(self, due_ns: int, arrive: Arrive, *, urgent: bool) -> None:
-        """Let something arrive at a time, under the network's lock."""
+        """Schedule the arrival of a message, under the network's lock."""
 
         def at_last() -> None:
             self.under_way -= 1
@@ -37,26 +37,26 @@ class Traffic:
         self.clock.at(due_ns, lambda: self._locked(at_last), urgent=urgent)
 
     def settle(self) -> None:
-        """Move the time on until nothing is under way."""
+        """Advance the time until nothing is in flight."""
         while self.under_way:
             self.clock.step()
 
     def drive(self, until: Callable[[], bool], limit_s: float = 10.0) -> None:
-        """Move the time on from message to message until something holds that real threads bring about.
+        """Advance the time from message to message until a condition holds that real threads bring about.
 
         Raises:
-            TimeoutError: it does not hold after ``limit_s`` seconds of the real clock.
+            TimeoutError: the condition does not hold after ``limit_s`` seconds of the real clock.
         """
         deadline = time.monotonic() + limit_s
         while not until():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"what the network was driven for does not hold after {limit_s} s")
+                raise TimeoutError(f"the condition that the network was driven for does not hold after {limit_s} s")
             if not (self.under_way and self.clock.step()):
                 threading.Event().wait(_LOOK_AGAIN_S)
 
     @contextlib.contextmanager
     def flowing(self) -> Generator[None, None, None]:
-        """Drive the network from a thread of its own, so that one may wait for calls over delayed links."""
+        """Drive the network on its own thread, so that a test can wait for calls over delayed links."""
         done = threading.Event()
         arguments = (done.is_set, math.inf)
         thread = threading.Thread(target=self.drive, args=arguments, name="trade-memory-network", daemon=True)

@@ -1,4 +1,4 @@
-"""The five verbs on a network in memory."""
+"""The transport interface on a network in memory."""
 
 from collections.abc import Callable
 from typing import Any
@@ -40,8 +40,8 @@ class MemoryTransport(Transport):
     """A transport on a network in memory.
 
     Args:
-        network: the one it joins.
-        name: what taps call it.
+        network: the network to join.
+        name: the name that taps see.
     """
 
     def __init__(self, network: Network, name: str = "") -> None:
