@@ -58,8 +58,8 @@ def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: 
     with caplog.at_level(logging.WARNING, "trade"):
         assert outsider.reach._thread is not None
         outsider.reach._thread.join(20)  # it has nothing to do once this is settled
-    assert f"no link to {endpoint}: something listens there but does not let us in" in caplog.text
-    with pytest.raises(CannotConnect, match="do both have the same user and password"):
+    assert f"no link to {endpoint}: something listens there but refuses the link" in caplog.text
+    with pytest.raises(CannotConnect, match="Do both have the same user and password"):
         outsider.system.connect(endpoint)
 
 

@@ -140,7 +140,7 @@ def test_a_wrong_file_of_revoked_identities_is_named(tmp_path: Path) -> None:
 
 def test_half_a_list_of_revoked_identities_takes_nobody_off_it(tmp_path: Path) -> None:
     written(tmp_path, "", "r.toml")  # as it is while it is being copied
-    with pytest.raises(ConfigurationError, match=r"r.toml: revoked: missing; write revoked = \[\] if no identity is revoked"):
+    with pytest.raises(ConfigurationError, match=r"revoked: missing; write revoked = \[\] if no identity is revoked"):
         read_policy(written(tmp_path, 'revoked_file = "r.toml"\n' + ROLE.format("")))
 
 

@@ -169,7 +169,7 @@ def test_only_so_many_wait(
 
 
 def test_a_stop_cannot_be_serial() -> None:
-    with pytest.raises(ConfigurationError, match="a stop waits for nobody"):
+    with pytest.raises(ConfigurationError, match="a stop cannot be serial"):
         service(effect="stop", serial=True)
 
 

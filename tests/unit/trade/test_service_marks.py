@@ -346,7 +346,7 @@ def test_an_unknown_effect_is_refused_where_it_is_written() -> None:
 
 
 def test_a_property_cannot_be_a_service() -> None:
-    with pytest.raises(ConfigurationError, match="@service stands on a method"):
+    with pytest.raises(ConfigurationError, match="@service decorates a method"):
 
         class Wrong:
             @service

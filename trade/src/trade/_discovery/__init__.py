@@ -1,1 +1,1 @@
-"""Finding other containers: dialling, announcing, listening, and asking again for what was missed."""
+"""Discovery of other containers: dialling, announcing, listening, and querying again for missed messages."""

@@ -1,4 +1,4 @@
-"""What this container announces: told at once, kept for those who ask, and counted so that nobody misses any of it."""
+"""Announces the services of this container: sends each change at once, answers queries, and numbers revisions."""
 
 import logging
 import threading
@@ -11,14 +11,14 @@ from trade._transport.base import ChannelClosed, Presence, Question, Transport
 _logger = logging.getLogger("trade")
 
 SELDOM: Final = 8
-"""Every how many beats who has nothing new says how far it is."""
+"""A container with no news announces its revision every this many beats."""
 
 
 class Announcer:
-    """Owns what stands. One at a time announces; a thread of its own answers who asks.
+    """Owns the current announcements. One thread announces at a time; its own thread answers queries.
 
-    The revision of each announcement is one more than that of the one before, whatever it is about: who finds one
-    missing asks. Nothing is sent before `appear`: nobody takes it up, and everybody asks then.
+    Each announcement has the next revision number, whatever provider it is about, so a container that misses one can
+    query for it. Nothing is sent before `appear`: no container would take it, and all of them query at that moment.
     """
 
     def __init__(self, transport: Transport, own: Address) -> None:
@@ -35,7 +35,7 @@ class Announcer:
         self._thread.start()
 
     def appear(self) -> Presence:
-        """Put up the container's sign of life, and tell everybody whatever is announced from now on.
+        """Publish the container's sign of life, and send all later announcements to the other containers.
 
         Raises:
             ChannelClosed: the transport was closed.
@@ -44,7 +44,7 @@ class Announcer:
         return self._transport.appear(alive_key(self._own))
 
     def announce(self, domain: str, provider: str, info: ProviderInfo) -> None:
-        """Tell everybody of a provider, or that it is gone if it has no services.
+        """Announce a provider to all containers, or its end if it has no services.
 
         Raises:
             ChannelClosed: the transport was closed.
@@ -60,10 +60,10 @@ class Announcer:
             self._transport.announce(key, payload)
 
     def beat(self) -> None:
-        """Say how far it is if it is time for that, for those who missed the last thing that was announced.
+        """Announce the current revision if it is due, for containers that missed the last announcement.
 
-        That is at the first beat after it, the second, the fourth and so on, and then at every eighth (`SELDOM`): as
-        all hear all others, what is said for nothing grows with the square of how many there are.
+        It is due at the first beat after an announcement, the second, the fourth and so on, then at every eighth
+        (`SELDOM`): as all containers receive it, the traffic grows with the square of their number.
 
         Raises:
             ChannelClosed: the transport was closed.
@@ -82,10 +82,10 @@ class Announcer:
                 return
             try:
                 self._answer(question)
-            except ChannelClosed:  # who asked is gone
+            except ChannelClosed:  # the querying container is gone
                 continue
             except Exception:
-                _logger.exception("a question for what stands could not be answered")
+                _logger.exception("a query for the current announcements could not be answered")
             finally:
                 question.close()
 
@@ -97,7 +97,7 @@ class Announcer:
         question.answer(tally_key(self._own), encode_message(Tally(PROTOCOL, revision)))
 
     def close(self) -> None:
-        """Answer nobody any more. Idempotent."""
+        """Stop answering queries. Idempotent."""
         self._questions.close()
         if self._thread is not threading.current_thread():
             self._thread.join(2)

@@ -1,7 +1,7 @@
-"""Whom a running container links to, and whether it lets itself be found; none of it touches the main session.
+"""Links a running container to others, and makes it discoverable; the main session stays as it is.
 
-One thread, there only while it has something to do: it looks for containers while discovery is on, and dials again
-what it was told to connect to whenever the link is gone.
+One thread, alive only while it has work: it looks for containers while discovery is on, and dials a configured endpoint
+again whenever its link is gone.
 """
 
 import logging
@@ -20,13 +20,13 @@ _ROUND_S: Final = 1.0
 _SCOUT_S: Final = 0.5
 _JOIN_S: Final = 2.0
 _AGAIN_S: Final = 5.0
-"""Who did not let us in is left alone so long."""
+"""A peer that refused a link is not dialled again for this long."""
 _REFUSED_S: Final = 3.0
-"""A configured endpoint that accepts connections but is not linked by then refuses us."""
+"""A configured endpoint that accepts connections but is not linked within this time refuses this container."""
 
 
 class Dialer:
-    """Switches of one container; safe to use from any thread."""
+    """The discovery switches of one container; thread-safe."""
 
     def __init__(self, links: Links, may_dial: Callable[[str], None], configured: Sequence[str] = ()) -> None:
         self._links = links
@@ -35,9 +35,9 @@ class Dialer:
         self._beacon: Beacon | None = None
         self._discovering = False
         self._kept: dict[str, str] = {}
-        """Endpoint -> id of the session found there."""
+        """From each endpoint to the id of the session found there."""
         self.configured: Final = tuple(configured)
-        """The endpoints it was told to dial when it was started."""
+        """The endpoints to dial that its settings name."""
         self._unsure = list(configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
@@ -88,7 +88,7 @@ class Dialer:
             self._ensure_thread()
 
     def disconnect(self, endpoint: str) -> None:
-        """Dial it no more; raises LinkStays while the link is there, which only its ends' closing can end."""
+        """Stop dialling an endpoint; raises LinkStays while the link exists, as only closing an end removes it."""
         Endpoint.read(endpoint)
         with self._lock:
             self._check_open()
@@ -102,19 +102,19 @@ class Dialer:
         return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
 
     def unlinked(self) -> list[str]:
-        """Those of the configured endpoints that none of the links leads to."""
+        """The configured endpoints that no link leads to."""
         return [endpoint for endpoint in self.configured if not self._links.linked_at(endpoint)]
 
     def why_apart(self, endpoint: str, *, certain: bool) -> str:
-        """Why there is no link to an endpoint that none leads to.
+        """Why no link leads to an endpoint.
 
         Args:
-            endpoint: a configured one.
-            certain: whether it is known that there is none; else somebody there may have dialled us, which is looked at
-                for two seconds at most.
+            endpoint: a configured endpoint.
+            certain: whether the link is known to be missing; otherwise the peer may have dialled this container, which
+                is checked for two seconds at most.
 
         Returns:
-            The reason; empty if there is a link.
+            The reason; empty if a link exists.
         """
         why = _why(endpoint, self._links)
         if certain or not accepts(endpoint):
@@ -166,7 +166,7 @@ class Dialer:
                     self._kept[endpoint] = there
 
     def _judge(self) -> None:
-        """Say once which of the configured endpoints refuse us; nothing else ever would."""
+        """Warn once about each configured endpoint that refuses this container; nothing else would report it."""
         self._unsure = [endpoint for endpoint in self._unsure if not self._links.linked_at(endpoint)]
         if time.monotonic() < self._unsure_until:
             return
@@ -194,18 +194,18 @@ class Dialer:
 
 
 _REFUSED: Final = {
-    False: "something listens there but does not let us in; do both have the same user and password?",
+    False: "something listens there but refuses the link. Do both have the same user and password?",
     True: (
-        "something listens there but there is no link; are both certificates in date and of one authority, and is the "
-        "other one for the addresses it listens on?"
+        "something listens there but there is no link. Are both certificates in date and of one authority, and is the "
+        "peer's valid for the addresses it listens on?"
     ),
 }
-"""By whether we have a certificate."""
+"""By whether this container has a certificate."""
 _BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
 
 
 def _why(endpoint: str, links: Links) -> str:
     if not accepts(endpoint):
-        return "nothing accepts connections there; is it up, and the address right?"
+        return "nothing accepts connections there. Is it up, and is the address right?"
     refused = _REFUSED[links.certified]
     return refused + _BRIDGES if links.bridges else refused

@@ -1,6 +1,6 @@
-"""Who is out of sight because a bridge went: believed to be there for a moment more, as bridges come back (S12).
+"""Grace periods for sessions out of sight because a bridge was lost: they count as alive, as bridges come back (S12).
 
-A sign of life may fall a moment before the link is seen to have gone that it came by, so one looks twice.
+A sign of life may disappear a moment before the loss of its link is visible, so the loss is checked twice.
 """
 
 import threading
@@ -13,7 +13,7 @@ _LOOK_S: Final = 0.05
 
 
 class GracePeriods:
-    """Sessions whose sign of life fell, perhaps with a bridge; then who is not back within a second is gone."""
+    """Sessions whose sign of life disappeared, perhaps with a bridge; a session not back within a second is gone."""
 
     def __init__(
         self,
@@ -22,28 +22,28 @@ class GracePeriods:
         grace_s: float = GRACE_S,
         look_s: float = _LOOK_S,
     ) -> None:
-        """Tell of nobody yet.
+        """Start without any session.
 
         Args:
-            gone: told of each session that is gone for good, on a thread of this.
-            bridge_lost: whether a bridge went a moment ago.
-            grace_s: how long who is behind a bridge may be away, in seconds.
-            look_s: how long after a sign of life has fallen the loss of a bridge is known, in seconds.
+            gone: called with each session that is gone for good, on a thread of this object.
+            bridge_lost: whether a bridge was lost a moment ago.
+            grace_s: how long a session behind a bridge may be away, in seconds.
+            look_s: how long after a sign of life disappears the loss of a bridge is known, in seconds.
         """
         self._gone = gone
         self._bridge_lost = bridge_lost
         self._grace_s = grace_s
         self._look_s = look_s
         self._due: dict[str, tuple[float, bool]] = {}
-        """When to look at a session, and whether it is gone then."""
+        """When to check a session, and whether it is gone then."""
         self._changed = threading.Condition()
         self._telling = threading.Lock()
-        """Held while somebody's being gone is told: who returns just then waits, and is found anew."""
+        """Held while a session's end is reported: a session that returns just then waits, and counts as a new one."""
         self._thread: threading.Thread | None = None
         self._closed = False
 
     def begin(self, session: str) -> None:
-        """Its sign of life fell; does not wait."""
+        """Start the period of a session whose sign of life disappeared; does not wait."""
         with self._changed:
             self._due.setdefault(session, (time.monotonic() + self._look_s, False))
             if self._thread is None and not self._closed:
@@ -52,15 +52,15 @@ class GracePeriods:
             self._changed.notify_all()
 
     def end(self, session: str) -> bool:
-        """Its sign of life rose; returns whether it was away, and is not gone yet.
+        """A session's sign of life reappeared; returns whether its period was running.
 
-        If that is being told just now, it waits until it was.
+        If its end is being reported right now, this waits until it was.
         """
         with self._telling:
             return self._came_out(session)
 
     def _came_out(self, session: str) -> bool:
-        """Nothing is to be seen to about it any more; returns whether there was."""
+        """Forget a session; returns whether it had a period."""
         with self._changed:
             return self._due.pop(session, None) is not None
 
@@ -71,7 +71,7 @@ class GracePeriods:
                     self._gone(session)
 
     def _next(self) -> str | None:
-        """The next one that is to be told of as gone for good; none once this is closed."""
+        """Waits for the next session to report as gone for good; None once this is closed."""
         with self._changed:
             while not self._closed:
                 first = min(self._due, key=self._due.__getitem__, default=None)
@@ -88,7 +88,7 @@ class GracePeriods:
             return None
 
     def close(self) -> None:
-        """Tell of nobody any more. Idempotent."""
+        """Report no more sessions. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

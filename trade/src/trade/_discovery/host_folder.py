@@ -1,7 +1,7 @@
-"""How the containers of one system find each other on one host: a folder with a file for each one's loopback endpoint.
+"""Discovery on one host: a folder with a file for the loopback endpoint of each container of a system.
 
-The loopback interface carries no multicast. Who starts writes its own endpoint first and reads the others' then, so of
-two that start together at least one sees the other; the newcomer dials everybody.
+The loopback interface carries no multicast. A container that starts writes its own endpoint first and then reads the
+others', so of two that start together at least one sees the other; the newcomer dials all others.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ __all__ = ["HostFolder", "free_endpoint"]
 _logger = logging.getLogger("trade")
 
 _YOUNG_S: Final = 10.0
-"""A file this young may belong to a container that does not listen yet, if its process lives."""
+"""A file younger than this may belong to a container that does not listen yet, if its process is alive."""
 
 
 class HostFolder:
@@ -31,9 +31,9 @@ class HostFolder:
         self._own: Path | None = None
 
     def enter(self, endpoint: str) -> list[str]:
-        """Say where we listen; returns where the others do.
+        """Publish our endpoint; returns the endpoints of the others.
 
-        Who cannot say it, as on a full disk, dials the others all the same: it may be there to stop them.
+        A container that cannot write, as on a full disk, still dials the others: it may be there to stop them.
         """
         name = endpoint.replace("/", "_").replace(":", "_")
         own, fresh = self._folder / name, self._folder / f".{name}.{os.getpid()}"
@@ -43,7 +43,7 @@ class HostFolder:
         except OSError as bad:
             with contextlib.suppress(OSError):
                 fresh.unlink()
-            _logger.warning("%s cannot be written: %s; who starts later on this host may not find this one", own, bad)
+            _logger.warning("%s cannot be written: %s. Later containers on this host may not find this one", own, bad)
         return self._others()
 
     def _others(self) -> list[str]:
@@ -60,23 +60,23 @@ class HostFolder:
         return found
 
     def leave(self) -> None:
-        """Take our endpoint away. Idempotent."""
+        """Remove our endpoint. Idempotent."""
         if self._own is not None:
             self._own.unlink(missing_ok=True)
             self._own = None
 
 
 def _is_young(path: Path, entered: str) -> bool:
-    """Whether it was written a moment ago, by a clock that nobody sets; on some systems that is set as they start."""
+    """Whether a file was written a moment ago, by a monotonic clock; some systems set that clock at boot."""
     try:
-        return abs(time.monotonic() - float(entered)) < _YOUNG_S  # of before the last start of the host: any number
-    except ValueError:  # it was written by something else
+        return abs(time.monotonic() - float(entered)) < _YOUNG_S  # from before the last boot: any number
+    except ValueError:  # another program wrote it
         return time.time() - path.stat().st_mtime < _YOUNG_S
 
 
 def _may_live(writer: str) -> bool:
     """Whether the process that wrote a file may be about to listen; not known on every operating system."""
-    if os.name != "posix" or not writer.isdigit():  # elsewhere signal 0 is no question
+    if os.name != "posix" or not writer.isdigit():  # elsewhere signal 0 is not a check
         return True
     try:
         os.kill(int(writer), 0)

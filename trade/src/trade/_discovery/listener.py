@@ -1,4 +1,4 @@
-"""The threads that listen to the rest of the system: who is there, and what they offer."""
+"""Threads that listen to the rest of the system: which containers exist, and what they offer."""
 
 import logging
 import math
@@ -27,11 +27,11 @@ _logger = logging.getLogger("trade")
 
 _SYNC_S: Final = 2.0
 _STAYS_S: Final = 60.0
-"""Who has been here for so long is no passer-by."""
+"""A container that has run for this long is not a short-lived one."""
 
 
 class RegistryListener:
-    """Feeds a registry from the network. Construction ends with the first sync: what stands now is known then."""
+    """Feeds a registry from the network. Construction ends with the first sync: the registry is complete then."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class RegistryListener:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody is being asked for what was missed."""
+        """Whether a container is being queried for missed announcements."""
         return self._asker.busy
 
     def _regularly(self) -> None:
@@ -106,13 +106,13 @@ class RegistryListener:
             self._drop(message.key, bad)
 
     def _of_another_version(self, message: Message, other: OtherVersion) -> None:
-        """Of what it says only this is heeded: that it does, and which e-stops are open there."""
+        """Takes from such a message only its version and the open e-stops."""
         self.malformed += 1
         address, domain, provider = _place(message.key)
         if self._registry.speaks(address, other.version):
             _logger.warning(
                 "container %s/%s speaks protocol version %d, this one speaks %d: neither sees what the other offers, "
-                "and only e-stops cross; update the older one",
+                "and only e-stops cross. Update the older one",
                 *(address.identity, address.container, other.version, PROTOCOL),
             )
         if domain != DOMAIN or provider == TALLY:
@@ -147,10 +147,10 @@ class RegistryListener:
         if not client:
             self._lost(address, back=True)
             if self._registry.appear(address) or was_away:
-                self._asker.request(address, anew=True)
+                self._asker.request(address, appeared=True)
 
     def _gone(self, session: str) -> None:
-        """A container, or a client of one, has ended or cannot be reached."""
+        """A container, or a client of one, has ended or is unreachable."""
         identity, container, epoch, *client = session.split("/")
         if client:
             self._ended(session)
@@ -160,9 +160,9 @@ class RegistryListener:
             self._registry.vanish(address)
 
     def _answer(self, answer: Answer, meant: dict[Address, ContainerState]) -> None:
-        """Take what a container says that it offers. Who speaks for anybody else is not listened to at all.
+        """Take a container's reply with all that it offers. A reply that speaks for another container is ignored.
 
-        The answer is empty then: of ten thousand entries each is kept as it came, or as it was read, and never both.
+        The reply is emptied meanwhile: each of ten thousand entries is kept either encoded or decoded, never both.
         """
         offered: dict[str, tuple[str, ProviderInfo]] = {}
         speakers, revision, message = set[Address](), None, None
@@ -188,9 +188,9 @@ class RegistryListener:
             self._of_another_version(other_message, other)
         state = meant.get(speakers.pop()) if speakers else None
         if state is not None and revision is not None:
-            self._registry.settle(state, revision, offered)  # without the tally, which comes last, it is not all
+            self._registry.settle(state, revision, offered)  # the tally comes last; without it the reply is incomplete
         elif state is not None and others and others[-1][0].key == tally_key(state.address):
-            state.heard.all_told(0)  # of what it tells nothing is counted: to be asked once is enough
+            state.heard.all_told(0)  # its entries have no tally: one query is enough
 
     def _drop(self, key: str, bad: Exception) -> None:
         self.malformed += 1
@@ -209,13 +209,13 @@ class RegistryListener:
 
 
 def _place(key: str) -> tuple[Address, str, str]:
-    """Whose entry it is, in which domain, of which provider."""
+    """The container, the domain and the provider of an entry."""
     domain, identity, container, epoch, provider = _chunks(key, 5)
     return Address(identity, container, epoch), domain, provider
 
 
 def _chunks(key: str, count: int, most: int = 0) -> list[str]:
-    """The chunks of a key after its first; one may put on a pattern, too, and that is nobody's key."""
+    """The chunks of a key after its first. Raises Malformed for a pattern, on which a peer may publish, too."""
     chunks = key.split("/")[1:]
     if not count <= len(chunks) <= max(count, most) or not all(map(is_chunk, chunks)):
         raise Malformed(f"{key!r} is a pattern or of another shape")

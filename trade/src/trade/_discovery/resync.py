@@ -1,4 +1,4 @@
-"""Asking containers for what stands there, when something they announced may have been missed."""
+"""Queries containers for their current announcements when one may have been missed."""
 
 import logging
 import math
@@ -14,21 +14,21 @@ from trade._transport.base import Answer, ChannelClosed, Transport
 _logger = logging.getLogger("trade")
 
 _ANSWER_S: Final = 1.5
-"""An answer that takes longer is none at first. Who starts waits longer than this for all."""
+"""A reply that takes longer counts as missing at first. A container that starts waits longer than this for all."""
 _SLOW_ANSWER_S: Final = 10.0
-"""So long who was waited for in vain is waited for from then on, apart from the others."""
+"""The timeout for a container that has not replied in time before; it is queried apart from the others."""
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0
-"""Between two questions to a container that is alive and does not answer, or announces nonsense."""
+"""Between two queries to a container that is alive and does not reply, or announces nonsense."""
 
 Take = Callable[[Answer, dict[Address, ContainerState]], None]
 
 
 class Resynchronizer:
-    """One thread that asks; several requests for one container are one question.
+    """One thread that sends queries; several requests for one container make one query.
 
-    Those who were waited for in vain are asked by a second one, there from the first such case on: nobody waits behind
-    them. The first also has the container say how far it is itself (`beat`), every ``Transport.beat_s``.
+    A second thread, started with the first such case, queries slow containers, so that no other waits for them. The
+    first thread also calls `beat`, every ``Transport.beat_s``, to announce the container's own revision.
     """
 
     def __init__(self, transport: Transport, registry: Registry, take: Take, beat: Callable[[], None]) -> None:
@@ -38,11 +38,11 @@ class Resynchronizer:
         self._beat = beat
         self._changed = threading.Condition()
         self._due: dict[Address, float] = {}
-        """When to ask, in monotonic seconds."""
+        """When to query each container, in monotonic seconds."""
         self._pauses: dict[Address, float] = {}
-        """In seconds until it is asked again, of those whose last answer left something open."""
+        """Seconds until the next query, of those whose last reply was missing or incomplete."""
         self._slow: set[Address] = set()
-        """Waited for in vain the last time."""
+        """Containers whose last reply did not come in time."""
         self._asking = False
         self._closed = False
         self._next_beat = time.monotonic() + transport.beat_s
@@ -55,15 +55,15 @@ class Resynchronizer:
         self._threads.append(threading.Thread(target=self._run, args=(slow,), name=name, daemon=True))
         self._threads[-1].start()
 
-    def request(self, address: Address, *, anew: bool = False) -> None:
-        """Ask a container soon; does not wait.
+    def request(self, address: Address, *, appeared: bool = False) -> None:
+        """Schedule a query to a container; does not wait.
 
         Args:
-            address: whom.
-            anew: it has just appeared: whatever was the matter before does not count.
+            address: the container.
+            appeared: whether it has just appeared, so that earlier failures do not count.
         """
         with self._changed:
-            if anew:
+            if appeared:
                 self._due.pop(address, None)
                 self._forget(address)
             self._due.setdefault(address, time.monotonic() + self._pauses.get(address, 0.0))
@@ -71,12 +71,12 @@ class Resynchronizer:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody is asked, or is to be asked, who has not failed to answer."""
+        """Whether a query is pending or running, other than to containers that failed to reply."""
         with self._changed:
             return not self._closed and (self._asking or any(address not in self._pauses for address in self._due))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it is not busy."""
+        """Wait until no query is pending."""
         with self._changed:
             self._changed.wait_for(lambda: not self.busy, timeout_s)
 
@@ -91,7 +91,7 @@ class Resynchronizer:
                     self._closed = True
                     self._changed.notify_all()
             except Exception:
-                _logger.exception("asking for what stands failed")
+                _logger.exception("the query for current announcements failed")
 
     def _beat_if_due(self) -> None:
         if time.monotonic() >= self._next_beat:
@@ -99,7 +99,7 @@ class Resynchronizer:
             self._beat()
 
     def _wait(self, slow: bool) -> list[Address]:
-        """Whom to ask now; nobody when it is time for something else."""
+        """Waits for containers to query; empty when other work is due."""
         with self._changed:
             if not slow and self._asking:
                 self._asking = False
@@ -156,12 +156,12 @@ class Resynchronizer:
             self._changed.notify_all()
 
     def _forget(self, address: Address) -> None:
-        """That it ever failed to answer."""
+        """Forget that a container ever failed to reply."""
         self._pauses.pop(address, None)
         self._slow.discard(address)
 
     def _put_off(self, address: Address, in_vain: bool) -> None:
-        """Who is alive and does not answer is asked again, less and less often."""
+        """Query a container that is alive but does not reply less and less often."""
         pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
         self._pauses[address] = pause_s
         self._due[address] = time.monotonic() + pause_s

@@ -1,1 +1,1 @@
-"""Containers started on other hosts through ssh."""
+"""Starts containers on other hosts through ssh."""

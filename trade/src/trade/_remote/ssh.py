@@ -1,4 +1,4 @@
-"""Containers started on other hosts, through the ``ssh`` program of this one."""
+"""Starts containers on other hosts, through the ``ssh`` program of this host."""
 
 import re
 import shlex
@@ -15,7 +15,7 @@ from trade.errors import CannotStart, ConfigurationError
 CONNECT_S: Final = 10
 LONGEST_S: Final = 60.0
 _ASKED: Final = ("-o", "BatchMode=yes", "-o", "StrictHostKeyChecking=yes", "-o", f"ConnectTimeout={CONNECT_S}", "-T")
-"""Nothing is asked of people, and no key of a host is taken for right that is not known as its own."""
+"""ssh prompts for nothing, and accepts only host keys that are known."""
 _HOST: Final = re.compile(r"(?:[A-Za-z0-9_][\w.+-]*@)?[A-Za-z0-9_\[][\w.:%\]-]*")
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*")
 _SSH_FAILED: Final = 255
@@ -25,8 +25,8 @@ _REASONS: Final = (
         re.compile(r"REMOTE HOST IDENTIFICATION HAS CHANGED|Host key for .* has changed"),
         "changed host key",
         (
-            "it shows another key than known_hosts has, so somebody may be in between. Was it set up anew? Compare the "
-            "fingerprint there, then `ssh-keygen -R HOST` and add the new key"
+            "its key differs from the one in known_hosts, so an attacker may be in between. Was it installed again? "
+            "Compare the fingerprint there, then run `ssh-keygen -R HOST` and add the new key"
         ),
     ),
     (
@@ -61,7 +61,7 @@ _REASONS: Final = (
 
 
 class Started(msgspec.Struct, frozen=True):
-    """What ``trade container --detach --json`` says when it is up."""
+    """What ``trade container --detach --json`` prints when the container is up."""
 
     container: str
     epoch: str
@@ -79,7 +79,7 @@ def start(
     environment: Mapping[str, str] | None = None,
     ssh_config: Path | None = None,
 ) -> Started:
-    """See `System.start_container`. Returns when it is up there."""
+    """See `System.start_container`. Returns when the container is up."""
     dialled = [word for endpoint in connect for word in ("--connect", endpoint)]
     allowed = [word for pattern in allow for word in ("--allow", pattern)]
     words = ["--system", system, *dialled, "container", "--name", name, *allowed]
@@ -95,11 +95,11 @@ def launch(
     environment: Mapping[str, str] | None = None,
     ssh_config: Path | None = None,
 ) -> Started:
-    """Run ``trade WORDS --detach`` on another host; returns when that says that the container is up.
+    """Run ``trade WORDS --detach`` on another host; returns when that reports that the container is up.
 
     Raises:
-        CannotStart: with the reason, and what to do.
-        ConfigurationError: what cannot be a host or a variable.
+        CannotStart: with the reason and the remedy.
+        ConfigurationError: an invalid host or variable.
     """
     there = [*_assigned(environment or {}), *command, *words, "--detach", "--json"]
     return _read(host, name, command[0], there, _run(host, name, ssh_words(host, ssh_config, there)))
@@ -108,23 +108,23 @@ def launch(
 def missing_there(
     host: str, name: str, command: Sequence[str], files: Sequence[str], ssh_config: Path | None
 ) -> list[str]:
-    """Those of the files that the host does not have, or does not let this user read.
+    """The files that the host does not have, or that this user may not read there.
 
     Raises:
-        CannotStart: the host, or ``trade`` on it, is out of reach.
-        ConfigurationError: what cannot be a host.
+        CannotStart: the host, or ``trade`` on it, is unreachable.
+        ConfigurationError: an invalid host.
     """
     script = f'{shlex.join(command)} --version >&2 && for one; do [ -r "$one" ] || echo "$one"; done'
     words = ["sh", "-c", script, "sh", *files]
     ended = _run(host, name, ssh_words(host, ssh_config, words))
     if ended.returncode != 0:
         raise _refusal(host, name, command[0], words, ended)
-    told = ended.stdout.splitlines()  # and whatever its shell says by itself
+    told = ended.stdout.splitlines()  # and any output of its shell
     return [file for file in files if file in told]
 
 
 def end_there(host: str, name: str, pid: int, ssh_config: Path | None) -> None:
-    """Have a process leave that was started there and is not in the system. Raises CannotStart if ssh fails."""
+    """Shut down a process that was started there and is not in the system. Raises CannotStart if ssh fails."""
     words = ["kill", str(pid)]
     ended = _run(host, name, ssh_words(host, ssh_config, words))
     if ended.returncode == _SSH_FAILED:
@@ -139,7 +139,7 @@ def _assigned(environment: Mapping[str, str]) -> list[str]:
 
 
 def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[str]:
-    """The words of a command that runs these on a host; raises ConfigurationError for what cannot be a host."""
+    """The command line that runs these words on a host; raises ConfigurationError for an invalid host."""
     if not _HOST.fullmatch(host):
         raise ConfigurationError(where="start_container", problem=f"{host!r} is no host; use HOST or USER@HOST")
     config = () if ssh_config is None else ("-F", str(ssh_config))
@@ -156,13 +156,13 @@ def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedPro
             text=True,
             timeout=longest_s,
             check=False,
-            start_new_session=True,  # Ctrl-C is for whoever starts it, who is told what came of it
+            start_new_session=True,  # Ctrl-C goes to this program, which reports the outcome
         )
     except FileNotFoundError:
         remedy = "install it (Debian: apt-get install openssh-client)"
         raise CannotStart(host=host, container=name, reason="no ssh here", said="", remedy=remedy) from None
     except subprocess.TimeoutExpired:
-        said, remedy = f"no end within {longest_s:.3g} s", "look there whether it is up: `trade containers`"
+        said, remedy = f"not finished within {longest_s:.3g} s", "check whether it is up: `trade containers`"
         raise CannotStart(host=host, container=name, reason="timeout", said=said, remedy=remedy) from None
 
 
@@ -174,7 +174,7 @@ def _read(
     try:
         return msgspec.json.decode(ended.stdout.strip().splitlines()[-1], type=Started)
     except (msgspec.DecodeError, IndexError):
-        remedy = f"it said {ended.stdout[-200:]!r}; does its shell print something by itself?"
+        remedy = f"it said {ended.stdout[-200:]!r}. Does its shell print something by itself?"
         raise CannotStart(
             host=host, container=name, reason="no answer", said=_complaint(ended), remedy=remedy
         ) from None

@@ -1,4 +1,4 @@
-"""``@service``, and reading a class with its interfaces into the services it provides."""
+"""The decorator ``@service``, and the services that a class provides with its interfaces."""
 
 # pyright: reportUnknownArgumentType=false
 
@@ -23,7 +23,7 @@ _EFFECTS = ("read", "note", "actuate", "stop")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ServiceMark:
-    """What ``@service`` notes on a method; each decoration is one of its own."""
+    """The options of ``@service`` on a method; each decoration has its own."""
 
     effect: Effect = "actuate"
     cancel: str | None = None
@@ -62,25 +62,25 @@ def service(
     """Mark a method as a service, in a class or in an interface whose implementations then have it.
 
     Args:
-        effect: ``"read"`` changes nothing, ``"note"`` only writes something down, so that no lock takes it or holds it
-            up, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends motion: it overtakes
-            everything and ignores deadlines.
+        effect: ``"read"`` changes nothing; ``"note"`` only records something, so that no lock takes or delays it;
+            ``"actuate"`` (default) may move something or change state; ``"stop"`` ends motion: it overtakes everything
+            and ignores deadlines.
         cancel: name of the service of the same provider that ends this one early.
         achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
-        uses: physical resources it needs for itself.
-        meta: numbers, texts, booleans by name, for others to select by: ``{"payload_kg": 2}``.
-        serial: it never runs beside another serial service of the same object; calls wait in order of arrival.
-        strict: a local call sees what a remote one would, validated arguments and copies. False: it goes straight
-            through by reference, checked and copied by nobody; what needs physical resources is always strict.
+        uses: physical resources that it needs exclusively.
+        meta: numbers, texts and booleans by name, for queries: ``{"payload_kg": 2}``.
+        serial: it never runs at the same time as another serial service of the object; calls queue in order of arrival.
+        strict: a local call behaves like a remote one, with validated arguments and copies. False: it passes arguments
+            by reference, neither checked nor copied; a service that needs physical resources is always strict.
 
     Raises:
-        ConfigurationError: the effect is none of these, the options contradict each other, a post-condition is
-            malformed, metadata is no plain value.
+        ConfigurationError: the effect is unknown, the options contradict each other, a post-condition is malformed, or
+            metadata is not a plain value.
     """
     if effect not in _EFFECTS:
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
     if serial and effect == "stop":
-        raise ConfigurationError(problem="a stop waits for nobody: it cannot be serial")
+        raise ConfigurationError(problem="a stop cannot be serial, because a stop never waits")
     if uses and effect == "note":
         raise ConfigurationError(problem="a note needs nothing physical; leave out uses, or have it actuate")
     for condition in _several(achieves):
@@ -90,9 +90,9 @@ def service(
     )
 
     def note(target: _Function) -> _Function:
-        function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark
+        function: Any = getattr(target, "__func__", target)  # of a class or static method, its function has the mark
         if not inspect.isroutine(function):
-            raise ConfigurationError(problem=f"@service stands on a method, not on {target!r}")
+            raise ConfigurationError(problem=f"@service decorates a method, not {target!r}")
         setattr(function, _MARK, mark)
         return target
 
@@ -104,11 +104,10 @@ def _several(texts: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tuple[ServiceMark, Callable[..., Any]]]:
-    """The services of a class: name -> its mark and the function whose signature counts.
+    """The services of a class: from each name to its mark and the function with its signature.
 
-    A mark on any class of the method resolution order, or on an interface named beside it, holds for the
-    implementation.
-    The most derived marked declaration gives the signature.
+    A mark on any class of the method resolution order, or on an interface named in addition, applies to the
+    implementation. The most derived marked declaration gives the signature.
     """
     found: dict[str, tuple[ServiceMark, Callable[..., Any]]] = {}
     for owner in (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__)):
@@ -122,13 +121,13 @@ def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tupl
 
 
 def effect_of(function: Callable[..., Any]) -> Effect | None:
-    """What a method does, by its mark; None: it is no service."""
+    """The effect of a method, by its mark; None: it is not a service."""
     mark = getattr(function, _MARK, None)
     return mark.effect if isinstance(mark, ServiceMark) else None
 
 
 def kinds_of(cls: type, interfaces: Sequence[type] = ()) -> tuple[str, ...]:
-    """Names of a class and of its bases and interfaces that have services."""
+    """Names of a class and of those of its bases and interfaces that have services."""
     every = (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__))
     serving = [base.__name__ for base in every if base is cls or any(map(_has_marks, base.__mro__))]
     return tuple(dict.fromkeys(serving))
@@ -156,7 +155,7 @@ def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) 
 
 
 def _implements(cls: type, name: str) -> bool:
-    """Whether the class has a method of its own: neither an abstract one nor the empty body in a protocol."""
+    """Whether the class implements a method: not abstract, and not the empty body of a protocol."""
     owner = next((base for base in cls.__mro__ if name in vars(base)), None)
     method = getattr(cls, name, None)
     return (

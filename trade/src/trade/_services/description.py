@@ -1,4 +1,4 @@
-"""What everybody may know of a service, read from its method: signature, schemas, types."""
+"""The public description of a service, read from its method: signature, schemas, types."""
 
 # pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false, reportUnknownMemberType=false
 
@@ -69,7 +69,7 @@ def describe(
 
 
 def _noted_fields(schema: dict[str, Any], kind: type | None, codec: Codec) -> dict[str, Any]:
-    """The schema of a struct with what JSON Schema loses of its fields' types."""
+    """The schema of a struct with the field types that JSON Schema cannot express."""
     fields: Sequence[str] = getattr(kind, "__struct_fields__", ())
     if not fields or "properties" not in schema:
         return schema
@@ -117,7 +117,7 @@ def _default_text(parameter: inspect.Parameter, hint: str) -> str:
 
 
 def _types_in(kind: Any, seen: set[int]) -> list[type]:
-    """The structs, dataclasses and enums a type mentions, however deep."""
+    """The structs, dataclasses and enums that a type mentions, at any depth."""
     if id(kind) in seen:
         return []
     seen.add(id(kind))

@@ -1,7 +1,7 @@
-"""The callee's side of a call: threads that read calls, check, run the provider, answer.
+"""The callee's side of a call: threads that read calls, check them, run the provider, and answer.
 
-Leader and followers: the threads that run providers are the ones that wait for calls, so a call changes hands nowhere.
-The last idle one that takes a call starts another; at the cap it answers Busy, so that the channel is always drained.
+Leader/followers: the threads that run providers also wait for calls, so no call changes threads. The last idle thread
+that takes a call starts another; at the limit it answers Busy, so that the channel is always drained.
 """
 
 import logging
@@ -65,29 +65,29 @@ ANYBODY: Final = "*"
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _MOST_WAITING: Final = 4096
-"""Calls of one caller that is told from others."""
+"""Waiting calls of one identified caller."""
 _MOST_CALLERS: Final = 1024
-"""Of one service, whose admission is kept."""
+"""Cached authorisations of one service."""
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
 _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
-"""Errors of ours that are mistakes of a provider; the others are answers it gives on purpose."""
+"""Our errors that are a provider's defect; a provider raises the others on purpose."""
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
 class IncomingCall(Struct, frozen=True, gc=False):
-    """A call that came in, and what its key says."""
+    """A call that came in, and the contents of its key."""
 
     call: Call
     caller: str
-    """Identity of who asks."""
+    """Identity of the caller."""
     replier: Publisher
     """Where to answer."""
     place: str = ""
-    """The ``domain/provider`` it is for; empty once only an answer is left to send."""
+    """The ``domain/provider`` that it calls; empty once only the answer remains to be sent."""
 
 
 class Dispatcher:
-    """Every incoming call of one container."""
+    """Handles every incoming call of one container."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class Dispatcher:
         self._progress_reporter = ProgressReporter(self._send_progress)
         self.malformed = 0
         self.callers = set[str]()
-        """Who is heard by channels of its own; nobody: all are heard by the same."""
+        """Identities with channels of their own; empty: all share the same channels."""
         self._worker_pools: list[WorkerPool] = []
         if callers := access.callers():
             self.hear(callers)
@@ -121,7 +121,7 @@ class Dispatcher:
             self._add_worker_pools(ANYBODY)
 
     def hear(self, callers: Iterable[str]) -> None:
-        """Take calls of these from now on, too: each by channels of its own, so that who floods fills only those."""
+        """Add callers, each with its own channels, so that a flood fills only the channels of its caller."""
         with self._lock:
             new = [caller for caller in dict.fromkeys(callers) if caller not in self.callers]
             self.callers.update(new)
@@ -129,10 +129,10 @@ class Dispatcher:
                 self._add_worker_pools(caller)
 
     def _add_worker_pools(self, caller: str) -> None:
-        """Threads for the calls of one caller and for its stops.
+        """Starts threads for the calls of one caller, and for its stops.
 
-        Who can be told from others loses what it sends faster than it is taken: made to wait, it would hold up all who
-        come by the same link.
+        An identified caller loses the calls that it sends faster than they are taken: a caller made to wait would delay
+        all others on the same link.
         """
         for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
@@ -141,7 +141,7 @@ class Dispatcher:
 
     @property
     def draining(self) -> bool:
-        """Whether some thread stands ready to take the next call."""
+        """Whether a thread is ready to take the next call."""
         return all(pool.draining for pool in self._worker_pools)
 
     def _serve(self, message: Message) -> None:
@@ -150,7 +150,7 @@ class Dispatcher:
             return
         try:
             service = self._providers.lookup(incoming.place, incoming.call.service)
-        except ServiceGone as gone:  # it has moved
+        except ServiceGone as gone:  # its provider has moved
             self._refuse(incoming, *failed(gone))
             return
         urgent = message.key.startswith("stop/")
@@ -224,16 +224,16 @@ class Dispatcher:
             self._note(service.label, self._too_much(service.label), incoming)
             self._end(ongoing, service, incoming, (Status.BUSY, EMPTY))
 
-    # --- calls that came before, and calls about calls
+    # --- repeated calls, and calls about calls
 
     def _again(self, first: ActiveCall, incoming: IncomingCall) -> None:
-        """It runs or has run: it gets that answer, and never runs again."""
+        """A repeated call: it gets the answer of the first one, and never runs again."""
         answer = self._deduplicator.attach(first, incoming.call)
         if answer is not None:
             self._answer(incoming, *answer)
 
     def _refuse(self, incoming: IncomingCall, status: int, body: Raw = EMPTY) -> None:
-        """It does not run now; but it may have before."""
+        """Answer without running the call; the call may have run before."""
         first = self._deduplicator.find(incoming.caller, incoming.call)
         if first is not None:
             self._again(first, incoming)
@@ -253,12 +253,12 @@ class Dispatcher:
 
     def _send_progress(self, ongoing: ActiveCall, body: Raw) -> None:
         call = ongoing.call
-        if call is None:  # it has ended
+        if call is None:  # the call has ended
             return
         try:
             self._answer(self._to_answer(ongoing.caller, call), Status.PROGRESS, body)
         except ChannelClosed:
-            _logger.debug("no word of the progress of %s: the container is closing", call.service)
+            _logger.debug("the progress of %s is not sent: the container is closing", call.service)
 
     def _busy(self, message: Message) -> None:
         incoming = self._take(message)
@@ -271,13 +271,13 @@ class Dispatcher:
         return Busy(service=label, container=self._own.container)
 
     def _note(self, label: str, error: TradeError, incoming: IncomingCall) -> None:
-        """Have it in the record that a call was refused."""
+        """Record that a call was refused."""
         call = incoming.call
         who, outer_id = foreign(call.session) or incoming.caller, outer_of(call.id, call.behalf)
         self._audit.refused(label, error, who=who, session=call.session, call_id=call.id, outer_id=outer_id)
 
     def _take(self, message: Message) -> IncomingCall | None:
-        """The call of a message; None: it is no call, and dropped."""
+        """The call of a message; None: the message is not a call, and was dropped."""
         try:
             call = decode_call(message.payload or b"")
             kind, caller, place = message.key.split("/", 2)
@@ -300,7 +300,7 @@ class Dispatcher:
         data = encode_message(Reply(PROTOCOL, incoming.call.id, status, time.monotonic_ns(), body))
         try:
             incoming.replier.put(data)
-        except ChannelClosed:  # it was let go in between
+        except ChannelClosed:  # the publisher was closed meanwhile
             if not self._closed:
                 self._replier(incoming.caller, incoming.call.reply).put(data)
 
@@ -314,8 +314,8 @@ class Dispatcher:
 
     def _new_replier(self, key: str, caller: str, reply: str) -> Publisher:
         container, _, channel = reply.partition("/")
-        if not (is_chunk(caller) and is_chunk(container) and is_chunk(channel)):  # a wildcard would answer everybody
-            raise Malformed(f"{key!r} is nobody's reply key")
+        if not (is_chunk(caller) and is_chunk(container) and is_chunk(channel)):  # a wildcard would answer all callers
+            raise Malformed(f"{key!r} is not a valid reply key")
         with self._lock:
             if key not in self._repliers:
                 if len(self._repliers) >= _MOST_REPLY_KEYS:
@@ -324,7 +324,7 @@ class Dispatcher:
             return self._repliers[key]
 
     def forget(self, caller: Address) -> None:
-        """A container is gone: nobody waits there for answers. For another one of its name keys are made anew."""
+        """A container is gone: release its reply keys. A new container of its name gets new ones."""
         begin = f"{caller.who}/"
         with self._lock:
             gone = [self._repliers.pop(key) for key in list(self._repliers) if key.startswith(begin)]
@@ -332,11 +332,11 @@ class Dispatcher:
             replier.close()
 
     def session_ended(self, session: str) -> None:
-        """Nobody of it is there any more: what runs for it is asked to end, and with it what that has called."""
+        """A session has ended: cancel the calls that run for it, and the calls that those have made."""
         end_calls([one.cancel for one in self._deduplicator.made_for(session)])
 
     def leave(self) -> None:
-        """Start no call that waits for its turn: its caller is about to hear that this container has left."""
+        """Start no queued call any more: its caller is about to hear that this container has shut down."""
         self._leaving = True
 
     def close(self) -> None:
@@ -348,7 +348,7 @@ class Dispatcher:
             pool.close()
         for pool in self._worker_pools:
             pool.wait(_PARTING_S)
-        self._loop.close()  # whoever still waits for a coroutine ends with it
+        self._loop.close()  # threads that still wait for a coroutine end with it
         for pool in self._worker_pools:
             pool.wait(_PARTING_S)
         self._progress_reporter.close()
@@ -362,7 +362,7 @@ def _run(incoming: IncomingCall, service: LocalService, ongoing: ActiveCall | No
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:
         return Status.OK, Raw(service.signature.encode_result(service.label, service.run(call.args, context)))
-    except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
+    except BaseException as error:  # noqa: BLE001 - every error of a provider goes to the caller
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller

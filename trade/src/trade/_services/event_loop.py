@@ -13,7 +13,7 @@ from trade.errors import Cancelled, OutcomeUnknown
 
 
 class AsyncLoop:
-    """The event loop on which a container's ``async def`` services run, started by the first of them."""
+    """The event loop on which a container's ``async def`` services run; the first of them starts it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -38,7 +38,7 @@ class AsyncLoop:
             raise Cancelled(service=context.service) from None
 
     def _submit(self, coroutine: Coroutine[Any, Any, Any]) -> "concurrent.futures.Future[Any] | None":
-        """Begin, unless it is closed; what begins before it closes is cancelled by that, and so always ends."""
+        """Start a coroutine, unless the loop is closed; closing cancels all coroutines, so each of them ends."""
         with self._lock:
             if self._closed:
                 coroutine.close()
@@ -62,7 +62,7 @@ class AsyncLoop:
 
 
 async def _contained(coroutine: Coroutine[Any, Any, Any], context: CallContext) -> Any:
-    """What would end the loop for everybody becomes an error for the caller, who may also cancel it."""
+    """Turns what would end the loop for all coroutines into an error for the caller, who may also cancel the call."""
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
 
     def cancel() -> None:

@@ -25,7 +25,7 @@ from trade.errors import TradeError
 __all__ = ["LocalService"]
 
 _COROUTINE: Final[type] = CoroutineType
-"""What an ``async def`` gives; asked of every result, so without a call."""
+"""The type that an ``async def`` returns; compared with every result, hence cheap."""
 
 
 class LocalService:
@@ -64,15 +64,15 @@ class LocalService:
         self.strict = mark.strict
         self.serial = serial
         self.resources = resources
-        """What it needs for itself, or stops."""
+        """Resources that it needs exclusively, or stops."""
         self.interceptors: tuple[Interceptor, ...] = ()
-        """What is called around it, the outermost first."""
+        """The interceptors called around it, the outermost first."""
         self.admitted: dict[str, Policy] = {}
-        """Who may call it, and by which policy that was decided."""
+        """The identities that may call it, each with the policy that allowed it."""
         self._loop = loop
 
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:
-        """Validate, then call. Raises what the provider raises."""
+        """Validate the arguments, then call. Raises what the provider raises."""
         try:
             args, kwargs = self.signature.decode(self.label, raw)
         except TradeError as error:
@@ -89,7 +89,7 @@ class LocalService:
         inside: tuple[Interceptor, ...] | None = None,
     ) -> Any:
         """Call with the arguments as they are, through all interceptors, or those ``inside`` the running one."""
-        interceptors = self.interceptors if inside is None else inside  # there may be others at any time
+        interceptors = self.interceptors if inside is None else inside  # others may be attached at any time
         if interceptors:
             proceed = partial(self.call, args, kwargs, context, interceptors[1:])
             return interceptors[0].run(ServedCall(self, args, kwargs, context), proceed)
@@ -104,7 +104,7 @@ class LocalService:
             structs.force_setattr(context, "permit", None)
 
     def _look(self, context: CallContext) -> None:
-        """What reads is open to all, unless it was locked by its own handle; what stops does so first."""
+        """Stop first, if it stops; check the lock that a reading service may have under its own handle."""
         for resource in self.resources:
             if self.effect == "stop":
                 resource.stop(foreign(context.session) or context.caller, context.sessions)
@@ -112,25 +112,25 @@ class LocalService:
                 resource.check_lock(context.tokens, context.caller, context.session)
 
     def run_admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """Call with the arguments as they are and nothing more asked: its resources are its own, or it stops them."""
+        """Call with checked arguments and no more checks: it holds its resources, or it stops them."""
         token = running.set(context)
         try:
             result = self.method(*args, **kwargs) if kwargs else self.method(*args)
             return self._loop.complete(result, context) if type(result) is _COROUTINE else result
-        except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # the provider's, not this thread's
+        except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # from the provider, not for this thread
             raise unpack_error(pack_error(error), self.label) from error
         finally:
             running.reset(token)
-            if context.behalf is not None:  # what it began and left running inherits nothing any more
+            if context.behalf is not None:  # tasks that it left running inherit nothing any more
                 structs.force_setattr(context, "behalf", None)
 
     def failure(self, error: BaseException, raw: Raw | bytes) -> ErrorInfo:
-        """What the caller is told of an error of a call with these arguments."""
+        """The error of a call with these arguments, as its caller receives it."""
         info = pack_error(error)
         return self.signature.without_secrets(info, raw) if self.signature.has_secrets else info
 
     def too_late(self, expires_ns: int | None) -> bool:
-        """Whether running it now would be running it late; a stop is never late, a command of unknown expiry always."""
+        """Whether the call has expired. A stop never expires; a command of unknown expiry always has."""
         if self.effect == "stop":
             return False
         if expires_ns is None:

@@ -1,4 +1,4 @@
-"""The objects a container offers: reading them into services, announcing and withdrawing them."""
+"""The providers of a container: reads objects into services, announces and withdraws them."""
 
 import os
 import socket
@@ -33,7 +33,7 @@ _Method = tuple[str, ServiceMark, Callable[..., Any]]
 
 
 class Providers:
-    """Owns what this container hosts; the registry and the rest of the system are told from here."""
+    """Owns the hosted providers, and informs the registry and the rest of the system about them."""
 
     def __init__(
         self,
@@ -56,15 +56,15 @@ class Providers:
         self._table = table
         self._lock = threading.Lock()
         self._announcing = threading.RLock()
-        """Revisions go out in order, one at a time."""
+        """Serialises announcements: revisions go out in order."""
         self._revision = 0
         self._hosted: dict[str, Registered] = {}
         self._names: dict[int, str] = {}
         self._moved: dict[str, str] = {}
-        """Where the last ones are that moved away, by place."""
+        """By place, where the providers went that moved away last."""
         self._counter = 0
         self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
-        """What objects of one class share, as long as one of them is hosted."""
+        """Signatures that objects of one class share while one of them is hosted."""
 
     def add(
         self,
@@ -80,9 +80,9 @@ class Providers:
         Args:
             provider: the object; kept until it is removed.
             groups: dotted labels, checked by the caller of this.
-            implements: interfaces beside those it inherits from.
-            meta: holds for all its services, over what they say themselves.
-            name: of the provider in keys; by default its class and a number.
+            implements: interfaces in addition to those it inherits from.
+            meta: metadata of all its services; it overrides their own.
+            name: name of the provider in keys; by default its class and a number.
 
         Raises:
             ConfigurationError, AccessDenied: see `Container.register`.
@@ -100,7 +100,7 @@ class Providers:
         meta: Mapping[str, Scalar] | None = None,
         name: str | None = None,
     ) -> Built:
-        """All of `add` that can go wrong: `host` offers it then, or `discard` gives its resources back."""
+        """Do all of `add` that can fail: `host` then offers the result, or `discard` gives its resources back."""
         kind, domain = type(provider).__qualname__, domain_of(groups)
         if domain != DOMAIN:
             self._access.require_offer(self._own.identity, groups, kind)
@@ -108,7 +108,7 @@ class Providers:
         place = f"{domain}/{chunk}"
         services = self._services_of(provider, groups, implements, place)
         info = ProviderInfo(
-            revision=1,  # told before it is announced
+            revision=1,  # assigned before it is announced
             groups=groups,
             kind=kind,
             host=socket.gethostname(),
@@ -123,25 +123,25 @@ class Providers:
         return Built(place, Registered(provider, services, tuple(implements), info), keys)
 
     def host(self, built: Built) -> None:
-        """Offer what was built: callable first, announced then."""
+        """Offer what was built: callable first, then announced."""
         self._host(built.place, built.registered)
 
     def discard(self, built: Built) -> None:
-        """It is not offered after all."""
+        """Give back what was built and is not offered."""
         self._drop(built.services)
 
     def pass_on(
         self, provider: object, info: ProviderInfo, make: Callable[[str], dict[str, LocalService]]
     ) -> tuple[str, str]:
-        """Host what stands for a provider of another system, described by its own words. Returns domain and name.
+        """Host a proxy for a provider of another system, described by that one's data. Returns domain and name.
 
         Args:
-            provider: stands for it; kept until it is removed.
-            info: what is told of it.
-            make: its services, for the place (``domain/provider``) that it gets.
+            provider: the proxy; kept until it is removed.
+            info: the description of the remote provider.
+            make: makes its services, for the place (``domain/provider``) that it gets.
 
         Raises:
-            ConfigurationError: what it uses is another one's here.
+            ConfigurationError: another provider here uses its resources.
             AccessDenied: this container may not offer it in these groups.
         """
         self._access.require_offer(self._own.identity, info.groups, info.kind)
@@ -175,15 +175,15 @@ class Providers:
             raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
 
     def alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
-        """Tell everybody something else about a provider, in a new revision. Its place stays: handles hold.
+        """Announce a changed description of a provider, in a new revision. Its place stays: handles remain valid.
 
         Args:
             provider: the object.
-            change: from what was announced to what is to be.
-            reread: read its class and resources again, too; calls under way end as they began.
+            change: turns the announced description into the new one.
+            reread: read its class and resources again, too; running calls end with the old ones.
 
         Raises:
-            ConfigurationError: it is not registered here, or the class has become wrong.
+            ConfigurationError: it is not registered here, or its class has become invalid.
             AccessDenied: this container may not offer it in these groups.
         """
         with self._announcing:
@@ -214,7 +214,7 @@ class Providers:
             return place, self._hosted[place]
 
     def _announce(self, place: str, info: ProviderInfo) -> None:
-        """Known here first, then everywhere; in the next revision."""
+        """Update the local registry first, then announce to all; in the next revision."""
         self._revision += 1
         info = structs.replace(info, revision=self._revision)
         domain, _, chunk = place.partition("/")
@@ -222,11 +222,11 @@ class Providers:
         self._announcer.announce(domain, chunk, info)
 
     def remove(self, provider: object, moved_to: str = "") -> None:
-        """Stop hosting an object: gone from the registry first, uncallable then.
+        """Stop hosting an object: removed from the registry first, then uncallable.
 
         Args:
             provider: the object.
-            moved_to: where what took it over is offered, if it did: ``identity/container/epoch/domain/provider``.
+            moved_to: its new place, if another container took it over: ``identity/container/epoch/domain/provider``.
 
         Raises:
             ConfigurationError: it is not registered here.
@@ -250,7 +250,7 @@ class Providers:
                 self._table.drop(resource)
 
     def alone_with(self, provider: object) -> list[Resource]:
-        """What services of a registered object use, and those of no other."""
+        """The resources that services of a registered object use, and no others do."""
         used: dict[bool, set[Resource]] = {True: set(), False: set()}
         for registered in list(self._hosted.values()):
             for service in registered.services.values():
@@ -258,7 +258,7 @@ class Providers:
         return sorted(used[True] - used[False], key=lambda resource: resource.name)
 
     def stop_of(self, resource: Resource) -> LocalService | None:
-        """The service that stops a resource, and as few others as there are."""
+        """The service that stops a resource and the fewest others."""
         found = [
             service
             for registered in list(self._hosted.values())
@@ -268,7 +268,7 @@ class Providers:
         return min(found, key=lambda service: len(service.resources), default=None)
 
     def groups_of(self, resource: str) -> set[str]:
-        """The groups, as keys name them, of the services that use a resource."""
+        """The groups, in the form of keys, of the services that use a resource."""
         return {
             place.partition("/")[0]
             for place, registered in list(self._hosted.items())
@@ -277,7 +277,7 @@ class Providers:
         }
 
     def stops(self) -> list[LocalService]:
-        """Every stop service that needs no arguments, the middleware's own left out."""
+        """All stop services without required arguments, except the middleware's own."""
         return [
             service
             for place, registered in list(self._hosted.items())
@@ -287,24 +287,24 @@ class Providers:
         ]
 
     def waiting(self) -> int:
-        """Calls of serial services whose turn has not come."""
+        """The number of calls that wait in queues of serial services."""
         services = [service for hosted in list(self._hosted.values()) for service in hosted.services.values()]
         return sum(serial.waiting for serial in {service.serial for service in services} if serial is not None)
 
     def offer(self, place: str) -> Offer | None:
-        """What is registered at a place (``domain/provider``)."""
+        """The provider registered at a place (``domain/provider``)."""
         known = self._hosted.get(place)
         return None if known is None else Offer(known.provider, known.info.groups, known.implements, known.info.meta)
 
     def lookup(self, place: str, service: str) -> LocalService | None:
-        """A service as calls name it.
+        """The service that a call names.
 
         Args:
-            place: ``domain/provider``. The domain must be the provider's own: access rules go by it.
+            place: ``domain/provider``. The domain must be the provider's own: access rules apply to it.
             service: its name.
 
         Raises:
-            ServiceGone: its provider has moved, and where to.
+            ServiceGone: its provider has moved; the error names the new place.
         """
         registered = self._hosted.get(place)
         if registered is None:
@@ -314,7 +314,7 @@ class Providers:
         return registered.services.get(service)
 
     def services_at(self, place: str) -> Mapping[str, LocalService]:
-        """What is offered at a place, by name."""
+        """The services at a place, by name."""
         registered = self._hosted.get(place)
         return {} if registered is None else registered.services
 
@@ -359,7 +359,7 @@ class Providers:
         return services
 
     def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
-        """The one that other objects of the class have already, if any."""
+        """The signature that other objects of the class already have, or a new one."""
         key = (name, mark, function)
         found = self._signatures.get(key)
         if found is None:
@@ -367,7 +367,7 @@ class Providers:
         return found
 
     def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
-        """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
+        """The resources that a service needs; a service that names none, or only reads, can be locked by itself."""
         if itself.startswith(f"{DOMAIN}/") or mark.effect == "note":
             return ()
         if mark.effect == "read" or (not needed and mark.effect == "actuate"):
@@ -388,5 +388,5 @@ def _not_registered(provider: object) -> ConfigurationError:
 
 
 def _own_meta(provider: object) -> dict[str, Scalar]:
-    """What others need to know of its class: that it may go on elsewhere although it drives something (S20)."""
+    """What others need to know of its class: that it can move to another host although it drives something (S20)."""
     return {"relocatable": True} if getattr(provider, "relocatable", False) is True else {}

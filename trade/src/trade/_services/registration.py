@@ -1,4 +1,4 @@
-"""What may be registered, and what is kept of each object that is."""
+"""The rules of registration, and the record of each registered object."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
@@ -15,7 +15,7 @@ _LONGEST_HEALTH: Final = 500
 
 
 def require_stop(kind: str, resources: Sequence[object], marks: Sequence[ServiceMark]) -> None:
-    """S17: what moves something physical is not offered without a way to stop it."""
+    """S17: a provider that moves something physical must have a way to stop it."""
     physical = resources or any(mark.uses for mark in marks)
     effects = {mark.effect for mark in marks}
     if physical and "actuate" in effects and "stop" not in effects:
@@ -38,7 +38,7 @@ def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, 
 
 
 def checked_health(provider: object, health: str) -> str:
-    """A health text; raises ConfigurationError for what is none."""
+    """A health text; raises ConfigurationError for an invalid one."""
     if not isinstance(health, str) or not 0 < len(health) <= _LONGEST_HEALTH:  # pyright: ignore[reportUnnecessaryIsInstance]
         problem = f"health must be a text of 1 to {_LONGEST_HEALTH} characters that says what is wrong, or 'healthy'"
         raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
@@ -52,11 +52,11 @@ class Registered(Struct, frozen=True):
     services: dict[str, LocalService]
     implements: tuple[type, ...]
     info: ProviderInfo
-    """As it was announced last."""
+    """As it was last announced."""
 
 
 class Offer(NamedTuple):
-    """An object, and how it is registered."""
+    """An object with its registration."""
 
     provider: object
     groups: tuple[str, ...]
@@ -65,7 +65,7 @@ class Offer(NamedTuple):
 
 
 class Built(NamedTuple):
-    """An object read into services, which are not offered yet; its resources are adopted."""
+    """An object read into services that are not offered yet; it holds its resources."""
 
     place: str
     registered: Registered

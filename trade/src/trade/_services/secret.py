@@ -1,4 +1,4 @@
-"""Arguments that reach the provider and nobody else: masked wherever a text might show them."""
+"""Secret arguments: they reach only the provider, and are masked wherever a text might show them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, TypeVar, cast, get_args
@@ -8,7 +8,7 @@ from msgspec import Meta, Raw, structs
 
 from trade._protocol.messages import UNREADABLE, ErrorInfo
 
-# What is masked has no types: it came over the wire.
+# Masked values have no types: they came over the wire.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 
 __all__ = ["MASK", "Secret", "is_secret"]
@@ -18,23 +18,23 @@ _T = TypeVar("_T")
 _NOTE: Final = Meta(extra_json_schema={"writeOnly": True})
 
 Secret = Annotated[_T, _NOTE]
-"""Marks an argument: ``Secret[str]``. Its value never shows in errors, tracebacks, logs or descriptions."""
+"""Marks an argument as secret: ``Secret[str]``. Its value appears in no error, traceback, log or description."""
 
 
 def is_secret(kind: Any) -> bool:
-    """Whether a parameter's annotation marks it as secret, however it is written."""
+    """Whether a parameter's annotation marks it as secret, in whatever form it is written."""
     if any(note is _NOTE for note in getattr(kind, "__metadata__", ())):
         return True
     return any(map(is_secret, get_args(kind)))
 
 
 def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: frozenset[str]) -> ErrorInfo:
-    """An error without the values of secret arguments.
+    """Replaces the values of secret arguments in an error.
 
     Args:
         info: the error as it would be sent.
         raw: the arguments of the call.
-        names: the service's parameters that may be given by place, in their order.
+        names: the names of the service's positional parameters, in order.
         secrets: the ones to mask.
     """
     named = _named(raw, names)
@@ -47,12 +47,12 @@ def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: froze
             fields=_masked(info.fields, ordered),
             traceback=_masked(info.traceback, ordered),
         )
-    except RecursionError:  # nested too deeply to be looked through
+    except RecursionError:  # nested too deeply to search
         return structs.replace(info, message=MASK, fields={}, traceback="")
 
 
 def _named(raw: Raw | bytes, names: Sequence[str]) -> Mapping[str, Any]:
-    """The arguments by name; none where the message has no arguments: no provider has seen a value then."""
+    """The arguments by name; empty if the message has no valid arguments: no provider has seen a value then."""
     try:
         given: Any = msgspec.msgpack.decode(raw)
     except UNREADABLE:
@@ -78,7 +78,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 
 
 def _forms(value: Any) -> Iterator[str]:
-    """How a value may stand in a text."""
+    """The forms in which a value may appear in a text."""
     for text in (str(value), repr(value), repr(value)[1:-1] if isinstance(value, str) else ""):
         if text:
             yield text

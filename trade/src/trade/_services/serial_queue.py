@@ -1,4 +1,4 @@
-"""Services that run one at a time: a queue per provider object, without a thread for each that waits."""
+"""Services that run one at a time: one queue for each provider object, without a thread for each waiting call."""
 
 import contextlib
 import logging
@@ -31,8 +31,8 @@ _held: "ContextVar[tuple[SerialQueue, ...]]" = ContextVar("trade_serial", defaul
 class SerialQueue:
     """The serial services of one provider, in order of arrival.
 
-    Whoever finds it free runs its own call and then what has queued up meanwhile. Calls from this process run on their
-    callers' threads.
+    The thread that finds the queue free runs its own call and then the calls queued meanwhile. Calls from this process
+    run on their callers' threads.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class SerialQueue:
 
     @property
     def waiting(self) -> int:
-        """Calls whose turn has not come."""
+        """The number of queued calls."""
         return len(self._queue)
 
     @property
@@ -52,7 +52,7 @@ class SerialQueue:
 
     @contextlib.contextmanager
     def held(self) -> Generator[None]:
-        """While a serial service runs."""
+        """Marks the running code as a serial service of this provider."""
         token = _held.set((*_held.get(), self))
         try:
             yield
@@ -60,7 +60,7 @@ class SerialQueue:
             _held.reset(token)
 
     def submit(self, job: Job) -> bool:
-        """Run it now if nothing runs, else when its turn comes, on another thread. False: too many wait already."""
+        """Run a job now if the queue is free, else later on another thread. False: the queue is full."""
         with self._lock:
             if self._taken:
                 if len(self._queue) >= MOST_WAITING:
@@ -72,7 +72,7 @@ class SerialQueue:
         return True
 
     def withdraw(self, waiting: Job | Turn) -> bool:
-        """Take it out of the queue; False if its turn has come."""
+        """Take a job or turn out of the queue; False if its turn has come."""
         with self._lock:
             if waiting not in self._queue:
                 return False
@@ -80,13 +80,13 @@ class SerialQueue:
             return True
 
     def drop(self, turn: Turn) -> None:
-        """End a thread's waiting: its turn will not come."""
+        """End a thread's wait: its turn will not come."""
         if self.withdraw(turn):
             turn.dropped = True
             turn.come.set()
 
     def enter(self, turn: Turn, timeout_s: float | None) -> bool:
-        """Wait for the turn of this thread; False if it did not come in time. Followed by `leave`."""
+        """Wait for the turn of this thread; False after the timeout. Followed by `leave`."""
         with self._lock:
             if not self._taken:
                 self._taken = True
@@ -100,7 +100,7 @@ class SerialQueue:
             raise
 
     def leave(self) -> None:
-        """Give the turn to who is next."""
+        """Pass the turn to the next in the queue."""
         job = self._next()
         if job is not None:
             threading.Thread(target=self._drain, args=(job,), name="trade-serial", daemon=True).start()
@@ -114,7 +114,7 @@ class SerialQueue:
             job = self._next()
 
     def _next(self) -> Job | None:
-        """The next job; None if nothing waits, or a thread does, which has the turn then."""
+        """The next job; None if the queue is empty, or if the next is a waiting thread, which then has the turn."""
         with self._lock:
             if not self._queue:
                 self._taken = False

@@ -1,4 +1,4 @@
-"""One method's arguments and result as the provider's side sees them: validated before its code runs, encoded after."""
+"""One method's arguments and result on the provider's side: validated before its code runs, encoded after."""
 
 # pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false, reportUnknownMemberType=false
 
@@ -28,15 +28,15 @@ _POSITIONAL: Final = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSIT
 _PLAIN: Final = frozenset([bool, int, float, str, bytes, type(None)])
 _SEVERAL: Final = (list, tuple, set, frozenset)
 _SAME_WHEN_COPIED: Final = (bool, float, type(None))
-"""Every value of these can be sent, and what arrives is the same."""
+"""Types whose values can all be sent, and arrive unchanged."""
 
 
 _infos: Final[WeakValueDictionary[tuple[str, ServiceMark, Callable[..., Any]], ServiceInfo]] = WeakValueDictionary()
-"""What was said of a method last. Believed of the middleware's own, which are in every container and do not change."""
+"""Cached descriptions of methods. Used for the middleware's own, which every container has and which do not change."""
 
 
 class Signature:
-    """Made once for all objects that share the method; whose service it is comes with each use, for errors."""
+    """Made once for all objects that share the method; each use passes the service's name, for errors."""
 
     def __init__(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any], codec: Codec) -> None:
         hints = _hints(where, function)
@@ -59,7 +59,7 @@ class Signature:
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
         key = (name, mark, function)
-        # What a program executes from text may have no module.
+        # Code executed from text may have no module.
         known = _infos.get(key) if (function.__module__ or "").startswith("trade.") else None
         self.info = known or describe(where, name, mark, function, parameters, kinds, returns, codec)
         _infos[key] = self.info
@@ -80,7 +80,7 @@ class Signature:
         return described(where, "an argument", build)
 
     def decode(self, service: str, raw: Raw | bytes) -> tuple[Sequence[Any], dict[str, Any]]:
-        """Validate arguments from the wire. Raises InvalidArgument; no code of the provider has run then."""
+        """Validate arguments from the wire. Raises InvalidArgument before any code of the provider runs."""
         try:
             head = raw[0] if type(raw) is bytes else memoryview(raw)[0]
             args, kwargs = self._by_name(raw) if head in _MAP_HEADS else (self._by_place(raw), {})
@@ -119,7 +119,7 @@ class Signature:
         return args, kwargs
 
     def encode_result(self, service: str, value: Any) -> bytes:
-        """Check and encode a result. Raises InvalidResult, NotSerialisable, TooLarge: the provider's fault."""
+        """Check and encode a result. Raises InvalidResult, NotSerialisable, TooLarge: defects of the provider."""
         plain = self._result_is_plain
         try:
             data = self._codec.encode(value)
@@ -134,13 +134,13 @@ class Signature:
         return data
 
     def copy_result(self, service: str, value: Any) -> Any:
-        """What a caller on the other side of the wire would get."""
+        """The result as a remote caller would get it."""
         if type(value) is self._result_is_itself:
             return value
         return self._decode_result(self.encode_result(service, value))
 
     def encode_progress(self, service: str, value: Any) -> bytes:
-        """What the provider says of its progress. Raises NotSerialisable, TooLarge: the provider's fault."""
+        """Encode a progress value. Raises NotSerialisable, TooLarge: defects of the provider."""
         try:
             data = self._codec.encode(value)
         except (TypeError, ValueError, OverflowError, RecursionError) as bad:
@@ -150,16 +150,16 @@ class Signature:
         return data
 
     def copy_progress(self, service: str, value: Any) -> Any:
-        """The same as a caller on the other side of the wire would get it."""
+        """The progress value as a remote caller would get it."""
         return self._decode_any(self.encode_progress(service, value))
 
     def named(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """Arguments by name, for everybody's eyes."""
+        """Arguments by name, with secrets masked."""
         given = {**dict(zip(self._positional, args, strict=False)), **kwargs}
         return {name: MASK if name in self._secrets else value for name, value in given.items()}
 
     def without_secrets(self, error: ErrorInfo, raw: Raw | bytes) -> ErrorInfo:
-        """An error of a call with these arguments, fit for everybody's eyes."""
+        """An error of a call with these arguments, with secrets masked."""
         return mask(error, raw, self._positional, self._secrets)
 
     def _explain(self, service: str, bad: Exception, raw: Raw | bytes) -> InvalidArgument:
@@ -240,7 +240,7 @@ def _parameters(where: str, function: Callable[..., Any]) -> list[inspect.Parame
 
 
 def _is_number(kind: Any) -> bool:
-    """Whether it takes numbers only, limited or not."""
+    """Whether a type accepts numbers only, limited or not."""
     return getattr(kind, "__origin__", kind) in (float, int, bool)
 
 
@@ -248,7 +248,7 @@ def _mentions_float(kind: Any) -> bool:
     if kind is float or kind is Any:
         return True
     if isinstance(kind, type) and kind.__module__ != "builtins":
-        return True  # a struct: looked at value by value
+        return True  # a struct: checked value by value
     return any(_mentions_float(inner) for inner in getattr(kind, "__args__", ()))
 
 

@@ -1,4 +1,4 @@
-"""Providers that were taken off from anywhere in the system, kept by their container to be offered again."""
+"""Providers that were withdrawn through the system, kept by their container to be offered again."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ class WithdrawnInfo(Struct, frozen=True):
 
 
 class Withdrawn:
-    """Owns what is not offered at the moment; whoever registered the object keeps the last word on it."""
+    """Owns the withdrawn providers; the code that registered an object keeps the final say over it."""
 
     def __init__(self, providers: Providers, rest: Callable[[Sequence[Resource], str], list[str]]) -> None:
         self._providers: Final = providers
@@ -31,13 +31,13 @@ class Withdrawn:
         self._kept: dict[str, Offer] = {}
 
     def take_off(self, key: ServiceKey, moved_to: str = "") -> str:
-        """Stop offering the provider of a service; returns the name it is put back by.
+        """Stop offering the provider of a service; returns the name under which it can be offered again.
 
-        What it moves is stopped first: afterwards nobody could. ``moved_to`` is where it is offered instead, if it is.
+        It stops its motion first: afterwards no client could. ``moved_to`` is its new place, if it moved.
 
         Raises:
             ConfigurationError: it is not offered here, or is the middleware's own.
-            DeviceFault: it could not be stopped; it is offered as before.
+            DeviceFault: it could not be stopped; it is still offered.
         """
         if key.domain == DOMAIN:
             raise ConfigurationError(where=key.provider, problem="the middleware's own services cannot be withdrawn")
@@ -50,13 +50,13 @@ class Withdrawn:
             self._kept[key.provider] = offer
         try:
             self._providers.remove(offer.provider, moved_to)
-        except ConfigurationError:  # somebody was quicker; its owner perhaps, who has the last word
+        except ConfigurationError:  # another thread was faster; perhaps its owner, which has the final say
             self.forget(offer.provider)
             raise
         return key.provider
 
     def put_back(self, provider: str, groups: str | Sequence[str] | None) -> list[ServiceKey]:
-        """Offer it again, in other groups if some are given. Returns the keys of its services.
+        """Offer a provider again, in other groups if some are given. Returns the keys of its services.
 
         Raises:
             ConfigurationError: no such provider was withdrawn, or a malformed group.
@@ -73,7 +73,7 @@ class Withdrawn:
         return keys
 
     def forget(self, provider: object) -> bool:
-        """Its owner registers or deregisters it; returns whether it was kept."""
+        """Its owner registers or deregisters it; returns whether it was withdrawn."""
         with self._lock:
             names = [name for name, offer in self._kept.items() if offer.provider is provider]
             for name in names:
@@ -81,12 +81,12 @@ class Withdrawn:
         return bool(names)
 
     def offer(self, provider: str) -> Offer | None:
-        """What was withdrawn under that name, and how it was registered."""
+        """The provider withdrawn under a name, with its registration."""
         with self._lock:
             return self._kept.get(provider)
 
     def infos(self) -> list[WithdrawnInfo]:
-        """What can be put back, by name."""
+        """The providers that can be offered again, by name."""
         with self._lock:
             kept = sorted(self._kept.items())
         return [WithdrawnInfo(name, type(offer.provider).__qualname__, offer.groups) for name, offer in kept]

@@ -1,1 +1,1 @@
-"""SQLite files, each with a thread of its own."""
+"""SQLite files, each with its own thread."""

@@ -1,4 +1,4 @@
-"""One SQLite file, and the one thread that uses it: all goes on without the disk but the saving."""
+"""One SQLite file, and the one thread that uses it: a disk error stops only the saving."""
 
 import contextlib
 import sqlite3
@@ -13,24 +13,24 @@ import msgspec
 __all__ = ["Database"]
 
 _WAIT_S: Final = 10.0
-"""How long the disk may take."""
+"""How long to wait for the disk."""
 _BESIDE: Final = ("", "-wal", "-shm")
-"""Of the file's name, what else belongs to it."""
+"""Suffixes of the database's files."""
 
 _Result = TypeVar("_Result")
 
 
 class Database:
-    """A file that others derive from to say what is in it.
+    """The base class of a database in one file.
 
-    What is wrong with the disk is told once, and when it is well again. A file that is no sound database is moved
-    aside, and a new one is begun.
+    It reports a disk error once, and the recovery once. A file that is not a valid database is renamed, and a new one
+    is created.
 
     Args:
-        path: of the file; its folder is made.
-        table: the statement that makes its table, if it is not there.
-        what: what is in it, in one word, for messages.
-        tell: is told what is wrong, and when it is not any more.
+        path: of the file; its folder is created.
+        table: the statement that creates its table if it does not exist.
+        what: its contents in one word, for messages.
+        tell: called with a message about each error and each recovery.
     """
 
     def __init__(self, path: Path, table: str, what: str, tell: Callable[[str], None]) -> None:
@@ -44,19 +44,19 @@ class Database:
 
     def close(self) -> None:
         """End its thread. Idempotent."""
-        with contextlib.suppress(RuntimeError):  # it has ended already
+        with contextlib.suppress(RuntimeError):  # it ended already
             self._thread.submit(self._let_go)
         self._thread.shutdown()
 
     def _ask(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> _Result:
-        """What comes of it, or the default if the disk does not do it in time."""
+        """The result of a function on the database, or the default if the disk does not respond in time."""
         try:
             return self._start(what, default=default).result(_WAIT_S)
-        except (TookTooLong, RuntimeError):  # the latter: it was closed meanwhile
+        except (TookTooLong, RuntimeError):  # RuntimeError: it was closed meanwhile
             return default
 
     def _start(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> "Future[_Result]":
-        """Have it done without waiting; RuntimeError if it was closed."""
+        """Run a function on the database without waiting; RuntimeError if it is closed."""
         return self._thread.submit(self._do, what, default)
 
     # --- on its thread
@@ -68,7 +68,7 @@ class Database:
             self._let_go()
             if not self._trouble:
                 self._trouble = str(wrong)
-                self._tell(f"no {self._what} is saved: {self._path}: {wrong}; all else goes on")
+                self._tell(f"no {self._what} is saved: {self._path}: {wrong}. Everything else continues")
             return default
         if self._trouble:
             self._trouble = ""
@@ -78,12 +78,12 @@ class Database:
     def _tried(self, what: Callable[[sqlite3.Connection], _Result]) -> _Result:
         try:
             return what(self._opened())
-        except sqlite3.OperationalError:  # the disk, not what is on it
+        except sqlite3.OperationalError:  # a disk error, not a damaged file
             raise
         except (sqlite3.DatabaseError, msgspec.DecodeError) as corrupt:
             self._let_go()
             aside = self._move_aside()
-            self._tell(f"{self._path} is corrupt ({corrupt}) and is {aside.name} now; what it held is not restored")
+            self._tell(f"{self._path} is corrupt ({corrupt}): it is {aside.name} now; its contents are not restored")
             return what(self._opened())
 
     def _opened(self) -> sqlite3.Connection:
