@@ -263,7 +263,7 @@ def test_a_condition_that_is_neither_true_nor_false_does_not_hold_and_is_told(
     with caplog.at_level(logging.WARNING, "trade"):
         noted = here.every(SOON_S, handle("go"), if_=handle("level"))
         wait_until(lambda: noted.info().failures >= 3)
-    assert "answers with True or False, not 0.5" in noted.info().last_error
+    assert "returns True or False, not 0.5" in noted.info().last_error
     assert dock.came.empty()
     assert caplog.text.count("it stays attached") == 1  # the same again says nothing new
 
@@ -395,7 +395,7 @@ def test_a_detached_one_outlives_who_asked_for_it(
 
 
 def test_one_that_lives_here_cannot_outlive_here(here: Container) -> None:
-    with pytest.raises(ConfigurationError, match="ask for it with host="):
+    with pytest.raises(ConfigurationError, match="request it with host="):
         here.every(60, print).detach()
 
 
@@ -416,4 +416,4 @@ def test_who_asked_hears_of_failures_elsewhere(
 ) -> None:
     with caplog.at_level(logging.WARNING, "trade"):
         here.once(handle("go").bind("fast"), host=there.name)
-        wait_until(lambda: "asked for here, failed at" in caplog.text)
+        wait_until(lambda: "requested here, failed at" in caplog.text)

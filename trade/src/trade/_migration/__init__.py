@@ -1,1 +1,1 @@
-"""Moving a provider to another container with its state, and making providers on request."""
+"""Moves a provider with its state to another container, and creates providers on request."""

@@ -1,4 +1,4 @@
-"""Objects that a container makes because somebody asks, of classes that its settings allow."""
+"""Creates objects in a container on request, of classes that its settings allow."""
 
 import importlib
 import logging
@@ -27,7 +27,7 @@ class _Made(NamedTuple):
 
 
 class FactoryHost(Protocol):
-    """The container they are registered in."""
+    """The container in which created objects are registered."""
 
     @property
     def address(self) -> Address: ...
@@ -35,7 +35,7 @@ class FactoryHost(Protocol):
 
 
 class ProviderFactory:
-    """Owns what was made here: it is closed when somebody terminates it, or with the container."""
+    """Owns the objects created here: each is closed when a client terminates it, or with the container."""
 
     def __init__(self, home: FactoryHost, providers: Providers, withdrawn: Withdrawn, allowed: Sequence[str]) -> None:
         self._home = home
@@ -46,11 +46,11 @@ class ProviderFactory:
         self._made: dict[int, _Made] = {}
 
     def find(self, class_path: str) -> type:
-        """The class of a path; it stands in the module that defines it, and only modules of allowed ones are imported.
+        """The class of a path, in the module that defines it; only modules of allowed classes are imported.
 
         Raises:
             NotInstantiable: the settings do not allow it.
-            NoSuchClass: there is none.
+            NoSuchClass: the class does not exist.
             CannotInstantiate: its module cannot be imported.
         """
         where = self._home.address.container
@@ -69,12 +69,12 @@ class ProviderFactory:
             found = getattr(found, "__dict__", {}).get(part)
         if not isinstance(found, type):
             raise NoSuchClass(class_path=class_path, container=where, reason=f"{module_name} has no such class")
-        if path_of(found) != class_path:  # a pattern means what its modules define, not what they import
+        if path_of(found) != class_path:  # a pattern allows what its modules define, not what they import
             raise NoSuchClass(class_path=class_path, container=where, reason=f"it is defined as {path_of(found)}")
         return found
 
     def make(self, kind: type, args: Arguments) -> object:
-        """An object of a class that `find` gave. Raises CannotInstantiate."""
+        """Create an object of a class that `find` returned. Raises CannotInstantiate."""
         try:
             return kind(**args) if isinstance(args, Mapping) else kind(*args)
         except Exception as error:
@@ -82,7 +82,7 @@ class ProviderFactory:
             raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_told(error)) from error
 
     def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
-        """Register what was made; it is closed if that cannot be."""
+        """Register a created object; close it if that fails."""
         try:
             handles = self._home.register(made, groups)
         except BaseException:
@@ -92,18 +92,18 @@ class ProviderFactory:
         return handles
 
     def keep(self, made: object, args: Arguments) -> None:
-        """Something was made here with these arguments."""
+        """Keep an object that was created here, with its arguments."""
         with self._lock:
             self._made[id(made)] = _Made(made, args)
 
     def arguments_of(self, provider: object) -> Arguments:
-        """What it was made with; nothing if it was not made here."""
+        """The arguments that a provider was created with; empty if it was not created here."""
         with self._lock:
             made = self._made.get(id(provider))
         return () if made is None else made.args
 
     def let_go(self, provider: object) -> None:
-        """It has moved away: it is not offered again, and is closed, whoever made it."""
+        """Close a provider that has moved away, so that it is not offered again, whatever created it."""
         self._withdrawn.forget(provider)
         with self._lock:
             self._made.pop(id(provider), None)
@@ -123,7 +123,7 @@ class ProviderFactory:
         self.let_go(made.provider)
 
     def close(self) -> None:
-        """Close all that was made here. Idempotent."""
+        """Close all objects created here. Idempotent."""
         with self._lock:
             made, self._made = list(self._made.values()), {}
         for one in reversed(made):
@@ -136,7 +136,7 @@ def path_of(kind: type) -> str:
 
 
 def end(made: object) -> None:
-    """Close an object, if it can be; what it raises then is logged."""
+    """Close an object that has `close`; log any error."""
     close = getattr(made, "close", None)
     if callable(close):
         try:

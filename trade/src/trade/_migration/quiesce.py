@@ -1,4 +1,4 @@
-"""A provider held still: nobody calls what actuates, nothing moves, until its state has been taken or given."""
+"""Holds a provider still: blocks calls that actuate, and motion, until its state has been taken or given."""
 
 import contextlib
 import threading
@@ -14,34 +14,34 @@ from trade._services.local_service import LocalService
 from trade.errors import ConfigurationError, LockedByOther
 
 CALLS_S: Final = 2.0
-"""How long calls that run may take to end."""
+"""How long running calls may take to end."""
 LONGEST_S: Final = 60.0
-"""A provider is held still no longer than this."""
+"""The longest time that a provider is held still."""
 
 
 class Frozen:
-    """The resources of one provider, which nobody may use."""
+    """The resources of one provider, blocked for every client."""
 
     def __init__(self, table: LockTable, number: int, resources: tuple[Resource, ...]) -> None:
         self._table = table
         self._number = number
-        """Of the grant that holds it still; 0 if nothing of it actuates."""
+        """The number of the grant that holds them; 0 if no service of the provider actuates."""
         self._resources = resources
         self._free: Callable[[], None] | None = None
 
     def check(self) -> None:
-        """Whether it is still.
+        """Check that the provider is still held.
 
         Raises:
-            LockedByOther: the lock that holds it was broken or has outlived its lease, or it moves.
-            Stopped: somebody stopped it meanwhile.
+            LockedByOther: the lock that holds it was broken or its lease expired, or it moves.
+            Stopped: a client stopped it meanwhile.
         """
         if self._number and (why := self._table.over(self._number)):
             raise self._lost(why)
         require_rest(self._resources)
 
     def seal(self) -> None:
-        """Let nobody in any more, also who has found it before it is withdrawn and gets to it after that.
+        """Block it permanently, also for calls that found it before it was withdrawn and reach it only later.
 
         Raises:
             LockedByOther: see `check`.
@@ -52,13 +52,13 @@ class Frozen:
                 raise self._lost(self._table.over(self._number))
 
     def unseal(self) -> None:
-        """It goes on."""
+        """Release the resources: the provider continues."""
         if self._free is not None:
             self._free()
 
     def _lost(self, why: str) -> LockedByOther:
         names = tuple(resource.name for resource in self._resources)
-        return LockedByOther(resources=names, owner=f"nobody any more: {why}", purpose="migrating")
+        return LockedByOther(resources=names, owner=f"no owner any more: {why}", purpose="migrating")
 
 
 class Quiescer:
@@ -72,17 +72,17 @@ class Quiescer:
     def frozen(
         self, services: Mapping[str, LocalService], alone: Callable[[], list[Resource]], purpose: str
     ) -> Generator[Frozen, None, None]:
-        """Hold it still, once calls that run have ended.
+        """Hold a provider still once its running calls have ended.
 
         Args:
-            services: of the provider, by name.
-            alone: tells the resources that are only its own.
-            purpose: as others are told who come meanwhile.
+            services: its services, by name.
+            alone: returns the resources that only this provider uses.
+            purpose: the purpose shown to other clients meanwhile.
 
         Raises:
-            LockedByOther: somebody has it locked, it moves, or a call does not end within `CALLS_S`.
-            Stopped: a stop holds, which would be forgotten elsewhere.
-            ConfigurationError: what it uses is used by another provider, too.
+            LockedByOther: a client has it locked, it moves, or a call does not end within `CALLS_S`.
+            Stopped: a stop is in force, which the other container would not know.
+            ConfigurationError: another provider uses its resources, too.
         """
         used = {resource for service in services.values() for resource in service.resources}
         moved = {one for service in services.values() if service.effect == "actuate" for one in service.resources}
@@ -107,21 +107,21 @@ class Quiescer:
 
 
 def require_rest(resources: tuple[Resource, ...]) -> None:
-    """Raises LockedByOther: one moves. Stopped: one was stopped, and nobody has resumed it."""
+    """Raises LockedByOther: a resource moves. Stopped: a resource was stopped and has not been resumed."""
     for resource in resources:
         if (latch := resource.estop or resource.latch) is not None:
             raise latch.stopped(resource.name, estop=resource.estop is not None)
         if resource.moving:
-            owner, purpose = ", ".join(resource.movers) or "somebody", "a motion that has not ended"
+            owner, purpose = ", ".join(resource.movers) or "a client", "a motion that has not ended"
             raise LockedByOther(resources=(resource.name,), owner=owner, purpose=purpose)
 
 
 BUDGET_S: Final = 5.0
-"""How long a provider may take to give or take its state."""
+"""How long a provider may take to save or restore its state."""
 
 
 def is_stateful(kind: type) -> bool:
-    """Whether objects of a class can give and take their state."""
+    """Whether objects of a class can save and restore their state."""
     return all(callable(getattr(kind, name, None)) for name in ("save_state", "restore_state"))
 
 
@@ -136,13 +136,13 @@ def restore(provider: Any, state: Any) -> None:
 
 
 def _within_budget(ask: Callable[[], Any], what: str) -> Any:
-    """On a thread of its own: what hangs there for ever holds up nobody else."""
+    """Calls on its own thread: a call that hangs blocks nothing else."""
     results, errors, over = list[Any](), list[BaseException](), threading.Event()
 
     def run() -> None:
         try:
             results.append(ask())
-        except BaseException as error:  # noqa: BLE001 - raised where it was asked for
+        except BaseException as error:  # noqa: BLE001 - raised again in the calling thread
             errors.append(error)
         over.set()
 

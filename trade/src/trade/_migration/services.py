@@ -1,4 +1,4 @@
-"""What every container offers about making, moving and ending providers, in group ``trade``."""
+"""The services for creating, moving and ending providers that every container offers, in group ``trade``."""
 
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from trade._services.decorator import service
 
 
 class Maker(Protocol):
-    """What makes objects and containers, and ends them."""
+    """Creates objects and containers, and ends them."""
 
     def instantiate(
         self, class_path: str, args: tuple[Any, ...] | dict[str, Any], groups: tuple[str, ...], state: Any
@@ -25,7 +25,7 @@ class Maker(Protocol):
 
 
 class FactoryServices:
-    """The wire's side of `Making`, and of the end of a container."""
+    """The wire side of `Making`, and of the end of a container."""
 
     def __init__(self, system: Maker) -> None:
         self._of_here = system
@@ -38,7 +38,7 @@ class FactoryServices:
         groups: tuple[str, ...] = (),
         state: Any = None,
     ) -> tuple[Handle, ...]:
-        """Make an object of a class that this container allows, give it its state if there is some, and offer it."""
+        """Create an object of a class that this container allows, give it its state if there is one, and offer it."""
         return self._of_here.instantiate(class_path, args, groups, state)
 
     @service
@@ -53,14 +53,14 @@ class FactoryServices:
 
     @service
     def terminate_container(self, reason: str = "", only_at_rest: bool = False) -> list[str]:
-        """End this container: what moves stops, its services are withdrawn; what could not be stopped, and why."""
+        """End this container: stop what moves and withdraw its services; returns what could not be stopped, and why."""
         call = current_call()
         who = "itself" if call is None else call.caller
         return self._of_here.terminate_container(reason, only_at_rest=only_at_rest, who=who)
 
 
 class MigrationServices:
-    """The wire's side of `MigrationSource` and `MigrationTarget`."""
+    """The wire side of `MigrationSource` and `MigrationTarget`."""
 
     def __init__(self, departing: MigrationSource, arriving: MigrationTarget) -> None:
         self._departing = departing
@@ -68,30 +68,30 @@ class MigrationServices:
 
     @service
     def migrate(self, service: Handle, to: str, args: tuple[Any, ...] | dict[str, Any] | None = None) -> list[Handle]:
-        """Have a provider of this container go on in another one, with its state; handles of its services there."""
+        """Move a provider of this container to another one, with its state; returns handles of its services there."""
         return self._departing.migrate(service, to, args, served_call().caller)
 
     @service
     def save_state(self, service: Handle) -> Any:
-        """The state of a provider of this container, while nothing of it runs or moves."""
+        """The state of a provider of this container, taken while it neither runs nor moves."""
         return self._departing.save_state(service, served_call().caller)
 
     @service
     def restore_state(self, service: Handle, state: Any) -> None:
-        """Give a provider of this container its state, while nothing of it runs or moves."""
+        """Give a provider of this container its state while it neither runs nor moves."""
         self._departing.restore_state(service, state, served_call().caller)
 
     @service
     def prepare_arrival(self, luggage: ProviderSnapshot) -> Prepared:
-        """For containers: make what is to come and give it its state; it is closed again if nobody fetches it."""
+        """For containers: create the arriving provider with its state; it is closed if it is not fetched in time."""
         return self._arriving.prepare(luggage, served_call().caller)
 
     @service
     def arrive(self, ticket: str) -> None:
-        """For containers: offer what was prepared."""
+        """For containers: offer the prepared provider."""
         self._arriving.arrive(ticket, served_call().caller)
 
     @service
     def arrived(self, ticket: str) -> bool:
-        """For containers: whether what was prepared is offered; if it is not, it never will be."""
+        """For containers: whether the prepared provider is offered; if it is not, it never will be."""
         return self._arriving.arrived(ticket, served_call().caller)

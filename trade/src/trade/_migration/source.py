@@ -1,7 +1,7 @@
-"""The side of a migration that a provider leaves: held still, prepared elsewhere, withdrawn here, offered there.
+"""The source of a migration: the provider is held still, prepared elsewhere, withdrawn here, and offered there.
 
-It is withdrawn here before it is offered there, so it is alive once at most. Up to that moment whatever goes wrong
-leaves it as it was. After it, it is offered here again only if the other side says that it never will.
+It is withdrawn here before it is offered there, so it is never active twice. Up to that moment any error leaves it as
+it was. After it, this container offers it again only if the target says that it never will.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ _ASK_S: Final = 2.0
 
 
 class MigrationHost(Protocol):
-    """The container it leaves."""
+    """The container that the provider leaves."""
 
     @property
     def address(self) -> Address: ...
@@ -54,7 +54,7 @@ class MigrationHost(Protocol):
 
 
 class MigrationSource:
-    """Sends providers of one container to another one, and takes or gives their state."""
+    """Moves providers of one container to other containers, and saves or restores their state."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class MigrationSource:
         self._codec = codec
         self._lock = threading.Lock()
         self._away: set[str] = set()
-        """Places of what is being held still."""
+        """Places of the providers that are being held still."""
 
     # --- state
 
@@ -95,12 +95,12 @@ class MigrationSource:
     def _stateful(self, service: Handle, who: str) -> Offer:
         offer = self._offer(service, who)
         if not is_stateful(type(offer.provider)):
-            problem = "it has no state to give and take; its class needs save_state() and restore_state(state)"
+            problem = "it has no state to save and restore; its class needs save_state() and restore_state(state)"
             raise ConfigurationError(where=service.label, problem=problem)
         return offer
 
     def _offer(self, service: Handle, who: str) -> Offer:
-        """What is registered here; raises ServiceGone, AccessDenied, ConfigurationError."""
+        """The registration of a service's provider; raises ServiceGone, AccessDenied, ConfigurationError."""
         key = service.key
         if key.address != self._home.address:
             problem = f"it belongs to another container, or to an earlier boot; ask {key.address.container}"
@@ -147,17 +147,17 @@ class MigrationSource:
             prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(luggage)
             keys = _keys(there.key.address, prepared)
             try:
-                self._require(who, service.key, offer)  # once more: it took its time
+                self._require(who, service.key, offer)  # again, as time has passed
                 _require_time(service, there)
                 still.check()
                 still.seal()
                 name = self._withdrawn.take_off(service.key, moved_to=_moved_to(keys[0]))
             except BaseException:
                 still.unseal()
-                with contextlib.suppress(TradeError):  # it ends there by itself then
+                with contextlib.suppress(TradeError):  # else the ticket there expires
                     self._ask(there.key.address, "arrived", _ASK_S, prepared.ticket)
                 raise
-            free = running.set(None)  # whoever asked for it may be gone: it is brought to its end
+            free = running.set(None)  # the caller may be gone: the move is completed
             try:
                 self._hand_over(service, offer, keys, prepared.ticket, name)
             finally:
@@ -165,14 +165,14 @@ class MigrationSource:
         return [self._home.handle(key) for key in keys]
 
     def _require_free(self, service: Handle, offer: Offer) -> None:
-        """S20: hardware is pinned to its host, unless its driver says that it can be reached from elsewhere."""
+        """S20: hardware is bound to its host, unless its driver declares that other hosts can reach it."""
         uses = {name for one in self._providers.services_at(_place(service.key)).values() for name in one.info.uses}
         if uses and not getattr(offer.provider, "relocatable", False):
             problem = f"it drives {', '.join(sorted(uses))} of this host; only a class that is relocatable can leave"
             raise ConfigurationError(where=service.label, problem=problem)
 
     def _target(self, to: str) -> Handle:
-        """`PREPARE` of the container of that name; of several that match, of the one whose host is least busy."""
+        """`PREPARE` of the container of that name; of several matches, of the one whose host is least busy."""
         asked = where(name=PREPARE, group=DOMAIN, container=to)
         found = [one for one in self._home.services(asked) if one.key.address != self._home.address]
         if not found:
@@ -183,7 +183,7 @@ class MigrationSource:
         try:
             return busyness(self._ask(there.key.address, "load", _ASK_S))
         except TradeError as error:
-            _logger.info("container %s does not tell its load: %s", there.container, error)
+            _logger.info("container %s does not report its load: %s", there.container, error)
             return float("inf"), 0.0
 
     def _packed(self, service: Handle, offer: Offer, there: Handle, args: Arguments | None) -> ProviderSnapshot:
@@ -206,7 +206,7 @@ class MigrationSource:
         )
 
     def _hand_over(self, service: Handle, offer: Offer, keys: list[ServiceKey], ticket: str, name: str) -> None:
-        """It is withdrawn: offer it there, or here again if it is certain that nobody offers it there."""
+        """Offer the withdrawn provider there, or here again if it is certain that the target will not."""
         there, problem = keys[0].address, ""
         try:
             self._ask(there, "arrive", _ARRIVE_S, ticket)
@@ -227,7 +227,7 @@ class MigrationSource:
         self._making.let_go(offer.provider)
 
     def _came(self, keys: list[ServiceKey], ticket: str) -> bool:
-        """Whether it is offered there; if not, it never will be. Raises TradeError if nobody can say."""
+        """Whether the target offers it; if not, it never will. Raises TradeError if the target cannot be asked."""
         return self._home.has(keys[0]) or self._ask(keys[0].address, "arrived", _ASK_S, ticket)
 
     def _ask(self, there: Address, name: str, deadline_s: float, *args: object) -> Any:
@@ -235,14 +235,14 @@ class MigrationSource:
 
 
 def busyness(load: LoadInfo) -> tuple[float, float]:
-    """By what containers are compared: the CPU of their hosts, then their calls a second."""
+    """The measure of load: the CPU of a container's host, then its calls a second."""
     return load.host_cpu_percent or load.cpu_percent, load.calls_per_s
 
 
 def _require_time(service: Handle, there: Handle) -> None:
     call = running.get()
     if call is not None and call.remaining_s == 0:
-        problem = "whoever asked for it waits no more"
+        problem = "the caller's deadline has passed"
         raise CannotMigrate(provider=service.label, to=there.container, problem=problem)
 
 

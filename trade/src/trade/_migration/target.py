@@ -1,4 +1,4 @@
-"""The side of a migration that a provider comes to: made and given its state first, offered when it has left."""
+"""The target of a migration: creates the provider with its state, and offers it once the source withdrew it."""
 
 import contextlib
 import hashlib
@@ -25,14 +25,14 @@ from trade._threads.scheduler import ScheduledTask, Scheduler
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
 
 TICKET_S: Final = 20.0
-"""What was prepared and is not fetched in this time is closed again."""
+"""A prepared provider that is not fetched within this time is closed again."""
 MOST: Final = 8
-"""So many may be prepared at once."""
+"""The largest number of prepared providers."""
 _REMEMBERED: Final = 256
 
 
 class ProviderSnapshot(Struct, frozen=True, kw_only=True):
-    """What is made of a provider elsewhere, and how it is offered."""
+    """Everything needed to create the provider elsewhere and to offer it."""
 
     class_path: str
     fingerprint: str
@@ -45,13 +45,13 @@ class ProviderSnapshot(Struct, frozen=True, kw_only=True):
 
 
 class Prepared(Struct, frozen=True):
-    """It stands ready."""
+    """A prepared provider."""
 
     ticket: str
-    """Offers it, once."""
+    """Offers the provider, once."""
     domain: str
     provider: str
-    """Where it will be offered."""
+    """Its place once it is offered."""
     services: tuple[str, ...]
 
 
@@ -61,14 +61,14 @@ class _Ready(Struct, eq=False):
     luggage: ProviderSnapshot
     built: Built
     ending: contextlib.ExitStack
-    """Closes it; to be emptied if it is offered."""
+    """Closes the provider; emptied once it is offered."""
     standing: contextlib.ExitStack
-    """Ends all that was taken up for it, and closes it."""
+    """Undoes all that the preparation took, and closes the provider."""
     due: ScheduledTask
 
 
 def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
-    """Two classes of one path with the same services and the same version of their state have the same one."""
+    """A text that is equal for two classes of one path with the same services and the same version of their state."""
     marked = marked_methods(kind, implements)
     told = [
         structs.replace(Signature(name, name, mark, function, codec).info, doc="")
@@ -79,7 +79,7 @@ def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
 
 
 class MigrationTarget:
-    """Owns what was prepared here and is not offered yet."""
+    """Owns the providers that are prepared here and not yet offered."""
 
     def __init__(
         self,
@@ -105,14 +105,14 @@ class MigrationTarget:
         """The last tickets that were used."""
 
     def prepare(self, luggage: ProviderSnapshot, caller: str) -> Prepared:
-        """Make it and give it its state; nobody can call it yet.
+        """Create the provider and give it its state; no client can call it yet.
 
         Raises:
-            AccessDenied: who asks, or this container, may not offer it in its groups.
+            AccessDenied: the caller, or this container, may not offer it in its groups.
             NotInstantiable, NoSuchClass, CannotInstantiate: as for `System.instantiate`.
-            CannotMigrate: the class is another one here, or does not take the state.
-            LockedByOther, ConfigurationError: what it needs here is taken.
-            Busy: too many are being prepared.
+            CannotMigrate: its class is different here, or rejects the state.
+            LockedByOther, ConfigurationError: resources that it needs are taken here.
+            Busy: too many providers are being prepared.
         """
         self._require(luggage, caller)
         if not self._places.acquire(blocking=False):
@@ -155,7 +155,7 @@ class MigrationTarget:
         return found
 
     def _restore(self, luggage: ProviderSnapshot, made: object, built: Built, undo: contextlib.ExitStack) -> None:
-        """Under a lock, so that whatever it commands is refused at its permit (S18)."""
+        """Restore under a lock, so that the permit refuses every command that the provider gives meanwhile (S18)."""
         used = {resource for service in built.services.values() for resource in service.resources}
         purpose = f"{luggage.class_path} arriving"
         still = undo.enter_context(
@@ -169,24 +169,24 @@ class MigrationTarget:
                 still.check()
             except Exception as error:
                 with contextlib.suppress(LockedByOther):
-                    still.seal()  # it may go on for all we know, and is still not to move anything
+                    still.seal()  # it may still run, and must not move anything
                 raise self._refusal(luggage, f"restore_state there: {type(error).__name__}: {error}") from error
 
     def arrive(self, ticket: str, caller: str) -> None:
-        """Offer what was prepared; a ticket is good once.
+        """Offer a prepared provider; a ticket is valid once.
 
         Raises:
-            CannotMigrate: it has been too long, or another one prepared it.
-            AccessDenied: who asks may not offer it any more.
+            CannotMigrate: the ticket expired, or belongs to another identity.
+            AccessDenied: the caller may no longer offer it.
         """
         with self._lock:
             ready = self._ready.get(ticket)
             if ready is None or ready.caller != caller:
                 here = self._own.container
-                problem = "what was prepared there is not there any more"
+                problem = "the prepared provider has expired there"
                 raise CannotMigrate(provider="it", to=here, problem=problem)
             del self._ready[ticket]
-            self._arrived[ticket] = None  # before it is offered: whoever asks now must not offer it elsewhere
+            self._arrived[ticket] = None  # before the offer: a container that asks now must not offer it elsewhere
             for forgotten in list(self._arrived)[:-_REMEMBERED]:
                 del self._arrived[forgotten]
         ready.due.cancel()
@@ -204,10 +204,10 @@ class MigrationTarget:
     def bring_back(
         self, class_path: str, args: Sequence[Any] | Mapping[str, Any], groups: tuple[str, ...], state: Any
     ) -> list[ServiceKey]:
-        """Make something, give it its state, then offer it.
+        """Create a provider, give it its state, then offer it.
 
         Raises:
-            CannotInstantiate: it does not take the state, or as for `prepare`.
+            CannotInstantiate: it rejects the state, or as for `prepare`.
             NotInstantiable, NoSuchClass, AccessDenied, LockedByOther, ConfigurationError, Busy: as for `prepare`.
         """
         named = dict(args) if isinstance(args, Mapping) else tuple(args)
@@ -224,7 +224,7 @@ class MigrationTarget:
         return [ServiceKey(self._own, prepared.domain, prepared.provider, name) for name in prepared.services]
 
     def arrived(self, ticket: str, caller: str) -> bool:
-        """Whether a ticket was used; if it was not, it is good no more."""
+        """Whether a ticket was used; if not, it becomes invalid."""
         with self._lock:
             ready = self._ready.get(ticket)
             if ready is not None and ready.caller == caller:
@@ -244,7 +244,7 @@ class MigrationTarget:
             ready.standing.close()
 
     def close(self) -> None:
-        """Close what nobody fetched. Idempotent."""
+        """Close prepared providers that were not fetched. Idempotent."""
         for ticket in list(self._ready):
             self._over(ticket)
 

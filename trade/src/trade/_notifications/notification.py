@@ -1,4 +1,4 @@
-"""Standing requests: on this occasion, if this holds, make that call."""
+"""Notifications: when an event occurs, and a condition holds, make a call."""
 
 import contextlib
 import logging
@@ -23,33 +23,33 @@ _logger = logging.getLogger("trade")
 
 _SINGLE: Final = ("at", "after", "once")
 _LOOK_NS: Final = 1_000_000_000
-"""How often the clock on the wall is looked at: it may be set."""
+"""How often the wall clock is checked: it may be set."""
 
 
 class State(str, Enum):
-    """Of a standing request."""
+    """The state of a notification."""
 
     WAITING = "waiting"
-    """For ``when`` to hold."""
+    """Waits for ``when`` to hold."""
     STANDING = "standing"
     ENDED = "ended"
-    """It has fired, or its moment has passed."""
+    """It has fired for the last time, or its time has passed."""
     CANCELLED = "cancelled"
 
 
 class NotificationInfo(Struct, frozen=True, kw_only=True):
-    """One standing request, as everybody may know it."""
+    """The public description of one notification."""
 
     id: str
     occasion: str
-    """Such as ``every 10 s``."""
+    """The event, such as ``every 10 s``."""
     call: str
-    """What is called, as text."""
+    """The service that it calls, as text."""
     condition: str
     owner: str
-    """The session of who asked for it."""
+    """The session of its owner."""
     container: str
-    """Where it lives."""
+    """The container that it runs in."""
     state: str
     """``waiting`` for its ``when``, ``standing``, ``ended`` or ``cancelled``."""
     fired: int
@@ -62,16 +62,16 @@ class NotificationInfo(Struct, frozen=True, kw_only=True):
 
 
 class Notification(ABC):
-    """A standing request; it ends when it has fired for the last time, is cancelled, or its owner ends."""
+    """A standing request for a call; it ends when it has fired for the last time, is cancelled, or its owner ends."""
 
     def __init__(self, name: str, text: str) -> None:
         self.id: Final = name
-        """Names it in the whole system."""
+        """An id that is unique in the system."""
         self._text = text
 
     @abstractmethod
     def info(self) -> NotificationInfo:
-        """How it stands."""
+        """Its current state."""
 
     @property
     def active(self) -> bool:
@@ -80,14 +80,14 @@ class Notification(ABC):
 
     @abstractmethod
     def cancel(self) -> None:
-        """End it; a call under way finishes. Idempotent."""
+        """End it; a running call finishes. Idempotent."""
 
     @abstractmethod
     def detach(self) -> None:
-        """Let it outlive whoever asked for it; it then stands until it is cancelled.
+        """Let it outlive its owner; it then lasts until it is cancelled.
 
         Raises:
-            ConfigurationError: it lives in the container that asked for it, and ends with that.
+            ConfigurationError: it runs in the container that requested it, and ends with it.
         """
 
     def __repr__(self) -> str:
@@ -95,7 +95,7 @@ class Notification(ABC):
 
 
 class NotificationHost(Protocol):
-    """What a standing request needs of its container."""
+    """The functions of a container that a notification uses."""
 
     @property
     def name(self) -> str: ...
@@ -104,17 +104,17 @@ class NotificationHost(Protocol):
 
 
 class Owner(Struct, frozen=True):
-    """Who asked for it."""
+    """The owner of a notification."""
 
     session: str
     identity: str = ""
-    """If it asked from another container: checked again whenever a call is made for it."""
+    """The owner's identity if it is in another container: checked again at each call made for it."""
     acts_as: Session | None = None
-    """Calls are made in this session."""
+    """The session in which its calls are made."""
 
 
 class ActiveNotification(Notification):
-    """One that lives in this container. Done by the scheduler: never twice at once."""
+    """A notification that runs in this container, on the scheduler: never twice at once."""
 
     def __init__(
         self,
@@ -140,21 +140,21 @@ class ActiveNotification(Notification):
         self.detached = False
         self._state = State.STANDING if when is None else State.WAITING
         self._due_ns: int | None = None
-        """Of after and every."""
+        """The next time of ``after`` and ``every``."""
         self._held = False
         """Whether the condition held at the last tick."""
         self._concerned: deque[Handle] = deque()
-        """Services that came, went or changed and were not told of yet."""
+        """Services that came, went or changed since the last call."""
         self._fired = self._failures = self._merged = 0
         self._last_error = ""
         self._said: set[tuple[str, str]] = set()
-        """What failed, and with which error, as far as it was told."""
+        """Failures already reported: the part that failed, and its error."""
         self._cancel_due: Callable[[], None] = lambda: None
 
-    # --- being
+    # --- life cycle
 
     def begin(self, scheduler: Scheduler) -> Callable[[int], None]:
-        """Have it done; returns what has it done once more."""
+        """Start it; returns the function that schedules it again."""
         due = scheduler.begin(self._act, time.monotonic_ns())
         self._cancel_due = due.cancel
         return due.at
@@ -186,8 +186,8 @@ class ActiveNotification(Notification):
     def detach(self) -> None:
         if not self.owner.identity:
             problem = (
-                f"it lives in container {self._home.name}, which asked for it, and ends with that; "
-                "ask for it with host= another container"
+                f"it runs in container {self._home.name}, which requested it, and ends with that; "
+                "request it with host= another container"
             )
             raise ConfigurationError(where=repr(self), problem=problem)
         self.detached = True
@@ -201,12 +201,12 @@ class ActiveNotification(Notification):
     # --- firing
 
     def concerns(self, record: Record) -> bool:
-        """Whether it is about that service."""
+        """Whether the notification is about a service."""
         assert self.terms.constraint is not None  # noqa: S101
         return self.terms.constraint.matches(record)
 
     def add(self, handle: Handle) -> None:
-        """Tell of that service, too, when it is done next."""
+        """Report a service at the next run, too."""
         self._concerned.append(handle)
 
     def _act(self) -> int | None:
@@ -265,7 +265,7 @@ class ActiveNotification(Notification):
         try:
             self._do(self._call, *given)
             self._fired += 1
-        except BaseException as error:  # noqa: BLE001 - whatever a callback raises kills nothing
+        except BaseException as error:  # noqa: BLE001 - an error of a callback ends nothing
             self._failed("call", self._call, error)
 
     def _asked(self, condition: Target | None) -> bool:
@@ -274,7 +274,7 @@ class ActiveNotification(Notification):
         try:
             held = self._do(condition)
             if not isinstance(held, bool):
-                problem = f"a condition answers with True or False, not {held!r}"
+                problem = f"a condition returns True or False, not {held!r}"
                 raise ConfigurationError(where=text_of(condition), problem=problem)
         except BaseException as error:  # noqa: BLE001
             self._failed("condition", condition, error)
@@ -298,11 +298,11 @@ class ActiveNotification(Notification):
         self._failures += 1
         kind = type(error).__name__
         self._last_error = f"{kind}: {error}"
-        if (part, kind) in self._said:  # the same again says nothing new, whatever numbers are in its text
+        if (part, kind) in self._said:  # the same error again is not news, whatever numbers its text has
             return
         self._said.add((part, kind))
         over = self._state is not State.WAITING and self.terms.occasion in _SINGLE
-        stays = "" if over else "; it stays attached, and this kind is told once"
+        stays = "" if over else "; it stays attached, and this kind of error is logged once"
         text = "the %s of %r failed (%s, id %s)%s: %s"
         _logger.warning(text, part, self, text_of(target), self.id, stays, self._last_error)
         self._tell_failed(self, self._last_error)

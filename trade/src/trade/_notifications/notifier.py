@@ -1,4 +1,4 @@
-"""What stands in one container, for itself and for others: who asked for it, and what it is told of services."""
+"""The notifications of one container, for itself and for others."""
 
 import threading
 import time
@@ -13,11 +13,11 @@ from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
 
 _MOST: Final = 10_000
-"""So many may stand in a container for others at once."""
+"""The largest number of notifications in a container for others."""
 
 
 class Notifier:
-    """Owns what stands in one container, for itself and for others."""
+    """Owns the notifications of one container, for itself and for others."""
 
     def __init__(
         self, home: NotificationHost, scheduler: Scheduler, epoch: str, handle: Callable[[Record], Handle]
@@ -31,9 +31,9 @@ class Notifier:
         self._of_services: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
         self._count = 0
         self.failed: Callable[[ActiveNotification, str], None] = lambda _standing, _error: None
-        """Told of failures of what stands for others."""
+        """Called for each failure of a notification of another container."""
         self.ended: Callable[[str], None] = lambda _session: None
-        """Told when nothing stands any more for a session of another container."""
+        """Called when a session of another container has no notification here any more."""
 
     def add(
         self,
@@ -44,15 +44,15 @@ class Notifier:
         owner: Owner,
         existing: list[Record],
     ) -> ActiveNotification:
-        """Begin one; services that are there already are told of first.
+        """Start a notification; it first reports matching services that exist already.
 
         Raises:
-            ConfigurationError: a time that is none, or too many stand here for others.
+            ConfigurationError: an invalid time, or too many notifications for others.
         """
         terms.check()
         with self._lock:
             if owner.identity and len(self._standing) >= _MOST:
-                problem = f"{len(self._standing)} notifications stand here already"
+                problem = f"{len(self._standing)} notifications are active here already"
                 raise ConfigurationError(where=self._home.name, problem=problem)
             self._count += 1
             name = f"{self._epoch}.{self._count}"
@@ -77,14 +77,14 @@ class Notifier:
             self.tidy(standing.owner.session)
 
     def tidy(self, session: str) -> None:
-        """See whether anything stands for that session."""
+        """Check whether a session still has notifications here."""
         with self._lock:
             left = any(one.owner.session == session for one in self._standing.values())
         if not left:
             self.ended(session)
 
     def changed(self, change: Change) -> None:
-        """Told by the registry."""
+        """Called by the registry."""
         with self._lock:
             told = list(self._of_services.values())
         now = time.monotonic_ns()
@@ -96,7 +96,7 @@ class Notifier:
                 again(now)
 
     def session_ended(self, session: str) -> None:
-        """Nobody of it is there any more: what it asked for ends, unless it was detached."""
+        """End the notifications of a session that ended, except detached ones."""
         with self._lock:
             orphans = [one for one in self._standing.values() if one.owner.session == session and not one.detached]
         for standing in orphans:
@@ -107,7 +107,7 @@ class Notifier:
         return self._standing.get(name)
 
     def infos(self) -> list[NotificationInfo]:
-        """What stands here, oldest first."""
+        """The notifications of this container, oldest first."""
         with self._lock:
             standing = list(self._standing.values())
         return [one.info() for one in standing]

@@ -1,4 +1,4 @@
-"""What every container offers about its standing requests, in group ``trade``."""
+"""The services for notifications that every container offers, in group ``trade``."""
 
 import contextlib
 import logging
@@ -22,7 +22,7 @@ _logger = logging.getLogger("trade")
 
 
 class NotificationServicesHost(Protocol):
-    """The container they belong to."""
+    """The container that offers the services."""
 
     @property
     def address(self) -> Address: ...
@@ -33,7 +33,7 @@ class NotificationServicesHost(Protocol):
 
 
 class Guests:
-    """Whoever has notifications standing here for it acts in a session of its own: what that moves stops with it."""
+    """Sessions for the owners of notifications in this container: what one's calls move stops with its session."""
 
     def __init__(self, open_session: Callable[[str], Session]) -> None:
         self._open = open_session
@@ -56,7 +56,7 @@ class Guests:
 
 
 class NotificationServices:
-    """The wire's side of a `Notifier`."""
+    """The wire side of a `Notifier`."""
 
     def __init__(
         self, notifier: Notifier, registry: Registry, home: NotificationServicesHost, access: Authorizer
@@ -71,7 +71,7 @@ class NotificationServices:
 
     @service
     def notify(self, terms: TriggerSpec, call: Action, if_: Action | None = None, when: Action | None = None) -> str:
-        """Make that call on that occasion, for who asks, who must be allowed to make it then; its id."""
+        """Make a call when an event occurs, for the caller, who must then have the right to make it; returns the id."""
         asked = served_call()
         owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
         try:
@@ -81,12 +81,12 @@ class NotificationServices:
 
     @service(effect="read")
     def notifications(self) -> list[NotificationInfo]:
-        """What stands here, whoever asked for it."""
+        """The notifications in this container, of all owners."""
         return self._notifier.infos()
 
     @service
     def cancel_notification(self, notification: str) -> bool:
-        """End a notification that stands here; whether there was one. Another's is for who administers the system."""
+        """End a notification in this container; returns whether it existed. Another owner's requires ``administer``."""
         standing = self._mine_or_administered(notification)
         if standing is not None:
             standing.cancel()
@@ -94,7 +94,7 @@ class NotificationServices:
 
     @service
     def detach_notification(self, notification: str) -> None:
-        """Let a notification that stands here outlive who asked for it."""
+        """Let a notification in this container outlive its owner."""
         standing = self._mine_or_administered(notification)
         if standing is None:
             raise NoSuchNotification(id=notification)
@@ -102,9 +102,9 @@ class NotificationServices:
 
     @service
     def notification_failed(self, notification: str, text: str, error: str) -> None:
-        """Told by another container: a call that it makes for this one failed."""
+        """For containers: a call that another container makes for this one failed."""
         _logger.warning(
-            "the call of %s (%s), asked for here, failed at %s: %s", notification, text, served_call().caller, error
+            "the call of %s (%s), requested here, failed at %s: %s", notification, text, served_call().caller, error
         )
 
     def _mine_or_administered(self, notification: str) -> ActiveNotification | None:
@@ -115,7 +115,7 @@ class NotificationServices:
 
     def _tell_owner(self, standing: ActiveNotification, error: str) -> None:
         owner = Address(*standing.owner.session.split("/")[:3])
-        with contextlib.suppress(CallerError, CallError):  # it has gone
+        with contextlib.suppress(CallerError, CallError):  # the owner has gone
             told = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
             told.start(standing.id, str(standing.terms), error)
 
@@ -129,7 +129,7 @@ def placed(
     when: Action | Callable[..., object] | None,
     owner: Owner,
 ) -> ActiveNotification:
-    """Begin one, such that no change of the registry is missed or told of twice."""
+    """Start a notification such that it misses no change of the registry and reports none twice."""
     made: list[ActiveNotification] = []
 
     def add() -> None:
@@ -143,7 +143,7 @@ def placed(
 
 
 class Hosted(Notification):
-    """One that lives in another container."""
+    """A notification that runs in another container."""
 
     def __init__(self, name: str, terms: TriggerSpec, host: Address, handle: Callable[[ServiceKey], Handle]) -> None:
         super().__init__(name, f"{terms}, in {host.container}")

@@ -1,4 +1,4 @@
-"""Values as bytes and back, with a container's way of sending handles."""
+"""Encodes and decodes values, with a container's own encoding of handles."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,14 +11,14 @@ __all__ = ["Codec"]
 
 
 class Codec:
-    """Encoding and decoding of values, with the container's way to turn handles into data and back."""
+    """Encoding and decoding of values, with the container's conversion of handles."""
 
     def __init__(
         self, enc_hook: Callable[[Any], Any], ext_hook: Callable[[int, memoryview], Any], own: Sequence[type] = ()
     ) -> None:
         self._ext_hook = ext_hook
         self._own = tuple(own)
-        """Types that only the hooks know how to send."""
+        """Types that only the hooks can encode."""
         self.encode: Callable[[Any], bytes] = msgspec.msgpack.Encoder(enc_hook=enc_hook).encode
 
     def decoder(self, kind: Any) -> Callable[[Any], Any]:
@@ -37,7 +37,7 @@ class Codec:
 
 
 def _as_it_is(kind: type, value: Any) -> Any:
-    """Values of types msgspec does not know: the ext hook has already made them (handles)."""
+    """Accepts values of types that msgspec does not know: the ext hook has already made them (handles)."""
     if isinstance(value, kind):
         return value
     raise TypeError(f"Expected `{kind.__name__}`, got `{type(value).__name__}`")

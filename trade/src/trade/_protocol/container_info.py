@@ -1,4 +1,4 @@
-"""What one container knows of another."""
+"""The description of a container that other containers keep."""
 
 from msgspec import Struct
 
@@ -16,5 +16,5 @@ class ContainerInfo(Struct, frozen=True):
     providers: int
     services: int
     protocol: int = PROTOCOL
-    """The version that it speaks; 0 before it has said anything to the one that tells of it. If it is another one than
-    that one's, nothing of what it offers is known there."""
+    """The protocol version that it speaks; 0 before its first message to the container that reports it. If the versions
+    of the two differ, the services of the one are unknown to the other."""

@@ -1,6 +1,6 @@
-"""What is read of e-stops: orders to stop, confirmations and what is open in others are so in every protocol version.
+"""E-stop messages: orders to stop, confirmations and open e-stops are readable in every protocol version.
 
-That part is never changed; docs/wire-protocol.md, "Versions", has it in prose.
+That part never changes; docs/wire-protocol.md, "Versions", describes it.
 """
 
 import math
@@ -26,7 +26,7 @@ _Value = TypeVar("_Value")
 
 
 class _AnyEstop(Struct, array_like=True, gc=False):
-    """What of an e-stop stands in every version: two fields, and two more that are understood if they can be."""
+    """The fields of an e-stop in every version: two, and two more if they can be decoded."""
 
     id: Annotated[str, Meta(min_length=1, max_length=80)]
     by: Annotated[str, Meta(max_length=300)]
@@ -42,7 +42,7 @@ class _AnyEstop(Struct, array_like=True, gc=False):
 
 
 class _AnyOrder(Struct, array_like=True, gc=False):
-    """What of an order to stop stands in every version."""
+    """The fields of an order to stop in every version."""
 
     v: Annotated[int, Meta(ge=1)]
     request: str
@@ -50,7 +50,7 @@ class _AnyOrder(Struct, array_like=True, gc=False):
 
 
 class _AnyEntry(Struct, gc=False):
-    """What of an entry that tells of open e-stops stands in every version."""
+    """The fields of an entry with open e-stops in every version."""
 
     estops: tuple[_AnyEstop, ...] = ()
 
@@ -64,7 +64,7 @@ _number_decoder: Final = msgspec.msgpack.Decoder(float)
 
 
 def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:
-    """An order, given by that identity: to stop, of any version; to clear, of this one."""
+    """An order of an identity: an order to stop of any version, an order to clear of this one."""
     any_order = read_any(_any_order_decoder, payload)
     if any_order.opened is None:
         order = decoded(_order_decoder, payload)
@@ -78,12 +78,12 @@ def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:
 
 
 def decode_estop_confirmed(payload: bytes) -> EstopConfirmed:
-    """Of any version."""
+    """A confirmation of any version."""
     return read_any(_confirmed_decoder, payload)
 
 
 def decode_open_estops(payload: bytes) -> tuple[Estop, ...]:
-    """Those that a registry entry of whatever version tells of."""
+    """The open e-stops of a registry entry of any version."""
     return tuple(estop.read() for estop in read_any(_any_entry_decoder, payload).estops)
 
 

@@ -1,6 +1,6 @@
-"""Who and what stands in the keys of messages, and how keys are made of that.
+"""The keys of messages, and the names in them.
 
-Identities stand in chunks of their own, so that access control can pin who speaks and who answers.
+Identities have chunks of their own, so that access control can bind senders and repliers to keys.
 """
 
 import re
@@ -11,9 +11,9 @@ from msgspec import Struct
 DOMAIN: Final = "trade"
 """The domain of the middleware's own functions."""
 PROVIDER: Final = "system"
-"""The provider of all of them but e-stops."""
+"""The provider of all of them except e-stops."""
 ESTOP_PROVIDER: Final = "estops"
-"""The provider of what has to do with e-stops, in the same domain."""
+"""The provider of the functions for e-stops, in the same domain."""
 CLOCK: Final = "clock"
 GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 """The name of a group."""
@@ -21,17 +21,17 @@ _CHUNK = re.compile(r"[A-Za-z0-9_.@:-]{1,80}")
 
 
 def is_chunk(text: str) -> bool:
-    """Whether the text can stand as one chunk of a key: no separator, no wildcard, not the reserved first ``@``."""
+    """Whether a text is valid as one chunk of a key: no separator, no wildcard, not the reserved first ``@``."""
     return _CHUNK.fullmatch(text) is not None and not text.startswith("@")
 
 
 def as_chunk(text: str) -> str:
-    """The text with everything replaced that cannot stand in a key."""
+    """The text with every character replaced that is invalid in a key."""
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:80] or "_"
 
 
 class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
-    """Where a container is: who speaks, under which name, in which boot."""
+    """The address of a container: its identity, its name, and its boot."""
 
     identity: str
     container: str
@@ -42,12 +42,12 @@ class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
 
     @property
     def who(self) -> str:
-        """The container, whichever boot of it: as reports and messages tell it."""
+        """The container in whatever boot, as reports and messages name it."""
         return f"{self.identity}/{self.container}"
 
 
 class ServiceKey(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
-    """Names one service of one boot epoch; what a handle is over the wire."""
+    """The name of one service of one boot epoch; a handle in its wire form."""
 
     address: Address
     domain: str
@@ -72,12 +72,12 @@ def registry_key(domain: str, address: Address, provider: str) -> str:
 
 
 def alive_key(session: Address | str) -> str:
-    """Of a container, or of a session within one."""
+    """The key of a container's sign of life, or of a session's within it."""
     return f"alive/{session}"
 
 
 def estop_key(identity: str) -> str:
-    """Orders of whoever speaks as that identity, for everybody."""
+    """The key of e-stop orders of an identity, to which all containers subscribe."""
     return f"estop/{identity}"
 
 
@@ -89,7 +89,7 @@ ESTOPS: Final = "estop/**"
 
 
 TALLY: Final = "tally"
-"""The last chunk of the key, in the middleware's own domain, under which a container says how far it is."""
+"""The last chunk of the key, in the middleware's own domain, under which a container publishes its revision."""
 
 
 def tally_key(address: Address) -> str:
@@ -100,12 +100,12 @@ REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
 PASSING: Final = {REGISTRY: "registry/*/**", ESTOPS: "estop/*/**"}
-"""What everybody subscribes to, and other patterns that match the same keys: see `ZenohTransport.settle`."""
+"""Patterns to which all containers subscribe, and others that match the same keys: see `ZenohTransport.settle`."""
 
 
 NO_GROUP: Final = "_"  # the domain of a provider without one
 
 
 def domain_of(groups: tuple[str, ...]) -> str:
-    """A provider's first group, whole, in one chunk: the grain of access rules and export lists."""
+    """A provider's first group, whole, in one chunk: the unit of access rules and export lists."""
     return groups[0] if groups else NO_GROUP

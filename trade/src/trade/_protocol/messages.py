@@ -1,4 +1,4 @@
-"""What goes over the wire: keys, messages, the protocol version. docs/wire-protocol.md says the same in prose."""
+"""The messages on the wire, and the protocol version. docs/wire-protocol.md describes the same in prose."""
 
 # pyright: reportUnknownVariableType=false
 
@@ -12,29 +12,29 @@ from msgspec import Meta, Raw, Struct, structs
 from trade._protocol.keys import is_chunk
 
 PROTOCOL: Final = 1
-"""Version of every message. A reader drops and counts what carries another, except what says that all is to stop."""
+"""The version of every message. A reader drops and counts messages of others, except orders to stop everything."""
 
 
 class Token(Struct, frozen=True, array_like=True, gc=False):
-    """Names a lock's grant by one container; travels with the calls made under the lock."""
+    """Names one container's grant of a lock; travels with the calls made under the lock."""
 
     epoch: str
-    """Of the container that granted."""
+    """The epoch of the container that granted it."""
     number: int
 
 
 class Behalf(Struct, frozen=True, array_like=True, gc=False):
-    """What a call inherits from those that led to it, and from the locks around it."""
+    """What a call inherits from the calls that led to it, and from the locks around it."""
 
     sessions: tuple[str, ...] = ()
-    """For whom else it is made, nearest first: what it moves stops when one of them ends."""
+    """Further sessions it is made for, nearest first: its motion stops when one of them ends."""
     calls: tuple[int, ...] = ()
     """The calls that led to it, nearest first."""
     tokens: tuple[Token, ...] = ()
 
 
 class Call(Struct, array_like=True, gc=False):
-    """A request, put on ``call/...`` or ``stop/...``. Who asks stands in the key."""
+    """A request, published on ``call/...`` or ``stop/...``. The key contains the caller."""
 
     v: int
     id: int
@@ -43,7 +43,7 @@ class Call(Struct, array_like=True, gc=False):
     reply: str
     """``container/channel`` of the caller's reply key."""
     session: str
-    """Of who asks: its address, and more chunks if it has several."""
+    """The session of the caller: its address, and more chunks if it has several."""
     expires_ns: int | None
     """In the callee's monotonic clock; None only where being late is harmless (reading, stopping)."""
     chain: tuple[str, ...]
@@ -61,18 +61,18 @@ class Status:
     BUSY: Final = 2
     EXPIRED: Final = 3
     GONE: Final = 4
-    # No end: how far it is.
+    # Not an end: a progress message.
     PROGRESS: Final = 5
-    # Put by the caller's own container on its own reply key, to end a wait.
+    # Published by the caller's own container on its own reply key, to end a wait.
     TIMED_OUT: Final = 6
     LOST: Final = 7
     CLOSED: Final = 8
-    # Never put at all: what a call ends with that could not be sent.
+    # Never published: the end of a call that could not be sent.
     UNSENT: Final = 9
 
 
 class Reply(Struct, array_like=True, gc=False):
-    """An answer, put on ``reply/...``."""
+    """An answer, published on ``reply/...``."""
 
     v: int
     id: int
@@ -80,11 +80,11 @@ class Reply(Struct, array_like=True, gc=False):
     clock_ns: int
     """The callee's monotonic clock when it answered: keeps the caller's estimate of the offset fresh."""
     body: Raw
-    """OK: the result. ERROR: an ErrorInfo. PROGRESS: whatever the provider says. Otherwise nil."""
+    """OK: the result. ERROR: an ErrorInfo. PROGRESS: the provider's value. Otherwise nil."""
 
 
 class ErrorInfo(Struct):
-    """An exception on its way to the caller."""
+    """An exception in its wire form."""
 
     type: str
     """``module:qualified name``."""
@@ -94,10 +94,10 @@ class ErrorInfo(Struct):
 
 
 Scalar = bool | int | float | str | None
-"""What metadata may be."""
+"""The types of metadata values."""
 
 HEALTHY: Final = "healthy"
-"""The health of a provider with which nothing is wrong; any other text says what is."""
+"""The health of a provider without a fault; any other text describes the fault."""
 
 
 class Parameter(Struct, frozen=True, array_like=True, gc=False):
@@ -114,7 +114,7 @@ NO_SCHEMA: Final = Raw(msgspec.msgpack.encode({}))
 
 
 class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref=True):
-    """What everybody may know of a service. Equal ones that came by message are one object: nobody changes it."""
+    """The public description of a service. Equal ones from messages are one shared object: nothing changes it."""
 
     name: str
     signature: str
@@ -125,108 +125,108 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref
     uses: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     arguments_schema: Raw = NO_SCHEMA
-    """JSON Schema as it travels: few are ever looked at, see `schema`."""
+    """JSON Schema in its wire form: few are ever read, see `schema`."""
     result_schema: Raw = NO_SCHEMA
     types: dict[str, str] = {}
-    """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""
+    """Schema definition -> ``module:qualified name``, so that a process that has the type uses it."""
     meta: dict[str, Scalar] = {}
 
 
 class Estop(Struct, frozen=True, array_like=True, gc=False):
-    """An e-stop that is open until somebody clears its id."""
+    """An e-stop that is open until its id is cleared."""
 
     id: Annotated[str, Meta(min_length=1, max_length=80)]
     by: Annotated[str, Meta(max_length=300)]
-    """The session of who gave it."""
+    """The session that gave it."""
     reason: Annotated[str, Meta(max_length=500)]
     at: float
     """``time.time()`` there."""
     told_by: Annotated[str, Meta(max_length=300)] = ""
-    """``identity/container`` of who told of it, if that is not its giver, nor of the giver's identity; empty: its order
-    was heard. Who told may have made it up."""
+    """``identity/container`` of the container that reported it, if neither that nor its identity gave it; empty: this
+    container received the order itself. The reporter may have invented it."""
 
     @property
     def giver(self) -> str:
-        """Who gave it and, where it was not heard from him, who says so."""
-        return f"{self.by} (told by {self.told_by})" if self.told_by else self.by
+        """The session that gave it and, if its order was not received here, the container that reported it."""
+        return f"{self.by} (reported by {self.told_by})" if self.told_by else self.by
 
 
 MOST_CLEARED: Final = 64
-"""By one order."""
+"""The largest number of e-stops that one order clears."""
 
 
 class EstopOrder(Struct, array_like=True, gc=False):
-    """Put on ``estop/<identity>`` until all have confirmed: one e-stop is opened, or some are cleared.
+    """Published on ``estop/<identity>`` until all have confirmed: opens one e-stop, or clears some.
 
-    One that opens is obeyed whatever its version; one that clears is of the reader's own.
+    An order to open is obeyed in any version; an order to clear only in the reader's own.
     """
 
     v: int
     request: Annotated[str, Meta(min_length=1, max_length=80)]
-    """Names the order; of an e-stop, its id."""
+    """The id of the order; of an e-stop, its id."""
     opened: Estop | None = None
     cleared: Annotated[tuple[str, ...], Meta(max_length=MOST_CLEARED)] = ()
-    """More are cleared by several orders."""
+    """More e-stops need several orders."""
 
 
 class EstopConfirmed(Struct, array_like=True, gc=False):
-    """Put on ``estop/<identity>/<container>/<epoch>`` by who did what an order says; the same in every version."""
+    """Published on ``estop/<identity>/<container>/<epoch>`` once an order is carried out; equal in every version."""
 
     v: Annotated[int, Meta(ge=1)]
     request: str
     problem: str = ""
-    """What of it failed."""
+    """The part that failed."""
 
 
 class ProviderInfo(Struct, frozen=True, kw_only=True):
-    """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
+    """A registry entry. Its key contains identity, container, epoch, domain and provider."""
 
     v: int = PROTOCOL
     revision: Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
-    """Counts everything its container announces: one more than what that announced before."""
+    """Numbers the announcements of its container: one more than the previous one."""
     groups: tuple[str, ...]
     kind: str
     host: str
     pid: int
     services: tuple[ServiceInfo, ...]
-    """None of them: the provider was deregistered."""
+    """Empty: the provider was deregistered."""
     kinds: tuple[str, ...] = ()
     """Names of its class and of the bases and interfaces that have services."""
     meta: dict[str, Scalar] = {}
-    """Holds for all its services, over what they say themselves."""
+    """Applies to all its services, and overrides their own."""
     health: str = HEALTHY
     members: dict[str, tuple[str, ...]] = {}
-    """What the robot's groups consist of: group -> resources, whether or not they are there."""
+    """The robot's groups: group -> resources, whether or not they are present."""
     estops: tuple[Estop, ...] = ()
-    """Of the middleware's own provider: what is open in its container; who hears it takes the union."""
-    moved_to: Annotated[str, Meta(max_length=500)] = ""  # where one that was deregistered goes on: see ServiceGone
+    """The open e-stops of a container, in the middleware's own provider; a reader takes the union of all."""
+    moved_to: Annotated[str, Meta(max_length=500)] = ""  # the new place of a deregistered provider: see ServiceGone
 
 
 class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
-    """The same before its services are read."""
+    """The same before its services are decoded."""
 
     services: tuple[Raw, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class Tally(Struct, frozen=True, array_like=True, gc=False):
-    """How far a container is: the last thing it says in an answer, and what it says now and then."""
+    """A container's current revision: the end of each reply, and published from time to time."""
 
     v: int
     revision: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
-    """Of what it announced last."""
+    """The revision of its last announcement."""
 
 
 CANCEL: Final = "cancel"
-"""Asks to end a call: a stop call of this name to the middleware's own provider. It stands in no registry."""
+"""Cancels a call: a stop call of this name to the middleware's own provider. No registry contains it."""
 
 
 class CancelArguments(Struct, array_like=True, gc=False):
-    """Which call to end."""
+    """The call to cancel."""
 
     id: int
     service: str
     keep_s: Annotated[float, Meta(ge=0, le=86_400)]
-    """How long the call may still be under way."""
+    """How long the call may still take to arrive."""
 
 
 MOST_BYTES: Final = 64 << 20
@@ -242,11 +242,11 @@ _Value = TypeVar("_Value")
 
 
 UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-"""What decoding of values from elsewhere raises: another type, text that is none, nested too deeply."""
+"""Errors of decoding foreign values: another type, invalid text, or too much nesting."""
 
 
 class Malformed(Exception):
-    """Bytes that are no message of this protocol version; dropped, never answered."""
+    """Bytes that are not a message of this protocol version; dropped, never answered."""
 
 
 class OtherVersion(Malformed):
@@ -258,14 +258,14 @@ class OtherVersion(Malformed):
 
 
 NO_CHUNK: Final = "an e-stop's id is one chunk"
-"""It names a file, too."""
+"""The id is also the name of a file."""
 
 call_decoder: Final = msgspec.msgpack.Decoder(Call)
 reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
 _provider_decoder: Final = msgspec.msgpack.Decoder(_ProviderMessage)
 _service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
 _services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
-"""The services known now by their bytes: a thousand objects of one class tell the same."""
+"""The current services by their bytes: a thousand objects of one class have equal descriptions."""
 _tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
@@ -301,7 +301,7 @@ def _service(data: bytes) -> ServiceInfo:
 
 
 def _understood(info: ServiceInfo) -> ServiceInfo:
-    """What has an effect that is not known, of a later version or another language, may move something."""
+    """Treats an unknown effect, of a later version or another language, as one that may move something."""
     return info if info.effect in _EFFECTS else structs.replace(info, effect="actuate")
 
 
@@ -318,7 +318,7 @@ def decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Mess
 
 
 def read_any(decoder: msgspec.msgpack.Decoder[_Value], payload: bytes) -> _Value:
-    """A message of whatever version. Raises Malformed."""
+    """A message of any version. Raises Malformed."""
     if len(payload) > _MOST_MESSAGE_BYTES:
         raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
     try:
@@ -328,7 +328,7 @@ def read_any(decoder: msgspec.msgpack.Decoder[_Value], payload: bytes) -> _Value
 
 
 def unread(payload: bytes, bad: Exception) -> Malformed:
-    """Why bytes are dropped that are no message of this version: another one is worth telling from garbage."""
+    """Why bytes were dropped: distinguishes another version from garbage."""
     try:
         raw: Any = msgspec.msgpack.decode(payload)
         version: Any = raw[0] if isinstance(raw, list) else raw.get("v")

@@ -1,4 +1,4 @@
-"""Exceptions on their way over the wire and back into the type a caller would catch."""
+"""Converts exceptions to their wire form and back to the type that a caller would catch."""
 
 import traceback
 from collections.abc import Mapping, Sequence
@@ -18,19 +18,19 @@ _MOST_TRACEBACK: Final = 16_000
 
 
 class RemoteTraceback(Exception):
-    """Carries the text of the traceback on the far side, as the cause of the error raised here."""
+    """The text of the remote traceback, as the cause of the error raised here."""
 
     def __init__(self, info: ErrorInfo) -> None:
         super().__init__(info.traceback)
         self.info: Final = info
-        """The error as it came."""
+        """The error in its wire form."""
 
     def __str__(self) -> str:
         return f"\n{self.args[0]}"
 
 
 def pack_error(error: BaseException) -> ErrorInfo:
-    """An exception as data. Values that cannot be sent are sent as their text; it never fails."""
+    """An exception as data. Values that cannot be sent are sent as text; it never fails."""
     kind = type(error)
     return ErrorInfo(
         type=name_of(kind),
@@ -41,24 +41,24 @@ def pack_error(error: BaseException) -> ErrorInfo:
 
 
 def passed_on(error: BaseException) -> ErrorInfo:
-    """An error that came from elsewhere, for the next one: as it came, whoever knows its type; no traceback."""
+    """An error from elsewhere in its original form, whether or not its type is known here; without a traceback."""
     cause = error.__cause__
     info = cause.info if isinstance(cause, RemoteTraceback) else pack_error(error)
     return structs.replace(info, traceback="")
 
 
 def _data(error: BaseException) -> dict[str, Any]:
-    """What makes up an exception: of ours its fields, of others its arguments and attributes."""
+    """The data of an exception: the fields of our own types, the arguments and attributes of others."""
     if isinstance(error, TradeError):
         return {f.name: getattr(error, f.name, None) for f in fields(error)}
-    args = error.__reduce__()[1] if isinstance(error, OSError) else error.args  # which leaves out the file's name
+    args = error.__reduce__()[1] if isinstance(error, OSError) else error.args  # args would lack the file's name
     return {**vars(error), "args": [_sendable(argument) for argument in args]}
 
 
 def _text(value: Any) -> str:
     try:
         text = str(value)
-    except Exception:  # noqa: BLE001 - a text of the user's making
+    except Exception:  # noqa: BLE001 - the user's own `__str__`
         text = f"<{type(value).__qualname__} without a text>"
     return text.encode(errors="backslashreplace").decode()
 
@@ -66,12 +66,12 @@ def _text(value: Any) -> str:
 def _traceback(error: BaseException) -> str:
     try:
         return _text("".join(traceback.format_exception(error)))
-    except Exception:  # noqa: BLE001 - it prints values of the user's making
+    except Exception:  # noqa: BLE001 - it prints values of user types
         return ""
 
 
 def unpack_error(info: ErrorInfo, service: str) -> BaseException:
-    """The exception a caller sees: the own type where this process has it, else RemoteError."""
+    """The exception that a caller sees: its own type where this process has it, else RemoteError."""
     error = _rebuilt(info)
     if error is None:
         error = RemoteError(service=service, type_name=info.type, message=info.message, traceback=info.traceback)
@@ -88,7 +88,7 @@ def _sendable(value: Any) -> Any:
 
 
 def _rebuilt(info: ErrorInfo) -> BaseException | None:
-    """The exception in its own type, if this process has that and it can be made from what was sent."""
+    """The exception in its own type, if this process has the type and can create it from the data."""
     found = imported(info.type)
     if not (isinstance(found, type) and issubclass(found, Exception)):
         return None
@@ -103,7 +103,7 @@ def _rebuilt(info: ErrorInfo) -> BaseException | None:
 
 
 def _users(found: type[Exception], args: Sequence[Any], attributes: Mapping[str, Any]) -> Exception:
-    """One of a class of the user's, with its arguments and attributes; its own code is not run."""
+    """An exception of a user's class, with its arguments and attributes; the class's own code is not run."""
     error = found.__new__(found)
     error.args = tuple(args)
     error.__dict__.update({name: value for name, value in attributes.items() if name != "args"})

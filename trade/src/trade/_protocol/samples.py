@@ -1,4 +1,4 @@
-"""One sample of a stream: as it travels, and as a listener is given it."""
+"""One sample of a stream: in its wire form, and as a listener gets it."""
 
 from typing import Annotated, Any, Final
 
@@ -21,28 +21,28 @@ __all__ = [
 
 STREAMS: Final = "stream/**"
 STEPS_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""Through a gateway that limits rates, streams go at one of these, or more slowly than the first."""
+"""A gateway that limits rates forwards streams at one of these, or more slowly than the first."""
 _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 
 class Sample(Struct, frozen=True, kw_only=True):
-    """What a service answered at a moment."""
+    """The result of a service at one moment."""
 
     value: Any
     at: float
-    """``time.time()`` of the source, when it was asked."""
+    """``time.time()`` of the source when the service was called."""
     at_ns: int
     """``time.monotonic_ns()`` of the source at that moment: for intervals between samples of one stream."""
     number: int
-    """Of the samples that the source has put at this rate, counted from 1."""
+    """Counts the samples that the source has published at this rate, from 1."""
     dropped: int = 0
-    """How many are missing since the one before: not taken in time, or lost on the way. What was never put at this
-    rate, the listener's own or that of a gateway between, is not missing. Whether they would have met the condition
-    nobody knows."""
+    """How many are missing since the previous one: not taken in time, or lost in transit. Samples that were never
+    published at this rate, the listener's own or that of a gateway between, are not counted. Whether the missing ones
+    would have met the condition is unknown."""
 
 
 class StreamSample(Struct, frozen=True, array_like=True, gc=False):
-    """Put on the key of a stream for all its listeners at once."""
+    """Published on the key of a stream, for all its listeners at once."""
 
     v: int
     number: Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
@@ -58,15 +58,15 @@ _decoder: Final = msgspec.msgpack.Decoder(StreamSample)
 
 
 def stream_key(service: ServiceKey, hz: float) -> str:
-    """Where the samples of a service are put for those who want so many a second.
+    """The key of a service's samples at a rate.
 
-    On the keys of the steps a source also shows that it can be heard: its signs reach those whom its samples reach.
+    On the keys of the steps a source also publishes signs of life, which reach the same listeners as its samples.
     """
     return f"{_all_rates(service)}/{hz:g}"
 
 
 def signs_of(service: ServiceKey) -> str:
-    """All signs of a source."""
+    """The pattern of all signs of a source."""
     return f"{_all_rates(service)}/*"
 
 
@@ -75,7 +75,7 @@ def _all_rates(service: ServiceKey) -> str:
 
 
 def rate_of(sign: str) -> float:
-    """The rate that a sign is for; 0 if it is none."""
+    """The rate of a sign; 0 if it is not one."""
     text = sign.rpartition("/")[2]
     return float(text) if text.isdecimal() else 0.0
 

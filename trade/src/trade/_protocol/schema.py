@@ -1,4 +1,4 @@
-"""Types as JSON Schema text, and whether values of one schema can stand where another one is asked for."""
+"""Types as JSON Schema text, and whether values of one schema are valid under another one."""
 
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
@@ -18,7 +18,7 @@ from trade.errors import ConfigurationError
 
 __all__ = ["NOT_FINITE", "limits_text", "problem_text", "value_at"]
 
-# What is looked at came over the wire: it has no types.
+# The schemas came over the wire: they have no types.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 
 
@@ -51,7 +51,7 @@ def _limits(meta: Meta) -> Iterator[str]:
 
 
 def value_at(given: Any, path: str) -> Any:
-    """The part of an argument that msgspec points at with a path such as ``[1].x_m``.
+    """The part of an argument that a path of msgspec, such as ``[1].x_m``, points to.
 
     Raises:
         LookupError: the path does not lead to one value.
@@ -67,7 +67,7 @@ def value_at(given: Any, path: str) -> Any:
 
 
 def problem_text(complaint: str, value: Any) -> str:
-    """What is wrong with a value: what validation says of it, and the value where it says nothing of that."""
+    """What is wrong with a value: the validation message, with the value where that does not show it."""
     if isinstance(value, float) and not math.isfinite(value):
         return NOT_FINITE
     if ", got " in complaint or not complaint.startswith("Expected "):
@@ -79,7 +79,7 @@ def problem_text(complaint: str, value: Any) -> str:
 _Schema = Mapping[str, Any]
 _NAMES: Final = {"number": "float", "integer": "int", "string": "str", "boolean": "bool", "null": "None"}
 _SAME: Final = ("format", "contentEncoding", "x-trade-type", "x-trade-kind")
-"""What makes another kind of value of the same JSON type."""
+"""Keys that distinguish kinds of values of the same JSON type."""
 _MOST_REFERENCES: Final = 100
 _decode_schema: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
 
@@ -108,14 +108,14 @@ def read_types(text: str) -> tuple[tuple[_Schema, ...], _Schema]:
 
 
 def schema_message(schema: _Schema, definitions: _Schema) -> Raw:
-    """A schema as it travels, with the definitions it refers to."""
+    """A schema in its wire form, with the definitions it refers to."""
     if not schema and not definitions:
-        return NO_SCHEMA  # which is left out
+        return NO_SCHEMA  # which is omitted
     return Raw(encode_message({**schema, "$defs": definitions} if definitions else schema))
 
 
 def read_schema(raw: Raw) -> dict[str, Any]:
-    """A schema as it travels, anew each time; what cannot be read describes nothing."""
+    """Decodes a schema from its wire form, as a new object each time; an unreadable one describes nothing."""
     try:
         return _decode_schema(raw)
     except (msgspec.DecodeError, ValueError, RecursionError):
@@ -124,7 +124,7 @@ def read_schema(raw: Raw) -> dict[str, Any]:
 
 @lru_cache(1024)
 def known_schema(data: bytes) -> _Schema:
-    """The same, kept: for looking only."""
+    """The same, cached: for reading only."""
     return read_schema(Raw(data))
 
 
@@ -137,7 +137,7 @@ def read_json(text: str, kind: Any) -> Any:
 
 
 def readable(text: str) -> str:
-    """Such a text as a person would write the types."""
+    """Such a text in the notation of a person."""
     return f"[{', '.join(map(_name, read_types(text)[0]))}]"
 
 
@@ -157,7 +157,7 @@ def _name(schema: _Schema) -> str:
 
 
 def type_text(kind: Any) -> str:
-    """A type as a person would write it: without modules and ``typing``, with its limits in parentheses."""
+    """A type in the notation of a person: without modules and ``typing``, with its limits in parentheses."""
     if hasattr(kind, "__metadata__"):
         limits = limits_text(kind.__metadata__)
         return type_text(kind.__origin__) + (f" ({limits})" if limits else "")
@@ -176,9 +176,9 @@ def type_text(kind: Any) -> str:
 
 
 def fits(given: _Schema, given_definitions: _Schema, wanted: _Schema, wanted_definitions: _Schema) -> bool:
-    """Whether every value of the given schema is of the wanted type; ranges and lengths are not looked at.
+    """Whether every value of the given schema is of the wanted type; ranges and lengths are not compared.
 
-    Schemas come from other containers and may be anything; what makes no sense fits nothing.
+    Schemas come from other containers and may be anything; an invalid one fits nothing.
     """
     try:
         return _Comparison(given_definitions, wanted_definitions).fits(given, wanted)
@@ -213,7 +213,7 @@ class _Comparison:
         same = given.get("type") == kind or (given.get("type"), kind) == ("integer", "number")
         if "enum" in wanted or not same:
             return False
-        if kind == "array":  # a list, a tuple, a set travel alike
+        if kind == "array":  # a list, a tuple and a set have one wire form
             return self._array(given, wanted)
         if any(given.get(part) != wanted.get(part) for part in _SAME):
             return False
@@ -273,7 +273,7 @@ def _values(schema: _Schema) -> _Schema:
 
 
 def _open_values(given: _Schema) -> Sequence[_Schema]:
-    """What values a mapping may have beside its named ones; a record has none."""
+    """The types of a mapping's values beside its named ones; a record has none."""
     return () if "properties" in given else (_values(given),)
 
 

@@ -1,6 +1,6 @@
-"""Types of results a process has no code for, made from their JSON Schema.
+"""Types for results whose code a process lacks, made from their JSON Schema.
 
-A result type that is already imported here is used as it is; nothing is ever imported because a message says so.
+A result type that is already imported here is used as it is; a message never causes an import.
 """
 
 # pyright: reportUnknownArgumentType=false, reportUnknownVariableType=false
@@ -36,13 +36,13 @@ _NOTED: Final[dict[str, Any]] = {
         *(dt.datetime, dt.date, dt.time, dt.timedelta),
     )
 }
-"""Types of which JSON Schema says only that they are an array or a text."""
+"""Types for which JSON Schema says only that they are an array or a text."""
 _GENERIC: Final[tuple[Any, ...]] = (list, dict, tuple, set, frozenset)
 _annotated: Final[Any] = Annotated
 
 
 def noted(kind: Any) -> Any:
-    """The same type with a note in its JSON Schema wherever that would say less than the type."""
+    """The type with a note in its JSON Schema wherever the schema would lose information."""
     origin: Any = get_origin(kind) or kind
     inner = get_args(kind)
     if origin is Annotated:
@@ -58,10 +58,10 @@ def noted(kind: Any) -> Any:
 
 
 def type_from_schema(schema: Mapping[str, Any], known: Mapping[str, str]) -> Any:
-    """The type a JSON Schema describes.
+    """The type that a JSON Schema describes.
 
     Args:
-        schema: as msgspec writes it, definitions under ``$defs``.
+        schema: as msgspec writes it, with definitions under ``$defs``.
         known: definition name -> ``module:qualified name`` of the type it was made from.
     """
     return _Reader(schema.get("$defs", {}), known).read(schema)
@@ -102,7 +102,7 @@ class _Reader:
         return tuple[item, ...] if kind is tuple else (kind or list)[item]
 
     def _object(self, schema: Mapping[str, Any]) -> Any:
-        if "x-trade-type" in schema:  # a value with an encoding of its own, such as a handle
+        if "x-trade-type" in schema:  # a value with its own encoding, such as a handle
             return Any
         if "properties" not in schema:
             values = schema.get("additionalProperties", {})
@@ -125,7 +125,7 @@ class _Reader:
         ]
         try:
             return msgspec.defstruct(title, fields, frozen=True, kw_only=True)
-        except (TypeError, ValueError):  # a name that is no identifier
+        except (TypeError, ValueError):  # a name that is not an identifier
             return dict[str, Any]
 
 
@@ -142,20 +142,20 @@ def loaded_type(path: str) -> type | None:
 
 
 def _same_fields(kind: type, definition: Mapping[str, Any]) -> bool:
-    """Whether our type of that name is theirs: programs have the same name, and versions differ."""
+    """Whether our type of that name equals the remote one: different programs or versions may use one name."""
     [_], ours = msgspec.json.schema_components([kind], schema_hook=lambda _: {})
     own = ours.get(kind.__name__, {})
     return all(set(own.get(part, ())) == set(definition.get(part, ())) for part in ("properties", "required", "enum"))
 
 
 def name_of(kind: type) -> str:
-    """``module:qualified name``, for other processes: what a program defines by the name it would be imported by."""
+    """``module:qualified name`` for other processes; types of the main program get the name of its module."""
     module_name = _program() if kind.__module__ == _MAIN else kind.__module__
     return f"{module_name}:{kind.__qualname__}"
 
 
 def publish(package: str, *kinds: type) -> None:
-    """Name types by the package that exports them: their names travel, and outlive a move of their modules."""
+    """Name types after the package that exports them: such names stay valid when a module moves."""
     for kind in kinds:
         kind.__module__ = package
 
@@ -168,7 +168,7 @@ def _program() -> str:
 
 
 def imported(path: str) -> Any:
-    """What stands under ``module:qualified name`` in this process; looking runs no code, not even a module's."""
+    """The object named ``module:qualified name`` in this process; the lookup runs no code, not even a module's."""
     module_name, _, qualified = path.partition(":")
     found: Any = sys.modules.get(module_name)
     if found is None and module_name == _program():
