@@ -269,7 +269,7 @@ def test_a_broken_record_is_moved_aside_and_a_new_one_says_so(
     writer.close()
     [aside] = moved_aside_in(path.parent)
     began, *_, after, _ended = rows(path)
-    assert (began.seq, began.what) == (1, "began anew")
+    assert (began.seq, began.what) == (1, "began again")
     assert aside.name in began.about
     assert after.what == "rosie.after"
     assert verdict(path).problem == ""

@@ -228,7 +228,7 @@ def test_what_cannot_be_listened_to_is_refused(apart: Two, name: str, options: d
 
 def test_a_source_refuses_what_is_not_its_own(apart: Two) -> None:
     listen = apart.here.find(where(name="listen", container="here"))
-    with pytest.raises(ConfigurationError, match="no service of container here"):
+    with pytest.raises(ConfigurationError, match="not a service of container here"):
         listen("mine", apart.service("count"), 10.0)
 
 

@@ -1,6 +1,6 @@
-"""What happened in a container, told to whoever writes it down: calls, locks, stops, refusals, changes of its set-up.
+"""Audit events: reports the calls, locks, stops, refusals and configuration changes of a container to its record.
 
-Off, nothing of it stands in the way of a call. On, a call puts one record into a queue; `writer` does the rest.
+Without a record, it costs a call nothing. With one, a call puts one event into a queue; `writer` does the rest.
 """
 
 import time
@@ -50,11 +50,11 @@ _REFUSALS: Final = (
     SessionEnded,
     Stopped,
 )
-"""Errors that say that nothing was done, and why."""
+"""Errors that say that a call was refused, and why."""
 
 
 class Event(Struct, frozen=True, gc=False):
-    """One thing that happened."""
+    """One audited event."""
 
     at_ns: int
     """``time.time_ns()``"""
@@ -64,27 +64,27 @@ class Event(Struct, frozen=True, gc=False):
     what: str
     """The service, as errors name it, or a word."""
     about: Any
-    """What else to say of it: a text, a handle, names; made into text by who writes it."""
+    """Further details: a text, a handle, names; the writer converts them to text."""
     who: str
-    """Identity of who asked; empty: nobody, it came about by itself."""
+    """Identity of the caller; empty: the event had no caller."""
     session: str
     call_id: int
-    """0: it was no call."""
+    """0: the event was not a call."""
     outer_id: int
-    """The call that led to that one first of all, the same in all containers; 0: it was no call."""
+    """The outermost call that led to it, the same in all containers; 0: the event was not a call."""
     outcome: str
     """``ok``, or the type of the error."""
     why: str
-    """What errors of ours say; nothing of others, and nothing where an argument is secret."""
+    """The message of our own errors; empty for other errors, and where an argument is secret."""
     took_ns: int
 
 
 Tell = Callable[[Event], None]
-"""Takes an event; returns at once, whatever becomes of it."""
+"""Takes an event; returns at once, whatever happens to it."""
 
 
 class Record(Protocol):
-    """How far what writes a record is."""
+    """The state of a record's writer."""
 
     written: int
     lost: int
@@ -94,14 +94,14 @@ class Record(Protocol):
 
 
 class Audit:
-    """Where a container tells what happens in it; with nobody to tell, it does nothing.
+    """Reports the events of a container; without a receiver, it does nothing.
 
     Args:
-        tell: told of each event.
+        tell: called with each event.
         own: the container.
-        reads: tell of services that only read, too.
-        calls: where calls and refusals are counted, if they are.
-        record: what writes the events down, for who wants to know how far it is.
+        reads: also report services that only read.
+        calls: counters of calls and refusals, if any.
+        record: the writer of the events, for queries of its state.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Audit:
         why: str = "",
         took_ns: int = 0,
     ) -> None:
-        """Tell of something that is no call of a service."""
+        """Report an event that is not a service call."""
         if self._tell is not None:
             at_ns, now_ns = time.time_ns(), time.monotonic_ns()
             self._tell(Event(at_ns, now_ns, kind, what, about, who, session, call_id, outer_id, outcome, why, took_ns))
@@ -148,7 +148,7 @@ class Audit:
         call_id: int = 0,
         outer_id: int = 0,
     ) -> None:
-        """Tell that somebody was refused something, and by which error or for what reason."""
+        """Report that a caller was refused, with the error or the reason."""
         outcome = "Malformed" if isinstance(error, str) else type(error).__name__
         if self.calls is not None:
             self.calls.refuse(outcome)
@@ -165,7 +165,7 @@ class Audit:
             )
 
     def changed(self, what: str, about: str, call: CallContext | None) -> None:
-        """Tell of a change of configuration, made in a call, or by this container itself."""
+        """Report a change of configuration, made in a call or by this container itself."""
         if self._tell is None:
             return
         if call is not None:
@@ -182,7 +182,7 @@ class Audit:
             self.note("configure", what, about=about, who=self._own.identity, session=str(self._own))
 
     def watch(self, domain: str, service: ServedService) -> None:
-        """From now on tell of calls of a service that is about to be offered."""
+        """Report the calls of a service that is about to be offered."""
         if self._tell is None and self.calls is None:
             return
         rule = _rule(domain, service.info.name, service.effect, reads=self._reads)
@@ -193,27 +193,27 @@ class Audit:
 class _Rule(NamedTuple):
     kind: Kind
     always: bool
-    """Tell also if nothing is wrong."""
+    """Whether to report successful calls, too."""
     about: bool
-    """Tell the first argument, too: of the middleware's own functions only, whose arguments are known."""
+    """Whether to report the first argument, too: only for the middleware's own functions, whose arguments are known."""
 
 
 _LOCKS: Final = frozenset(("break_lock", "request_release"))
 _STOPS: Final = frozenset(("estop", "estop_clear", "resume"))
 _TABLE_TELLS: Final = frozenset(("acquire",))
-"""What the lock table tells itself, and better; their refusals are told."""
+"""The lock table reports these itself, in more detail; only their refusals are reported here."""
 _SILENT: Final = frozenset(
     ("renew", "release", "release_requested", "notification_failed", "hook_suspended", "listen", "unlisten")
 )
-"""The small talk of containers."""
+"""Routine messages between containers."""
 
 
 def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
-    """Where a container tells what happens in it; what writes it down, if anything does, ends with the stack."""
+    """The audit of a container; the stack closes its writer, if it has one."""
     calls = CallCounters() if settings.metrics else None
     if settings.audit is None:
         return Audit(calls=calls)
-    from trade._audit.writer import start_writing  # noqa: PLC0415 - who keeps no record needs no database
+    from trade._audit.writer import start_writing  # noqa: PLC0415 - without a record no database is needed
 
     writer = start_writing(settings, settings.audit, own)
     leaving.callback(writer.close)
@@ -221,7 +221,7 @@ def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
 
 
 def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
-    """How calls of a service are told of; None: not at all."""
+    """How to report the calls of a service; None: not at all."""
     if domain != DOMAIN:
         if effect == "read":
             return _Rule("read", reads, about=False)
@@ -235,7 +235,7 @@ def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
 
 
 class Audited(Interceptor):
-    """Counts the calls of a service, and tells of each when it has ended."""
+    """Counts the calls of a service, and reports each when it has ended."""
 
     __slots__ = ("_calls", "_rule", "_tell", "_timed")
 
@@ -246,8 +246,8 @@ class Audited(Interceptor):
         self._timed = None if calls is None else calls.of(label)
 
     def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
-        """Call the service and tell of that. Its errors pass."""
-        began_ns, outer_id = time.monotonic_ns(), call.context.outer_id  # when it has ended, it belongs to nobody
+        """Call the service and report that. Its errors pass through."""
+        began_ns, outer_id = time.monotonic_ns(), call.context.outer_id  # a call that has ended has no outer call
         try:
             result = proceed()
         except BaseException as error:
@@ -262,7 +262,7 @@ class Audited(Interceptor):
         return result
 
     def rejected(self, call: ServedCall, error: BaseException) -> None:
-        """Tell of a call that never began."""
+        """Report a call that never began."""
         self._failed(call, error, 0, call.context.outer_id)
 
     def _failed(self, call: ServedCall, error: BaseException, began_ns: int, outer_id: int) -> None:

@@ -1,6 +1,6 @@
-"""The chain that an audit record is: each row carries the hash of the one before, so that no row changes unnoticed.
+"""The hash chain of an audit record: each row contains the hash of the previous one, so that no row changes unnoticed.
 
-Pure: rows in, a verdict out. What a chain can prove, and what it cannot, is in decision 36.
+Pure: rows in, a verdict out. Decision 36 describes what a chain can prove, and what it cannot.
 """
 
 import hashlib
@@ -11,13 +11,13 @@ import msgspec
 from msgspec import Struct, structs
 
 NOTHING: Final = bytes(32)
-"""What the first row of all has for the hash of the row before."""
+"""The previous hash of the first row."""
 DROPPED: Final = "dropped"
-"""What a row of kind ``audit`` says when older rows were dropped; it is about the last of them, see `checkpoint`."""
+"""The event of a row of kind ``audit`` for dropped rows; it names the last of them, see `checkpoint`."""
 _FORMAT: Final = b"trade audit 1\0"
 _NEAR: Final = 1000
-"""So many places around a row are tried for the one that it was taken from."""
-_ANOTHER: Final = "it is not the row that was noted elsewhere: it, or one before, was written anew"
+"""The distance within which the origin of a moved row is searched."""
+_ANOTHER: Final = "it is not the row that was noted elsewhere: it, or an earlier one, was rewritten"
 _encode: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -30,7 +30,7 @@ class AuditRow(Struct, frozen=True, array_like=True, gc=False):
     """``time.time_ns()`` of the host."""
     monotonic_ns: int
     boot: str
-    """Epoch of the container that wrote it: another one after each start."""
+    """Epoch of the container that wrote it; a restart begins a new one."""
     kind: str
     what: str
     about: str
@@ -44,7 +44,7 @@ class AuditRow(Struct, frozen=True, array_like=True, gc=False):
 
 
 class Link(Struct, frozen=True, gc=False):
-    """A row with what ties it to the others, as it was read."""
+    """A row with its own hash and the previous one, as they were read."""
 
     row: AuditRow
     before: bytes
@@ -52,47 +52,47 @@ class Link(Struct, frozen=True, gc=False):
 
 
 class Head(Struct, frozen=True):
-    """Where a record ends."""
+    """The end of a record."""
 
     seq: int
     hash: bytes
 
 
 class ChainCheck(Struct, frozen=True, kw_only=True):
-    """What the rows of a record prove."""
+    """The result of a check of a record."""
 
     rows: int = 0
     first: int = 0
-    """The oldest row there is; older ones were dropped in order if it is not 1."""
+    """The oldest row present; if it is not 1, older rows were dropped in order."""
     head: Head = Head(0, NOTHING)
-    """The newest row there is."""
+    """The newest row present."""
     broken_at: int = 0
-    """The first row that is not what it was, or is missing; 0: none."""
+    """The first row that was changed or is missing; 0: none."""
     problem: str = ""
-    """What is wrong with it; empty: nothing."""
+    """The problem with that row; empty: none."""
     proven: int = 0
-    """The newest row noted elsewhere that is, or was when it was dropped, the one that was noted; 0: none."""
+    """The newest row noted elsewhere that matches, or matched when it was dropped; 0: none."""
     untold: tuple[int, ...] = ()
-    """Rows noted elsewhere that were dropped, and that no row which is left names: nobody can tell any more."""
+    """Dropped rows, noted elsewhere, that no remaining row names: they can no longer be checked."""
 
 
 def row_hash(before: bytes, row: AuditRow) -> bytes:
-    """SHA-256 of a row and the hash of the one before."""
+    """SHA-256 of a row and the hash of the previous one."""
     return hashlib.sha256(_FORMAT + before + _encode(row)).digest()
 
 
 def checkpoint(head: Head) -> str:
-    """How a row says that all up to that one were dropped."""
+    """The text of a row about dropped rows: the last of them."""
     return f"{head.seq} {head.hash.hex()}"
 
 
 def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | None = None) -> ChainCheck:
-    """Walk a record from its oldest row to its newest.
+    """Check a record from its oldest row to its newest.
 
     Args:
         links: its rows, in the order of their numbers.
-        head: where the record itself says that it ends.
-        witnessed: hashes of rows by number, as somebody else has noted them.
+        head: the end according to the record itself.
+        witnessed: hashes of rows by number, as noted elsewhere.
     """
     witnessed, rows, first, begins = witnessed or {}, 0, 0, ""
     dropped: list[str] = []
@@ -130,14 +130,14 @@ def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | N
 
 
 def _dropped_before(first: int, dropped: Iterable[str], witnessed: Mapping[int, bytes]) -> dict[int, bool]:
-    """Of rows that are gone, whether they were those that were noted, as far as the rows that say so name them."""
+    """Whether dropped rows matched the noted ones, as far as the rows about dropping name them."""
     named = {about.partition(" ")[0]: about for about in dropped}
     gone = {seq: noted for seq, noted in witnessed.items() if seq < first and str(seq) in named}
     return {seq: named[str(seq)] == checkpoint(Head(seq, noted)) for seq, noted in sorted(gone.items())}
 
 
 def _wrong_row(link: Link, last: Head, witnessed: Mapping[int, bytes]) -> tuple[int, str]:
-    """What is wrong with a row behind that one, and where."""
+    """The first problem with a row after another one, and its place."""
     seq = link.row.seq
     if seq != last.seq + 1:
         return last.seq + 1, f"rows {last.seq + 1} to {seq - 1} are missing"
@@ -151,7 +151,7 @@ def _wrong_row(link: Link, last: Head, witnessed: Mapping[int, bytes]) -> tuple[
 
 
 def _wrong_end(last: Head, head: Head, witnessed: Mapping[int, bytes]) -> tuple[int, str]:
-    """What is wrong with where the rows end."""
+    """The problem with the end of the rows, and its place."""
     if last.seq < head.seq:
         return last.seq + 1, f"rows {last.seq + 1} to {head.seq} are missing, at the end"
     if last != head:

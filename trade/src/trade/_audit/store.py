@@ -1,7 +1,7 @@
-"""An audit record on disk: one SQLite file for each container, to which rows are added and of which the oldest go.
+"""An audit record on disk: one SQLite file for each container; rows are added, and the oldest dropped.
 
-Several processes may add to one file (a container that is started twice): each addition begins at the end that the file
-has by then.
+Several processes may write to one file (a container that is started twice): each addition starts from the end that the
+file has at that moment.
 """
 
 import contextlib
@@ -17,9 +17,9 @@ from trade._audit.hash_chain import DROPPED, NOTHING, AuditRow, Head, Link, chec
 
 SUFFIX: Final = ".sqlite"
 BROKEN: Final = ".broken-"
-"""Stands in the name of a file that was moved aside."""
+"""Part of the name of a file that was moved aside."""
 _BUSY_S: Final = 0.5
-"""How long one step waits for who else holds the file; a closing writer takes four such steps at most."""
+"""How long one step waits for another process to release the file; a closing writer takes four such steps at most."""
 _DAY_NS: Final = 86_400_000_000_000
 _COLUMNS: Final = AuditRow.__struct_fields__
 _SCHEMA: Final = (
@@ -32,31 +32,31 @@ _ADD: Final = (  # by name: a later version may have added columns
 _READ: Final = f"SELECT {', '.join(_COLUMNS)}, before, hash FROM record WHERE seq > ? ORDER BY seq"  # noqa: S608
 
 Make = Callable[[Head], Sequence[AuditRow]]
-"""Rows to add after that one."""
+"""Makes the rows to add after a given end."""
 
 
 class Keep(NamedTuple):
-    """What is kept of a record."""
+    """The limits for keeping rows of a record."""
 
     days: int
     rows: int
     least: int = 10_000
-    """So many rows are kept however old they are: a clock that is wrong must not clear the record."""
+    """The number of rows kept whatever their age: a wrong clock must not clear the record."""
     piece: int = 1_000
-    """Rows go by so many, and at most ten times as many at once."""
+    """Rows are dropped in pieces of this size, ten pieces at most at once."""
 
 
 class AuditStore:
-    """The file of one container, for whoever adds to it. Used by one thread.
+    """The audit file of one container, for its writer. Used by one thread.
 
     Raises:
-        sqlite3.OperationalError: it cannot be written now: no space, no right, a read-only disk.
-        sqlite3.DatabaseError: it is broken.
+        sqlite3.OperationalError: the file cannot be written now: no space, no permission, a read-only disk.
+        sqlite3.DatabaseError: the file is corrupt.
     """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        os.close(os.open(path, os.O_CREAT | os.O_RDWR, 0o600))  # what SQLite puts beside it gets the same rights
+        os.close(os.open(path, os.O_CREAT | os.O_RDWR, 0o600))  # SQLite's further files get the same permissions
         self._file = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None)
         try:
             self._file.execute("PRAGMA journal_mode=WAL")
@@ -76,12 +76,12 @@ class AuditStore:
             yield
             self._file.execute("COMMIT")
         except BaseException:
-            with contextlib.suppress(sqlite3.Error):  # it may have been undone already
+            with contextlib.suppress(sqlite3.Error):  # it may have been rolled back already
                 self._file.execute("ROLLBACK")
             raise
 
     def add(self, rows: Sequence[AuditRow]) -> Head:
-        """Add rows, all or none; their numbers are given here. Returns the new end. Raises as the class says."""
+        """Add rows, all or none; assigns their numbers. Returns the new end. Raises as the class says."""
         with self._transaction():
             return self._append(_head(self._file), rows)
 
@@ -97,14 +97,14 @@ class AuditStore:
         return head
 
     def drop(self, keep: Keep, row: AuditRow) -> int:
-        """Drop the oldest rows, as far as they need not be kept, and say so in a row. Raises as the class says.
+        """Drop the oldest rows that need not be kept, and add a row about it. Raises as the class says.
 
         Args:
-            keep: what to keep, by the time of ``row``.
-            row: what is added then; what it is about is filled in.
+            keep: the limits, at the time of ``row``.
+            row: the row to add; this fills in what it is about.
 
         Returns:
-            How many were dropped; there may be more to drop.
+            The number of rows dropped; there may be more to drop.
         """
         with self._transaction():
             head = _head(self._file)
@@ -124,7 +124,7 @@ class AuditStore:
             return pieces * keep.piece
 
     def _older(self, oldest: int, before_ns: int, keep: Keep, head: Head) -> int:
-        """How many of the oldest rows in a row are from before a moment, of those that may go for that."""
+        """The number of consecutive oldest rows that are older than a moment and may be dropped."""
         most = min(10 * keep.piece, head.seq - oldest + 1 - keep.least)
         if most <= 0:
             return 0
@@ -134,7 +134,7 @@ class AuditStore:
         return most if found is None else found - oldest
 
     def close(self) -> None:
-        """Let go of the file. Idempotent."""
+        """Close the file. Idempotent."""
         self._file.close()
 
 
@@ -151,17 +151,17 @@ def records_in(folder: Path) -> list[Path]:
 
 
 def moved_aside_in(folder: Path) -> list[Path]:
-    """Those that were found broken."""
+    """The files that were found corrupt."""
     found = folder.glob(f"*{SUFFIX}{BROKEN}*")
     return sorted(path for path in found if not path.name.endswith(("-wal", "-shm")))
 
 
 @contextlib.contextmanager
 def reading(path: Path, after: int = 0) -> Generator[tuple[Head, Iterator[Link]], None, None]:
-    """The end of a record, and its rows after one of them, as they are at this moment; nothing is written.
+    """The end of a record, and its rows after one of them, at this moment; writes nothing.
 
     Raises:
-        sqlite3.Error: it cannot be read, or is broken; also while the rows are read.
+        sqlite3.Error: the file cannot be read, or is corrupt; also while the rows are read.
     """
     file = _opened(path)
     try:
@@ -172,7 +172,7 @@ def reading(path: Path, after: int = 0) -> Generator[tuple[Head, Iterator[Link]]
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """Without the right to write beside it, as it was when its container ended."""
+    """Opens a file for reading; also without permission to write next to it, in the state its container left."""
     file = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=_BUSY_S, isolation_level=None)
     try:
         file.execute("SELECT seq FROM head").fetchone()
@@ -188,7 +188,7 @@ def _link(found: tuple[object, ...]) -> Link:
 
 
 def move_aside(path: Path, stamp: str) -> Path:
-    """Put a broken file, with what belongs to it, under another name. Raises OSError."""
+    """Rename a corrupt file with its further files. Raises OSError."""
     aside = path.with_name(f"{path.name}{BROKEN}{stamp}")
     path.replace(aside)
     for part in ("-wal", "-shm"):

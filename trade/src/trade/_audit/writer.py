@@ -1,4 +1,4 @@
-"""Writes down what happened: one thread, fed by a queue that never keeps anybody waiting."""
+"""Writes audit events: one thread, fed by a queue that never blocks its callers."""
 
 import importlib.metadata
 import json
@@ -22,32 +22,32 @@ from trade._settings import Settings
 _logger = logging.getLogger("trade")
 
 _MOST: Final = 20_000
-"""So many events wait at most; what comes then is counted, and lost."""
+"""The largest number of waiting events; further ones are counted, and lost."""
 _BATCH: Final = 1_000
 _GATHER_S: Final = 0.1
-"""How long events are gathered before they are written together."""
+"""How long events are collected before they are written together."""
 _AGAIN_S: Final = 1.0
-"""How long to wait before trying once more to write."""
+"""The pause before the next attempt to write."""
 _LOOK_S: Final = 3600.0
-"""How often it is looked for rows to drop, and where the record ends is logged."""
+"""How often old rows are dropped, and the end of the record is logged."""
 _PARTING_S: Final = 3.0
 _LONGEST: Final = 500
 _MOST_ID: Final = (1 << 63) - 1
 _JUMP_NS: Final = 2_000_000_000
-"""A clock on the wall that has moved so far against the monotonic one was set."""
+"""A wall clock that differs by this much from the monotonic one was set."""
 _FAR_NS: Final = 86_400_000_000_000
-"""And after such a jump nothing is dropped for its age: it may be wrong."""
+"""After a jump this large no row is dropped for its age: the clock may be wrong."""
 _EVER_DAYS: Final = 1_000_000
 
 
 class AuditWriter:
-    """Owns the record of one container. Closed, it has written what it could, and says what it could not.
+    """Owns the record of one container. When closed, it has written what it could, and logs what it could not.
 
     Args:
-        path: of the file; made when the first event is written.
-        boot: names this boot of the container.
-        about: what the first row of this boot says.
-        keep: how much.
+        path: of the file; created when the first event is written.
+        boot: the epoch of the container.
+        about: the details of the first row of this boot.
+        keep: the limits for keeping rows.
     """
 
     def __init__(
@@ -64,21 +64,21 @@ class AuditWriter:
         self._clocks = clocks
         self._offset_ns = self._offset()
         self._far = False
-        """The clock was set by so much that ages mean nothing."""
+        """The clock was set by so much that ages are meaningless."""
         self._waiting: deque[Event] = deque()
         self._some = threading.Event()
         self._closing = threading.Event()
         self._guard = threading.Lock()
         self._lost = 0
         self.lost = 0
-        """Events that were not written down, since the start."""
+        """The number of events lost since the start."""
         self.written = 0
         self._rows: list[AuditRow] = [self._row("began", about)]
-        """What is to be written next; kept until it is."""
+        """The next rows to write; kept until they are written."""
         self._to_drop = False
-        """It is time to look for rows to drop."""
+        """Whether to look for rows to drop."""
         self._unlooked = 0
-        """Rows written since that was done last."""
+        """Rows written since the last time."""
         self._store: AuditStore | None = None
         self._head = Head(0, b"")
         self._trouble = ""
@@ -88,16 +88,16 @@ class AuditWriter:
 
     @property
     def waiting(self) -> int:
-        """Events that are not written yet."""
+        """The number of events not yet written."""
         return len(self._waiting)
 
     @property
     def running(self) -> bool:
-        """It still writes, or tries to."""
+        """Whether it still writes, or tries to."""
         return self._thread.is_alive()
 
     def tell(self, event: Event) -> None:
-        """Take an event, on any thread; without waiting for anything."""
+        """Take an event, on any thread, without blocking."""
         if len(self._waiting) >= _MOST:
             with self._guard:
                 self._lost += 1
@@ -117,7 +117,7 @@ class AuditWriter:
             self._some.clear()
             if time.monotonic() - looked >= _LOOK_S:
                 looked, self._to_drop = time.monotonic(), True
-                self._say_head("stands at")
+                self._say_head("is at")
             self._write_all(last=False)
         self._write_all(last=True)
         self._part()
@@ -131,7 +131,7 @@ class AuditWriter:
                 return
 
     def _gather(self) -> None:
-        if self._rows:  # they could not be written before
+        if self._rows:  # from a failed attempt
             return
         offset_ns = self._offset()
         if abs(jump_ns := offset_ns - self._offset_ns) >= _JUMP_NS:
@@ -146,12 +146,12 @@ class AuditWriter:
             self._rows.append(_row_of(self._waiting.popleft(), self._boot))
 
     def _write(self, *, anew: bool = True) -> bool:
-        """Write the rows down, into a new file if the one there is broken. Whether that could be done."""
+        """Write the rows, into a new file if the present one is corrupt. Returns whether that succeeded."""
         fresh = self._store is None
         try:
             self._store = self._store or AuditStore(self._path)
             self._head = self._store.add(self._rows)
-        except (sqlite3.OperationalError, OSError) as trouble:  # no space, no right, read-only: it may pass
+        except (sqlite3.OperationalError, OSError) as trouble:  # no space, no permission, read-only: may be temporary
             self._say_trouble(str(trouble))
             return False
         except sqlite3.DatabaseError as broken:
@@ -165,12 +165,12 @@ class AuditWriter:
             self._trouble = ""
             _logger.warning("audit: %s is written again", self._path)
         if fresh:
-            self._say_head("goes on at")
+            self._say_head("continues at")
         return True
 
     def _say_trouble(self, trouble: str) -> None:
         self._let_go()
-        if trouble != self._trouble:  # the same again says nothing new
+        if trouble != self._trouble:  # the same trouble again is not news
             self._trouble = trouble
             _logger.error(
                 "audit: %s cannot be written: %s; trying again every %g s, and up to %d records wait",
@@ -186,12 +186,14 @@ class AuditWriter:
         except OSError as trouble:
             self._say_trouble(f"it is broken ({broken}), and cannot be moved aside: {trouble}")
             return False
-        _logger.error("audit: %s is broken (%s); it is %s now, and a new one is begun", self._path, broken, aside.name)
-        self._rows.insert(0, self._row("began anew", f"the record before is broken, and is {aside.name} now: {broken}"))
+        _logger.error("audit: %s is broken (%s); it is %s now, a new one was started", self._path, broken, aside.name)
+        self._rows.insert(
+            0, self._row("began again", f"the record before is broken, and is {aside.name} now: {broken}")
+        )
         return True
 
     def _drop(self) -> bool:
-        """Drop some of what need not be kept any more, if it is time to look. Whether that could be done."""
+        """Drop some rows that need not be kept, if it is time to. Returns whether that succeeded."""
         if not self._to_drop or self._store is None:
             return True
         keep = self._keep._replace(days=_EVER_DAYS) if self._far else self._keep
@@ -218,7 +220,7 @@ class AuditWriter:
             self._store = None
 
     def _say_head(self, verb: str) -> None:
-        """In the log: a witness that stands elsewhere."""
+        """Log the end of the record: a witness in another place."""
         if self._head.seq:
             _logger.info("audit: %s %s row %d, %s", self._path, verb, self._head.seq, self._head.hash.hex())
 
@@ -231,13 +233,13 @@ class AuditWriter:
         return at_ns - now_ns
 
     def close(self) -> None:
-        """Write what waits, for a few seconds at most. Idempotent."""
+        """Write the waiting events, for a few seconds at most. Idempotent."""
         self._closing.set()
         self._some.set()
         if self._thread is not threading.current_thread():
             self._thread.join(_PARTING_S)
             if self.running:
-                _logger.error("audit: %s is still held up after %g s; what waits may be lost", self._path, _PARTING_S)
+                _logger.error("audit: %s is still blocked after %g s; waiting rows may be lost", self._path, _PARTING_S)
 
 
 def _row_of(event: Event, boot: str) -> AuditRow:
@@ -260,13 +262,13 @@ def _row_of(event: Event, boot: str) -> AuditRow:
 
 
 def _clipped(text: str) -> str:
-    """What can be written, and no more than anybody reads."""
+    """The part of a text that can be written, at a readable length."""
     text = text[:_LONGEST]
     return text if text.isascii() else text.encode(errors="replace").decode()
 
 
 def _text(about: Any) -> str:
-    """In words; of what a caller may have made of any length, little."""
+    """Details as text; shortened where a caller may have made them of any length."""
     if isinstance(about, str):
         return about
     if isinstance(key := getattr(about, "key", None), ServiceKey):  # a handle
@@ -277,7 +279,7 @@ def _text(about: Any) -> str:
 
 
 def start_writing(settings: Settings, folder: Path, own: Address) -> AuditWriter:
-    """The writer of a container's record in that folder; its first row says who is up here, and by which policy."""
+    """The writer of a container's record in a folder; its first row names the container and its policy."""
     about = {
         "container": own.container,
         "identity": own.identity,

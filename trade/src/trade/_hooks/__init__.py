@@ -1,1 +1,1 @@
-"""Before and after calls: hooks on services, and the services that manage them."""
+"""Hooks: services called before and after other ones, and the services that manage hooks."""

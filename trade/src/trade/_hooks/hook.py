@@ -1,4 +1,4 @@
-"""What is called before and after a service, where that runs: attached from anywhere, never able to change the call."""
+"""Hooks before and after a service, in the container where it runs: attached from anywhere, unable to alter calls."""
 
 import logging
 import threading
@@ -31,64 +31,64 @@ ONE_S: Final = 0.1
 ALL_S: Final = 0.25
 """How long all hooks of one side of a call may take together."""
 _TRIES: Final = 3
-"""After so many failures in a row a hook is suspended."""
+"""A hook is suspended after this many failures in a row."""
 _MOST: Final = 1000
-"""So many may be attached in a container."""
+"""The largest number of hooks in a container."""
 
 Side = Literal["before", "after"]
 
 
 class HookEvent(Struct, frozen=True, kw_only=True):
-    """What a hook is told: which service, with what, for whom; and after it, how it ended."""
+    """The call that a hook receives: the service, its arguments and caller; afterwards also the outcome."""
 
     service: Handle
     args: dict[str, Any]
-    """By name, as plain data; ``***`` stands for what is secret."""
+    """By name, as plain data; ``***`` replaces secret values."""
     caller: str
-    """Identity of who calls."""
+    """Identity of the caller."""
     session: str
     call_id: int
     chain: tuple[str, ...]
     """Services whose calls led to it, outermost first."""
     ended: bool = False
-    """Whether it has run: True for hooks that are called after it."""
+    """Whether the service has run: True for hooks that are called after it."""
     result: Any = None
     """As plain data; None also if it failed."""
     error: str = ""
-    """Type and message of the error it ended with."""
+    """Type and message of its error."""
     took_s: float = 0.0
 
     @property
     def ok(self) -> bool:
-        """Whether it ended with a result."""
+        """Whether the call ended with a result."""
         return self.ended and not self.error
 
 
 class HookInfo(Struct, frozen=True, kw_only=True):
-    """One hook in one container, as everybody may know it."""
+    """The public description of one hook in one container."""
 
     id: str
     side: Side
     target: str
-    """Which services, as text."""
+    """The services it applies to, as text."""
     call: str
-    """What is called: ``rosie.watch.saw``."""
+    """The service that it calls: ``rosie.watch.saw``."""
     owner: str
-    """The session of who attached it."""
+    """The session that attached it."""
     container: str
-    """Where the services run."""
+    """The container of the services."""
     services: tuple[str, ...]
-    """Those of them that it is attached to there."""
+    """The services there that it is attached to."""
     fired: int
     skipped: int
-    """Times it was left out: it is among the services that led to the call, or there was no time left."""
+    """How often it was left out: it led to the call itself, or no time was left."""
     failures: int
     suspended: bool
     last_error: str
 
 
 class HookHost(Protocol):
-    """What hooks need of their container."""
+    """The functions of a container that hooks use."""
 
     @property
     def name(self) -> str: ...
@@ -97,7 +97,7 @@ class HookHost(Protocol):
 
 
 Denied = Callable[[str, Record], "AccessDenied | None"]
-"""Why somebody may not instrument a service; None if it may."""
+"""Why an identity may not instrument a service; None if it may."""
 
 
 class AttachedHook:
@@ -127,13 +127,13 @@ class AttachedHook:
         self.last_error = ""
 
     def means(self, record: Record) -> bool:
-        """Whether it is about that service."""
+        """Whether the hook applies to a service."""
         if isinstance(self.target, Handle):
             return self.target.key == record.key
         return self.target.matches(record)
 
     def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
-        """Call it, as long as that may take. Whatever becomes of it, the call it watches goes on."""
+        """Call the hook within its time limit. Whatever its outcome, the watched call continues."""
         if self.call.label in chain or left_s <= 0:
             self.skipped += 1
             return
@@ -144,8 +144,8 @@ class AttachedHook:
             self.fired += 1
             self._in_a_row = 0
         except TimeoutError:
-            self._failed(f"cut off: it took longer than the {ONE_S:g} s it may, or than all may together")
-        except BaseException as error:  # noqa: BLE001 - whatever a hook raises is none of the caller's business
+            self._failed(f"cut off: it took longer than its {ONE_S:g} s, or all hooks took too long together")
+        except BaseException as error:  # noqa: BLE001 - an error of a hook never reaches the caller
             self._failed(f"{type(error).__name__}: {error}")
 
     def _failed(self, text: str) -> None:
@@ -159,7 +159,7 @@ class AttachedHook:
 
 
 class HookInterceptor(Interceptor):
-    """The hooks of one service here."""
+    """The hooks of one service in this container."""
 
     def __init__(
         self, home: HookHost, codec: Codec, scheduler: Scheduler, handle: Handle, hooks: Sequence[AttachedHook]
@@ -173,7 +173,7 @@ class HookInterceptor(Interceptor):
         self._after = [hook for hook in hooks if hook.side == "after"]
 
     def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
-        """Call the service with its hooks around it. Its own errors pass."""
+        """Call the service with its hooks around it. Its own errors pass through."""
         began_ns = time.monotonic_ns()
         service, _, _, context = call
         called = self._called(call)
@@ -219,22 +219,22 @@ class HookInterceptor(Interceptor):
         )
 
     def _plain(self, value: Any) -> Any:
-        """A copy that can be sent: hooks see what was, and change nothing."""
+        """A copy that can be sent: hooks see the values, and cannot change them."""
         try:
             return self._decode(self._encode(value))
-        except Exception:  # noqa: BLE001 - only a call within this process, and not strict, carries such a thing
+        except Exception:  # noqa: BLE001 - only a local call without strict can carry such a value
             return repr(value)
 
 
 def _error_text(service: ServedService, error: BaseException) -> str:
-    """Its message may show what is secret."""
+    """The error as text, without its message if that may show a secret."""
     kind = type(error).__name__
     return kind if service.signature.has_secrets else f"{kind}: {error}"
 
 
 @contextmanager
 def _as_the_container(context: CallContext):
-    """Calls made inside belong to the watched call's chain and end with its caller; they carry none of its locks."""
+    """Runs hook calls within the watched call's chain and session, but without its locks."""
     bare = CallContext(context.id, context.service, context.caller, context.session, context.expires_ns, context.chain)
     tokens = running.set(bare), holding.set(()), speaking.set(None)
     try:
@@ -267,18 +267,18 @@ class Hooks:
         self._attached: dict[tuple[str, str], AttachedHook] = {}
         """By session and name."""
         self._spans: Spans | None = None
-        """Where calls are noted while this container is traced."""
+        """The spans of this container while it is traced."""
         self.suspended: Callable[[AttachedHook], None] = lambda _: None
-        """Told of each that is suspended."""
+        """Called for each hook that is suspended."""
 
     def attach(
         self, name: str, side: Side, target: Handle | Constraint, call: Handle, owner: str, identity: str
     ) -> list[str]:
-        """Attach one; the same again changes nothing. Returns the labels of the services it is attached to.
+        """Attach a hook; repeating it changes nothing. Returns the labels of the services it is attached to.
 
         Raises:
-            AccessDenied: its owner may instrument none of those it means here.
-            ConfigurationError: a stop service was named for a hook before it, or there are too many.
+            AccessDenied: its owner may instrument none of the services here.
+            ConfigurationError: the hook is to run before a stop service, or there are too many hooks.
         """
         hook = AttachedHook(name, side, target, call, owner, identity, self.suspended_now)
         with self._lock:
@@ -300,7 +300,7 @@ class Hooks:
         self.suspended(hook)
 
     def detach(self, owner: str, name: str) -> bool:
-        """End one; whether there was one."""
+        """Detach a hook; returns whether it existed."""
         with self._lock:
             gone = self._attached.pop((owner, name), None)
             if gone is not None:
@@ -308,11 +308,11 @@ class Hooks:
             return gone is not None
 
     def named(self, name: str) -> list[AttachedHook]:
-        """Those of that name."""
+        """The hooks of a name."""
         return [hook for hook in list(self._attached.values()) if hook.name == name]
 
     def session_ended(self, session: str) -> None:
-        """Who attached them is gone: so are they."""
+        """Detach the hooks of a session that ended."""
         with self._lock:
             gone = [key for key in self._attached if key[0] == session]
             for key in gone:
@@ -321,18 +321,18 @@ class Hooks:
                 self._refresh()
 
     def changed(self, change: Change) -> None:
-        """Told by the registry."""
+        """Called by the registry."""
         if self._in_use and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
             self.recheck_access()
 
     def recheck_access(self) -> None:
-        """What is offered here, or who may instrument it, has changed."""
+        """Check again which services exist, and who may instrument them."""
         with self._lock:
             if self._in_use:
                 self._refresh()
 
     def trace(self, spans: Spans | None) -> None:
-        """Note every call of a service there from now on; None: none any more."""
+        """Record a span of every service call from now on; None: stop recording."""
         with self._lock:
             self._spans = spans
             self._refresh()
@@ -365,7 +365,7 @@ class Hooks:
         return hook.means(record) and self._denied(hook.identity, record) is None
 
     def infos(self) -> list[HookInfo]:
-        """Those attached here, oldest first."""
+        """The hooks attached here, oldest first."""
         return [
             HookInfo(
                 id=hook.name,
@@ -386,10 +386,10 @@ class Hooks:
 
 
 def _lasting(service: LocalService) -> list[Interceptor]:
-    """What was around it from its beginning: audit."""
+    """The interceptors that a service has from the start: audit."""
     return [one for one in service.interceptors if not isinstance(one, SpanRecorder | HookInterceptor)]
 
 
 def _hookable(record: Record) -> bool:
-    """The middleware's own services are watched by nobody: locks, stops and hooks depend on them."""
+    """Whether a service can have hooks: the middleware's own cannot, as locks, stops and hooks depend on them."""
     return record.local and record.key.domain != DOMAIN

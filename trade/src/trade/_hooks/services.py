@@ -1,4 +1,4 @@
-"""What every container offers about the hooks on its services, in group ``trade``."""
+"""The services for hooks that every container offers, in group ``trade``."""
 
 import contextlib
 import logging
@@ -17,7 +17,7 @@ _logger = logging.getLogger("trade")
 
 
 class HookServices:
-    """The wire's side of `Hooks`."""
+    """The wire side of `Hooks`."""
 
     def __init__(self, hooks: Hooks, home: NotificationServicesHost, access: Authorizer) -> None:
         self._hooks = hooks
@@ -29,7 +29,7 @@ class HookServices:
     def attach_hook(
         self, name: str, side: Side, call: Handle, handle: Handle | None = None, constraint: Constraint | None = None
     ) -> list[str]:
-        """Call that one before or after services of this container, now and later ones; which they are now."""
+        """Call a service before or after services of this container, now and later; returns the current ones."""
         asked, target = served_call(), constraint if handle is None else handle
         if target is None:
             raise ConfigurationError(where="attach_hook", problem="it needs a handle or a constraint")
@@ -37,7 +37,7 @@ class HookServices:
 
     @service
     def detach_hook(self, name: str) -> bool:
-        """End hooks of that name here; whether there were any. Another's is for who administers the system."""
+        """Detach the hooks of a name in this container; returns whether any existed. Others' require ``administer``."""
         asked, found = served_call(), self._hooks.named(name)
         for hook in found:
             if hook.identity != asked.caller:
@@ -47,18 +47,18 @@ class HookServices:
 
     @service(effect="read")
     def hooks(self) -> list[HookInfo]:
-        """What is attached to services of this container, whoever attached it."""
+        """The hooks on services of this container, of all owners."""
         return self._hooks.infos()
 
     @service
     def hook_suspended(self, name: str, call: str, error: str) -> None:
-        """Told by another container: a hook that was attached from here failed too often there."""
+        """For containers: a hook that was attached from this container failed too often."""
         _logger.warning(
             "hook %s (%s), attached from here, is suspended by %s: %s", name, call, served_call().session, error
         )
 
     def _tell_who_attached(self, hook: AttachedHook) -> None:
         owner = Address(*hook.owner.split("/")[:3])
-        with contextlib.suppress(CallerError, CallError):  # it has gone
+        with contextlib.suppress(CallerError, CallError):  # the owner has gone
             told = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
             told.start(hook.name, hook.call.label, hook.last_error)

@@ -1,4 +1,4 @@
-"""What every container offers about listening to its services, in group ``trade``."""
+"""The services for streams that every container offers, in group ``trade``."""
 
 from typing import Annotated
 
@@ -13,21 +13,21 @@ Hz = Annotated[float, Meta(ge=LEAST_HZ, le=MOST_HZ)]
 
 
 class StreamServices:
-    """The wire's side of `Streams`."""
+    """The wire side of `Streams`."""
 
     def __init__(self, streams: Streams) -> None:
         self._streams = streams
 
     @service(effect="read")
     def listen(self, name: str, service: Handle, hz: Hz, on_change: bool = False) -> None:
-        """Sample that service of this container for who asks, so many times a second; to be asked for again and again.
+        """Sample a service of this container for the caller at a rate; the caller must renew this regularly.
 
-        ``name`` is the listener's own; the samples are put on the key of the stream.
+        ``name`` is the listener's own; the samples are published on the key of the stream.
         """
         asked = served_call()
         self._streams.listen(service, (asked.session, name), RateRequest(asked.caller, hz, on_change))
 
     @service(effect="read")
     def unlisten(self, name: str) -> None:
-        """Who asks listens no more under that name."""
+        """End a stream of the caller, by its name."""
         self._streams.unlisten((served_call().session, name))

@@ -1,6 +1,6 @@
-"""Services sampled while somebody listens: the source's side of streams.
+"""Samples services while they have listeners: the source's side of streams.
 
-However many listen, a service is called once a tick, its answer encoded once, and put once for each rate.
+Whatever the number of listeners, a service is called once a tick, its result encoded once, and sent once per rate.
 """
 
 import logging
@@ -26,16 +26,16 @@ from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, Ser
 
 
 class Pace:
-    """At most so many a second, by the source's clock."""
+    """A rate limit, by the source's clock."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(1e9 / hz)
         self._slack_ns = self._period_ns // 2
-        """A source is never quite on time: so much too early is on time, too."""
+        """A source is never exactly on time: a sample this much too early counts as on time."""
         self._due_ns: int | None = None
 
     def takes(self, at_ns: int) -> bool:
-        """Whether the sample of that moment is one of those."""
+        """Whether a sample of that time is within the rate."""
         due_ns = at_ns if self._due_ns is None else self._due_ns
         if at_ns + self._slack_ns < due_ns:
             return False
@@ -48,22 +48,22 @@ _logger = logging.getLogger("trade")
 LEAST_HZ: Final = 0.001
 MOST_HZ: Final = 1000.0
 LEASE_S: Final = 10.0
-"""Who has not said again for so long that it listens is taken for gone."""
+"""A listener that has not renewed its request for this long counts as gone."""
 SIGN_S: Final = 1.0
-"""What does not change is put once in a while all the same."""
+"""An unchanged value is still published this often."""
 _PATIENCE_S: Final = 10.0
 """How long a sample may take."""
 _MOST: Final = 10_000
-"""So many may listen to one service."""
+"""The largest number of listeners of one service."""
 _MOST_RATES: Final = 64
-"""At so many different rates."""
+"""The largest number of different rates of one service."""
 
 Listener = tuple[str, str]
 """Session and name."""
 
 
 class StreamHost(Protocol):
-    """What streams need of their container."""
+    """The functions of a container that streams use."""
 
     @property
     def address(self) -> Address: ...
@@ -74,31 +74,31 @@ class StreamHost(Protocol):
 
 
 class RateRequest(Struct, frozen=True):
-    """What one listener would like to have."""
+    """The request of one listener."""
 
     identity: str
     hz: float
     on_change: bool
     until_ns: int = 0
-    """When its lease ends."""
+    """The end of its lease."""
 
 
 class ActiveRate(NamedTuple):
-    """What all who want the same rate would like to have."""
+    """The combined requests for one rate."""
 
     always: bool
-    """Somebody wants more than changes."""
+    """Some listener wants more than changes."""
     newly: bool
-    """Somebody wants a sample now."""
+    """Some listener wants a sample now."""
 
 
 def period_ns(hz: float) -> int:
-    """Of a rate."""
+    """The period of a rate."""
     return int(1e9 / hz)
 
 
 class _Rate:
-    """What is put for all who want so many samples a second. Used by the scheduler only."""
+    """The publication of samples at one rate. Used by the scheduler only."""
 
     def __init__(self, hz: float, publisher: Publisher) -> None:
         self._pace = Pace(hz)
@@ -109,14 +109,14 @@ class _Rate:
         self._put_ns = 0
 
     def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: ActiveRate, every_ns: int) -> None:
-        """Put it, unless that would be too soon, or nothing new to those who want changes only.
+        """Publish a sample, unless it is too soon, or unchanged for listeners of changes only.
 
         Args:
-            answer: whether the service failed, and what it answered.
-            at: ``time.time()`` when it was asked.
+            answer: whether the service failed, and its result.
+            at: ``time.time()`` of the call.
             at_ns: the monotonic clock at that moment.
-            wished: how.
-            every_ns: how often it is asked.
+            wished: the requests for this rate.
+            every_ns: the period of sampling.
         """
         stale = at_ns - self._put_ns >= SIGN_S * 1e9
         if not (wished.newly or stale or wished.always or answer != self._put):
@@ -133,7 +133,7 @@ class _Rate:
 
 
 class Source:
-    """A service of this container that is listened to, or once was. Done by the scheduler: never twice at once."""
+    """A service of this container with or without listeners. Run by the scheduler: never twice at once."""
 
     def __init__(
         self,
@@ -150,30 +150,30 @@ class Source:
         self._lock = threading.Lock()
         self._wishes: dict[Listener, RateRequest] = {}
         self._new: set[float] = set()
-        """Rates at which somebody wants a sample at once."""
+        """Rates at which a listener wants a sample at once."""
         self._rates: dict[float, _Rate] = {}
         self._next_ns = 0
         self._problem = ""
 
     def show(self) -> None:
-        """Put up the signs by which listeners see what rates reach them."""
+        """Publish the signs that show listeners which rates reach them."""
         for hz in STEPS_HZ:
             self._shown.callback(self._transport.appear(stream_key(self._key, hz)).close)
 
     def wish(self, listener: Listener, wish: RateRequest) -> bool:
-        """Somebody listens from now on, or still does; whether it is another wish than before.
+        """Add or renew a listener; returns whether its request has changed.
 
         Raises:
-            ConfigurationError: too many listen, or at too many rates.
+            ConfigurationError: too many listeners, or too many rates.
         """
         where = f"{self._key.domain}.{self._key.name}"
         with self._lock:
             before = self._wishes.get(listener)
             if before is None and len(self._wishes) >= _MOST:
-                raise ConfigurationError(where=where, problem=f"{_MOST} listen to it already")
+                raise ConfigurationError(where=where, problem=f"it has {_MOST} listeners already")
             rates = {other.hz for other in self._wishes.values()}
             if wish.hz not in rates and len(rates) >= _MOST_RATES:
-                problem = f"it is listened to at {_MOST_RATES} different rates already; ask for one of {sorted(rates)}"
+                problem = f"it is sampled at {_MOST_RATES} different rates already; ask for one of {sorted(rates)}"
                 raise ConfigurationError(where=where, problem=problem)
             self._wishes[listener] = wish
             new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
@@ -182,17 +182,17 @@ class Source:
             return new
 
     def drop(self, which: Callable[[Listener, RateRequest], bool]) -> None:
-        """Those listen no more."""
+        """Remove listeners."""
         with self._lock:
             self._wishes = {who: wish for who, wish in self._wishes.items() if not which(who, wish)}
 
     def identities(self) -> set[str]:
-        """Of those who listen."""
+        """The identities of the listeners."""
         with self._lock:
             return {wish.identity for wish in self._wishes.values()}
 
     def tick(self) -> int | None:
-        """Sample it if anybody still listens; when to do so again."""
+        """Sample the service if it has listeners; returns the time of the next tick."""
         now = time.monotonic_ns()
         self.drop(lambda _, wish: wish.until_ns <= now)
         service = self._services(self._key)
@@ -211,14 +211,14 @@ class Source:
         return self._after(now, every_ns)
 
     def _wished(self) -> dict[float, ActiveRate]:
-        """By rate."""
+        """The combined requests by rate."""
         with self._lock:
             new, self._new = self._new, set[float]()
             always = {wish.hz for wish in self._wishes.values() if not wish.on_change}
             return {wish.hz: ActiveRate(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
 
     def _keep_only(self, wished: dict[float, ActiveRate]) -> None:
-        """Put at these rates, and at no others any more."""
+        """Publish at these rates only."""
         for hz in [hz for hz in self._rates if hz not in wished]:
             self._rates.pop(hz).close()
         for hz in wished:
@@ -226,7 +226,7 @@ class Source:
                 self._rates[hz] = _Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
 
     def _after(self, now: int, period_ns: int) -> int:
-        """The next tick; those that have passed meanwhile are left out, and one out of turn moves no others."""
+        """The time of the next tick; missed ones are left out, and an extra tick shifts no others."""
         self._next_ns = min(self._next_ns or now, now + period_ns)
         ended = time.monotonic_ns()
         if self._next_ns <= ended:
@@ -234,15 +234,15 @@ class Source:
         return self._next_ns
 
     def _sampled(self, service: LocalService, now: int) -> tuple[bool, bytes]:
-        """Whether it failed, and what it answered: called as by its own container, behind its own locks and turns."""
+        """Whether the service failed, and its result: called as by its own container, with its own locks and queue."""
         own = self._key.address
         until_ns = now + int(_PATIENCE_S * 1e9)
         context = CallContext(self._new_id(), service.label, own.identity, str(own), until_ns)
         try:
             answer = service.signature.encode_result(service.label, _in_turn(service, context))
-        except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to who listens
+        except BaseException as error:  # noqa: BLE001 - every error of a provider goes to the listeners
             info = structs.replace(service.failure(error, EMPTY_ARGUMENTS), traceback="")
-            if info.type != self._problem:  # the same again says nothing new, however long it has lasted by now
+            if info.type != self._problem:  # the same error again is not news
                 _logger.warning("%s fails while it is listened to: %s: %s", service.label, info.type, info.message)
             self._problem = info.type
             return True, encode_message(info)
@@ -250,7 +250,7 @@ class Source:
         return False, answer
 
     def close(self) -> None:
-        """Sample it no more; the last tick lets go of its keys. Idempotent."""
+        """Stop sampling; the last tick releases the keys. Idempotent."""
         self.drop(lambda _listener, _wish: True)
         self._shown.close()
 
@@ -287,24 +287,24 @@ class Streams:
         self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
 
     def listen(self, handle: Handle, listener: Listener, wish: RateRequest) -> None:
-        """Sample a service of this container for somebody from now on, for as long as the lease.
+        """Sample a service of this container for a listener, for as long as the lease.
 
         Raises:
-            AccessDenied: the policy does not let it read the service.
-            ConfigurationError: that is no service of this container which can be listened to.
+            AccessDenied: the policy does not let the listener read the service.
+            ConfigurationError: not a service of this container that can be sampled.
             ServiceGone: it was deregistered.
         """
         key = handle.key
         service = self._services(key)
         if key.address != self._home.address:
-            raise ConfigurationError(where=handle.label, problem=f"it is no service of container {self._home.name}")
+            raise ConfigurationError(where=handle.label, problem=f"it is not a service of container {self._home.name}")
         if service is None:
             raise ServiceGone(service=handle.label)
         check_sampled(handle)
         self._home.require_call(wish.identity, handle)
         source, again = self._source(key)
         until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
-        in_key = float(f"{wish.hz:g}")  # what differs less than that is one rate
+        in_key = float(f"{wish.hz:g}")  # smaller differences are one rate
         if source.wish(listener, structs.replace(wish, hz=in_key, until_ns=until_ns)):
             again(time.monotonic_ns())
 
@@ -323,15 +323,15 @@ class Streams:
         return known
 
     def unlisten(self, listener: Listener) -> None:
-        """It listens no more."""
+        """Remove a listener."""
         self._drop(lambda who, _wish: who == listener)
 
     def session_ended(self, session: str) -> None:
-        """Nobody of it is there any more."""
+        """Remove the listeners of a session that ended."""
         self._drop(lambda who, _wish: who[0] == session)
 
     def recheck_access(self) -> None:
-        """Who may read what has changed: those who may no longer are dropped, and refused when they ask again."""
+        """Drop the listeners that may no longer read a service; they are refused when they renew."""
         with self._lock:
             sources = list(self._sources.items())
         for key, (source, _) in sources:
@@ -352,7 +352,7 @@ class Streams:
             source.drop(which)
 
     def changed(self, change: Change) -> None:
-        """Told by the registry."""
+        """Called by the registry."""
         for record in change.left:
             with self._lock:
                 gone = self._sources.pop(record.key, None) if record.local else None
@@ -360,7 +360,7 @@ class Streams:
                 gone[0].close()
 
     def close(self) -> None:
-        """Sample nothing more. Idempotent."""
+        """Stop all sampling. Idempotent."""
         with self._lock:
             sources = list(self._sources.values())
             self._sources.clear()
@@ -369,12 +369,12 @@ class Streams:
 
 
 def check_sampled(handle: Handle) -> None:
-    """Raises ConfigurationError: it cannot be listened to."""
+    """Raises ConfigurationError: the service cannot be sampled."""
     info = handle.record.info
     if info.effect != "read":
-        problem = f"it does not only read (effect={info.effect!r}), so it is not called again and again for listeners"
+        problem = f"it does not only read (effect={info.effect!r}), so it cannot be called repeatedly for listeners"
         raise ConfigurationError(where=handle.label, problem=problem)
     required = [parameter.name for parameter in info.parameters if parameter.required]
     if required:
-        problem = f"it needs {', '.join(required)}; only what needs no arguments can be listened to"
+        problem = f"it needs {', '.join(required)}; only a service without required arguments can be listened to"
         raise ConfigurationError(where=handle.label, problem=problem)

@@ -1,4 +1,4 @@
-"""The listener's side of streams: what somebody hears of one service, kept until it is taken."""
+"""The listener's side of streams: the samples of one service, kept until they are taken."""
 
 import asyncio
 import contextlib
@@ -25,19 +25,19 @@ If = Callable[[Any], object]
 
 
 class _Heard(NamedTuple):
-    """A sample that waits to be taken."""
+    """A sample that has not been taken yet."""
 
     sample: Sample
     missed: int
-    """How many were missed on the way since the stream began."""
+    """How many were lost in transit since the stream began."""
 
 
 class Stream:
-    """Samples of one service, as they come: iterate over it, in a thread or with ``async for``, or ask for `latest`.
+    """Samples of one service: iterate over it, in a thread or with ``async for``, or read `latest`.
 
-    Made by `Container.stream`; a context manager, also of asyncio. Who takes them too slowly has the newest, and each
-    sample says how many are missing before it. While its source cannot be reached nothing comes; when the same
-    container is back, so are its samples.
+    Made by `Container.stream`; a context manager, also of asyncio. A slow reader gets the newest samples, and each
+    sample says how many are missing before it. No samples come while the source is unreachable; when the same container
+    is back, the stream continues.
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class Stream:
         ended: Callable[["Stream"], None],
     ) -> None:
         self.name: Final = name
-        """Names it among the listeners of its container."""
+        """Identifies it among the streams of its container."""
         self.source: Final = source
         """The service."""
         self.hz = hz
-        """How many samples a second at most: what was asked for, or fewer if a gateway lets no more pass."""
+        """The largest number of samples a second: as requested, or fewer if a gateway limits the rate."""
         self.on_change: Final = on_change
         self.opened_by: Final = opened_by
-        """The session that it ends with; none: its container."""
+        """The session that it ends with; None: its container."""
         self._decode = decode
         self._if = if_
         self._tell_ended = ended
@@ -69,7 +69,7 @@ class Stream:
         self._waiting: deque[_Heard | BaseException] = deque()
         self._keep = keep
         self._body: tuple[bool, bytes] | None = None
-        """What was heard last, of those that are its own."""
+        """The last message received that is its own."""
         self._number = self._missed = self._told = self._overflowed = 0
         self._latest: Sample | BaseException | None = None
         self._end: BaseException | None = None
@@ -80,19 +80,19 @@ class Stream:
     # --- taking
 
     def next(self, timeout_s: float | None = None) -> Sample:
-        """The oldest sample that was not taken yet; waits for one.
+        """The oldest sample not taken yet; waits for one.
 
         Args:
-            timeout_s: give up after so many seconds; by default one waits as long as the stream stands.
+            timeout_s: how long to wait, in seconds; by default as long as the stream is open.
 
         Raises:
-            TimeoutError: none came in time.
+            TimeoutError: no sample came in time.
             ServiceGone: the service was deregistered.
-            SourceLost: its container cannot be reached; said once, and samples come again when it is back.
+            SourceLost: its container is unreachable; raised once, and samples continue when it is back.
             AccessDenied: the policy no longer lets this container read the service.
             SessionEnded: the session that opened it was closed.
             ConfigurationError: the stream was closed.
-            Exception: what the service itself raises, for each sample at which it does.
+            Exception: the error of the service itself, for each sample that failed.
         """
         taken: list[Sample] = []
 
@@ -106,11 +106,11 @@ class Stream:
         return taken[0]
 
     async def anext(self) -> Sample:
-        """`next` from asyncio, without a time limit of its own."""
+        """`next` for asyncio, without a time limit of its own."""
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
-            with contextlib.suppress(RuntimeError):  # that loop has ended
+            with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(woken.set)
 
         self.tell(wake)
@@ -123,11 +123,11 @@ class Stream:
         return taken
 
     def tell(self, more: Callable[[], None]) -> None:
-        """Have this called whenever there is more to take, or nothing more will come; it must not wait."""
+        """Have a function called whenever there is more to take, or the stream ends; it must not block."""
         self._told_of_more.add(more)
 
     def take(self) -> Sample | None:
-        """The oldest sample that was not taken yet, None if there is none now. Raises like `next`."""
+        """The oldest sample not taken yet, None if there is none now. Raises like `next`."""
         with self._lock:
             if not self._waiting:
                 if self._end is not None:
@@ -141,10 +141,10 @@ class Stream:
         return msgspec.structs.replace(heard.sample, dropped=dropped) if dropped else heard.sample
 
     def latest(self) -> Sample | None:
-        """The newest sample, None before the first; takes nothing and waits for nothing.
+        """The newest sample, None before the first; neither takes nor waits.
 
         Raises:
-            Exception: like `next`, if what was heard last is no sample; for as long as that is so.
+            Exception: like `next`, for as long as the last message is not a sample.
         """
         latest = self._end or self._latest
         if isinstance(latest, BaseException):
@@ -171,23 +171,23 @@ class Stream:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will come."""
+        """Whether no more samples will come."""
         return self._end is not None
 
     @property
     def why_ended(self) -> BaseException | None:
-        """What `next` raises once all was taken, if it has ended."""
+        """The error that `next` raises once all samples were taken, if the stream has ended."""
         return self._end
 
     def close(self) -> None:
-        """Listen no more; what was not taken is gone. Idempotent."""
+        """Stop listening and discard samples not taken. Idempotent."""
         self._closed = True
         with self._lock:
             self._waiting.clear()
         self.end(ConfigurationError(where=self.source.label, problem="this stream was closed; open another one"))
 
     def end(self, why: BaseException) -> None:
-        """Told by the container: nothing more will come. What has come can still be taken."""
+        """Called by the container: no more samples come. Those already here can still be taken."""
         with self._lock:
             if self._end is not None:
                 return
@@ -196,7 +196,7 @@ class Stream:
         self._tell_ended(self)
 
     def session_ended(self, session: str) -> None:
-        """Told by the container."""
+        """Called by the container."""
         if self.opened_by is not None and self.opened_by.name == session:
             self.end(SessionEnded(session=session, reason="it was closed"))
 
@@ -218,8 +218,8 @@ class Stream:
     # --- hearing
 
     def hear(self, message: StreamSample) -> None:
-        """Told by the container: the source has put this."""
-        if self._number:  # a lower number: the source counts anew
+        """Called by the container: a message of the source."""
+        if self._number:  # a lower number: the source started to count again
             self._missed += max(0, message.number - self._number - 1)
         self._number = message.number
         body = (message.failed, bytes(message.body))
@@ -228,11 +228,11 @@ class Stream:
         self._body = body
         try:
             heard = self._read(message)
-        except Exception as bad:  # noqa: BLE001 - of the condition, which is the listener's own
+        except Exception as bad:  # noqa: BLE001 - from the condition, which is the listener's own
             heard = bad
         if heard is not None:
             self.add(heard)
-        elif isinstance(self._latest, BaseException):  # it is over
+        elif isinstance(self._latest, BaseException):  # the error is over
             self._latest = None
 
     def _read(self, message: StreamSample) -> Sample | BaseException | None:
@@ -249,16 +249,16 @@ class Stream:
         return Sample(value=value, at=message.at, at_ns=message.at_ns, number=message.number)
 
     def at_rate(self, hz: float) -> None:
-        """Told by the container: what comes now are samples of that rate, which are counted for themselves."""
+        """Called by the container: later samples have that rate, and their own count."""
         self.hz, self._number = hz, 0
 
     def lost(self, error: BaseException) -> None:
-        """Told by the container: the source is out of reach. What it says when it is back is news, changed or not."""
+        """Called by the container: the source is unreachable. Its next sample is reported, changed or not."""
         self._body = None
         self.add(error)
 
     def add(self, heard: Sample | BaseException) -> None:
-        """Keep it until it is taken; the oldest goes if there are too many."""
+        """Keep a sample until it is taken; drop the oldest if there are too many."""
         with self._lock:
             if self._end is not None:
                 return

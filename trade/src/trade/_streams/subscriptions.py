@@ -1,7 +1,7 @@
-"""What one container hears of streams: a subscription and a thread for each, which asks its source to go on.
+"""The streams that one container receives: a subscription and a thread for each, which renews its request.
 
-Between it and the source there may be gateways that let only lower rates pass. What passes the listener sees by the
-signs that reach it, and then asks for no more than that.
+Gateways on the way may forward lower rates only. The signs that arrive show a listener which rates pass, and it
+requests no more than those.
 """
 
 import contextlib
@@ -30,15 +30,15 @@ from trade.errors import AccessDenied, ServiceGone, SessionEnded, SourceLost, Tr
 _logger = logging.getLogger("trade")
 
 AGAIN_S: Final = 2.0
-"""How often a listener says that it still listens: often enough for the lease at the source, and to be back soon."""
+"""How often a listener renews its request: often enough for the source's lease, and for a quick return."""
 _DEADLINE_S: Final = 5.0
 _SIGNS_S: Final = 1.0
 _RING: Final = 64
-"""So many messages at least are kept while a whole process stands still."""
+"""The least number of messages kept while the whole process is suspended."""
 
 
 class _Subscription:
-    """One stream's subscription, and its word to the source."""
+    """The subscription of one stream, and its requests to the source."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class _Subscription:
         return self._transport.subscribe(stream_key(self._stream.source.key, hz), newest=self._keep)
 
     def begin(self) -> None:
-        """Ask the source for samples, and hear them from now on. Raises what it answers."""
+        """Request samples from the source, and receive them. Raises the source's errors."""
         try:
             self._ask()
         except BaseException:
@@ -75,7 +75,7 @@ class _Subscription:
         self._due.at(time.monotonic_ns() + int(AGAIN_S * 1e9))
 
     def ask_now(self) -> None:
-        """The source is there again."""
+        """The source is reachable again."""
         self._due.at(time.monotonic_ns())
 
     def _ask(self) -> None:
@@ -89,7 +89,7 @@ class _Subscription:
                 self._function("listen")(stream.name, stream.source, stream.hz, stream.on_change)
 
     def _passing_hz(self) -> float:
-        """The rate that is wanted, unless a gateway lets only some below it pass; as it is if none is seen to."""
+        """The requested rate, or the highest one that gateways let pass; unchanged if no sign has arrived."""
         wanted = self._wanted_hz
         if not self._transport.bridged():
             return wanted
@@ -118,14 +118,14 @@ class _Subscription:
     def _again(self) -> int | None:
         if self._stream.ended:
             return None
-        if self._stream.source.alive:  # else the registry will tell
+        if self._stream.source.alive:  # else the registry will report it
             try:
                 self._ask()
             except (AccessDenied, SessionEnded) as error:
                 self._stream.end(error)
                 return None
-            except (TradeError, ChannelClosed) as error:  # lost on the way, say: next time
-                _logger.debug("%r was not asked for again: %s", self._stream, error)
+            except (TradeError, ChannelClosed) as error:  # perhaps lost in transit: next time
+                _logger.debug("the request for %r was not renewed: %s", self._stream, error)
         return time.monotonic_ns() + int(AGAIN_S * 1e9)
 
     def _read(self) -> None:
@@ -141,7 +141,7 @@ class _Subscription:
                 self._malformed(bad)
 
     def close(self) -> None:
-        """Listen no more, and tell the source if it can be told; what it does not hear its lease ends."""
+        """Stop listening, and inform the source if it is reachable; otherwise its lease expires."""
         self._due.cancel()
         with self._lock:
             self._closed = True
@@ -173,12 +173,12 @@ class Subscriptions:
         self._lock = threading.Lock()
         self._subscriptions: dict[str, tuple[Stream, _Subscription]] = {}
         self.malformed = 0
-        """Samples that were none."""
+        """The number of invalid samples."""
 
     def open(
         self, source: Handle, hz: float, *, on_change: bool, if_: If | None, keep: int, opened_by: Session | None
     ) -> Stream:
-        """Listen: subscribed first, asked for then, so that nothing is missed. Raises what the source answers."""
+        """Open a stream: subscribes before it requests, so that no sample is missed. Raises the source's errors."""
         stream = Stream(
             f"{self._home.address.epoch}.s{next(self._numbers)}",
             source,
@@ -208,7 +208,7 @@ class Subscriptions:
         return stream
 
     def _ended(self, stream: Stream) -> None:
-        """Told by a stream."""
+        """Called by a stream."""
         with self._lock:
             _, ear = self._subscriptions.pop(stream.name, (stream, None))
         if ear is not None:
@@ -220,7 +220,7 @@ class Subscriptions:
             _logger.warning("dropped a sample: %s (further ones are counted, not logged)", bad)
 
     def changed(self, change: Change) -> None:
-        """Told by the registry."""
+        """Called by the registry."""
         if not self._subscriptions:
             return
         came, went = {record.key for record in change.joined}, {record.key for record in change.left}
@@ -234,7 +234,7 @@ class Subscriptions:
                 stream.lost(SourceLost(service=label, container=key.address.container))
 
     def session_ended(self, session: str) -> None:
-        """Streams that were opened in it end with it."""
+        """End the streams that were opened in a session."""
         for stream, _ in self._all():
             stream.session_ended(session)
 

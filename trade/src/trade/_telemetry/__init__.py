@@ -1,1 +1,1 @@
-"""What a container measures of itself: spans, metrics, log lines, and load."""
+"""Measurements of a container: spans, metrics, log lines, and load."""

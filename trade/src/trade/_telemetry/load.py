@@ -1,4 +1,4 @@
-"""How busy a container is: its process, its host, the calls that others make to it."""
+"""The load of a container: its process, its host, and the calls that others make to it."""
 
 import os
 import threading
@@ -17,30 +17,30 @@ _STAT: Final = Path("/proc/stat")
 
 
 class LoadInfo(Struct, frozen=True):
-    """How busy a container is; None is what its system does not tell.
+    """The load of a container; None where its operating system does not report a value.
 
     Rates and percentages are means over the last ``over_s`` seconds.
     """
 
     container: str
     over_s: float
-    """A second at least, once it is that old: who asks every second or so is told of that second."""
+    """At least a second, once it is that old: a client that asks every second gets the values of that second."""
     cpu_percent: float
     """Of its process; 100 is one core."""
     host_cpu_percent: float | None
     """Of its host; 100 is all cores."""
     load_1min: float | None
-    """Processes of its host that run or want to, a mean of the last minute."""
+    """Processes of its host that run or wait for a core, a mean of the last minute."""
     cores: int
     memory_bytes: int | None
     """Of its process, resident."""
     calls: int
-    """That came from other containers since it started, stops and the middleware's own included."""
+    """Calls from other containers since the start, stops and the middleware's own included."""
     calls_per_s: float
     in_flight: int
-    """Of those, how many have a thread now: this question, too, and what was answered in the last moment."""
+    """Those of them that have a thread now, including this query and calls answered a moment ago."""
     queued: int
-    """Calls of serial services whose turn has not come."""
+    """Queued calls of serial services."""
     threads: int
 
 
@@ -49,12 +49,12 @@ class _Sample(Struct, frozen=True):
     process_s: float
     busy: int
     ticks: int
-    """Of the host, by its own clock; both 0 where it does not tell."""
+    """Of the host, by its own clock; both 0 where it does not report them."""
     calls: int
 
 
 class LoadMeter:
-    """Measures when it is asked, and costs nothing otherwise."""
+    """Measures on request, and costs nothing otherwise."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class LoadMeter:
         return sum(pool.working for pool in self._worker_pools())
 
     def read(self) -> LoadInfo:
-        """As it is now."""
+        """The current load."""
         with self._lock:
             now = self._sample()
             if now.at_s - self._last.at_s >= _WINDOW_S:
@@ -107,7 +107,7 @@ class LoadMeter:
 
 
 def _load_1min() -> float | None:
-    ask: Callable[[], tuple[float, float, float]] | None = getattr(os, "getloadavg", None)  # not everywhere
+    ask: Callable[[], tuple[float, float, float]] | None = getattr(os, "getloadavg", None)  # not on every system
     try:
         return None if ask is None else ask()[0]
     except OSError:
@@ -123,10 +123,10 @@ def resident_bytes() -> int | None:
 
 
 def _host_ticks() -> tuple[int, int]:
-    """Ticks that the cores of the host were busy, and all of them."""
+    """Ticks in which the cores of the host were busy, and all ticks."""
     try:
         with _STAT.open() as stat:
-            ticks = [int(word) for word in stat.readline().split()[1:9]]  # what comes then is counted in these already
+            ticks = [int(word) for word in stat.readline().split()[1:9]]  # these include the rest
     except (OSError, ValueError):
         return 0, 0
-    return sum(ticks) - sum(ticks[3:5]), sum(ticks)  # without idle and waiting for input
+    return sum(ticks) - sum(ticks[3:5]), sum(ticks)  # without idle and I/O wait

@@ -1,4 +1,4 @@
-"""What this process has logged lately, each line with the call it was logged in."""
+"""The latest log lines of this process, each with the call that it was logged in."""
 
 import logging
 import secrets
@@ -16,10 +16,10 @@ _PATIENCE_S: Final = 0.1
 
 
 class LogLine(Struct, frozen=True, kw_only=True):
-    """One line of the logger ``trade``, without tracebacks of what was logged with it."""
+    """One line of the logger ``trade``, without its traceback."""
 
     process: str
-    """Names the process; containers of one process tell the same lines."""
+    """Identifies the process; containers of one process report the same lines."""
     number: int
     """Counts the lines of the process, from 1."""
     at: float
@@ -27,11 +27,11 @@ class LogLine(Struct, frozen=True, kw_only=True):
     level: int
     text: str
     call_id: int
-    """The call it was logged in; 0 for none."""
+    """The call that logged it; 0 for none."""
     outer_id: int = 0
-    """The call that led to that one first of all: one id for all lines that come of it, in all processes."""
+    """The outermost call that led to it: one id for all lines that it causes, in all processes."""
     container: str = ""
-    """Who told of it."""
+    """The container that reported it."""
 
     @property
     def level_name(self) -> str:
@@ -42,7 +42,7 @@ class LogLine(Struct, frozen=True, kw_only=True):
 class Logbook(logging.Filter):
     """Sees each line of the logger that passes its level, and keeps the newest; lets all of them pass.
 
-    A filter and not a handler: with a handler, a program that has set up no logging would show nothing any more.
+    A filter and not a handler: with a handler, a program without a logging set-up would no longer show anything.
     """
 
     def __init__(self) -> None:
@@ -53,14 +53,14 @@ class Logbook(logging.Filter):
         self._count = 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Keep a line, and tell formatters its ``call_id`` and ``outer_id``."""
+        """Keep a line, and add ``call_id`` and ``outer_id`` for formatters."""
         call = running.get()
         call_id: int = getattr(record, "call_id", 0) or (0 if call is None else call.id)
         outer_id: int = getattr(record, "outer_id", 0)
         if not outer_id:
             outer_id = call_id if call is None or call.id != call_id else call.outer_id
         record.call_id, record.outer_id = call_id, outer_id
-        if self._lock.acquire(timeout=_PATIENCE_S):  # in a forked child nobody may be left to release it
+        if self._lock.acquire(timeout=_PATIENCE_S):  # in a forked child its holder may not exist
             try:
                 self._count += 1
                 self._lines.append(
@@ -79,7 +79,7 @@ class Logbook(logging.Filter):
         return True
 
     def lines(self, after: int = 0) -> list[LogLine]:
-        """Those kept with a higher number, oldest first."""
+        """The lines kept with a higher number, oldest first."""
         with self._lock:
             return [line for line in self._lines if line.number > after]
 
@@ -87,16 +87,16 @@ class Logbook(logging.Filter):
 def _text(record: logging.LogRecord) -> str:
     try:
         text = record.getMessage()
-    except Exception:  # noqa: BLE001 - arguments that do not fit; what writes the line says so
+    except Exception:  # noqa: BLE001 - arguments that do not match; the handler reports that
         text = str(record.msg)
     kind = record.exc_info[0] if record.exc_info else None
     return text if kind is None else f"{text} ({kind.__name__})"
 
 
 logbook: Final = Logbook()
-"""Of this process; it listens from its first container on."""
+"""The log buffer of this process; active from its first container on."""
 
 
 def listen() -> None:
-    """Keep what is logged from now on."""
+    """Keep lines from now on."""
     logging.getLogger("trade").addFilter(logbook)

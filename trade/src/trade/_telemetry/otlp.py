@@ -1,4 +1,4 @@
-"""Notes of calls, sent to a collector that speaks OTLP over HTTP, such as Jaeger or Tempo: an extra, off by default."""
+"""Exports spans to a collector over OTLP/HTTP, such as Jaeger or Tempo: an extra, off by default."""
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
 INSTALL: Final = 'needs OpenTelemetry; pip install "trade-core[otel]"'
 _ASKED: Final = 1 << 63
-"""Call ids are below it: the caller's note of a call has the call's id with this bit as its span id."""
+"""Call ids are below it: the caller's span of a call has the call's id with this bit as its span id."""
 _MOST: Final = 2048
-"""So many notes wait at most; while the collector is away the newest are lost."""
+"""The largest number of waiting spans; while the collector is unreachable the newest are lost."""
 _TIMEOUT_S: Final = 2.0
 _NS: Final = 1_000_000_000
 
 
 class Export:
-    """Turns notes into spans of OpenTelemetry and hands them on; never waits for a collector.
+    """Converts spans to OpenTelemetry's and exports them; never waits for a collector.
 
-    The id of a trace is made of that of the call that began it, a served call has its own id as span id.
+    The trace id is derived from the outermost call's id; a served call has its own id as span id.
 
     Args:
-        processor: of OpenTelemetry's SDK; closed with this.
-        about: attributes of the container that notes.
+        processor: of OpenTelemetry's SDK; closed with this object.
+        about: attributes of the container that records the spans.
     """
 
     def __init__(self, processor: "SpanProcessor", about: Mapping[str, str]) -> None:
@@ -41,7 +41,7 @@ class Export:
         self._scope = InstrumentationScope("trade")
 
     def tell(self, span: Span) -> None:
-        """Hand a note on."""
+        """Export a span."""
         from opentelemetry.sdk.trace import Event, ReadableSpan  # noqa: PLC0415
         from opentelemetry.trace import SpanContext, SpanKind, Status, StatusCode, TraceFlags  # noqa: PLC0415
 
@@ -75,17 +75,17 @@ class Export:
         )
 
     def close(self) -> None:
-        """Send what waits, for a few seconds at most."""
+        """Send waiting spans, for a few seconds at most."""
         self._processor.shutdown()
 
 
 def trace_id(call_id: int) -> int:
-    """The trace of an outermost call, the same in every container: all 128 bits look random, as samplers expect."""
+    """The trace id of an outermost call, the same in every container: all 128 bits look random, as samplers expect."""
     return int.from_bytes(blake2b(call_id.to_bytes(8, "big"), digest_size=16).digest(), "big")
 
 
 def span_ids(span: Span) -> tuple[int, int]:
-    """Its span id and that of what led to it, 0 for nothing: the call around it, and in between who asked from afar."""
+    """The span id, and the parent's, 0 for none: the call around it or, for a remote call, the caller's span."""
     led = span.calls[0] if span.calls else 0
     if span.side == "asked":
         return span.call_id | _ASKED, led
@@ -93,7 +93,7 @@ def span_ids(span: Span) -> tuple[int, int]:
 
 
 def open_export(settings: Settings, own: Address, leaving: ExitStack) -> Callable[[Span], None] | None:
-    """What to tell notes to, if they are to be sent to a collector; what ends that goes onto the stack.
+    """The receiver of spans if they are to be exported to a collector; its closing goes onto the stack.
 
     Raises:
         ConfigurationError: the extra is not installed.

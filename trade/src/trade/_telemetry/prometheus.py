@@ -1,4 +1,4 @@
-"""``/metrics`` for Prometheus: an extra, off by default. Everything is read when it is asked for."""
+"""``/metrics`` for Prometheus: an extra, off by default. All values are read at each request."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 INSTALL: Final = 'needs prometheus-client; pip install "trade-core[metrics]"'
 _PREFIX: Final = "trade_"
 _MOST_CONNECTIONS: Final = 32
-"""At once; each has a thread until it has been answered."""
+"""The most simultaneous connections; each has a thread until it is answered."""
 _ASKED_WITHIN_S: Final = 5.0
-"""How long a connection may say nothing."""
+"""How long a connection may send nothing."""
 
 
 class Metrics:
     """A collector of prometheus-client.
 
     Args:
-        container: a label of all.
-        calls: what is counted of calls.
-        measures: everything else.
+        container: a label of all metrics.
+        calls: counters of calls.
+        measures: all other values.
     """
 
     def __init__(self, container: str, calls: CallCounters, measures: Callable[[], Iterable[Measure]]) -> None:
@@ -37,7 +37,7 @@ class Metrics:
         self._measures = measures
 
     def collect(self) -> "Iterator[Metric]":
-        """All of it, as it is now."""
+        """All metrics with their current values."""
         from prometheus_client.core import (  # noqa: PLC0415 - an extra
             CounterMetricFamily,
             GaugeMetricFamily,
@@ -55,7 +55,7 @@ class Metrics:
             took.add_metric((self._container, label), list(buckets), timed.sum_ns / 1e9)
             failed.add_metric((self._container, label), timed.failures)
         refused = CounterMetricFamily(
-            f"{_PREFIX}refusals", "What was refused, by the type of the error.", labels=("container", "reason")
+            f"{_PREFIX}refusals", "Refused calls, by the type of the error.", labels=("container", "reason")
         )
         for reason, count in sorted(self._calls.refusals().items()):
             refused.add_metric((self._container, reason), count)
@@ -74,7 +74,7 @@ class Metrics:
 def open_metrics(
     settings: Settings, calls: CallCounters | None, measures: Callable[[], Iterable[Measure]], leaving: ExitStack
 ) -> int:
-    """Serve ``/metrics`` if that is wanted; what ends it goes onto the stack. Returns the port, 0 if it is not.
+    """Serve ``/metrics`` if configured; its closing goes onto the stack. Returns the port, 0 if not configured.
 
     Raises:
         ConfigurationError: the extra is not installed, or the port is taken.

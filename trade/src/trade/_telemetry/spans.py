@@ -1,4 +1,4 @@
-"""What a container notes of calls while it is traced: what was called for whom, when, how long, how it ended."""
+"""Spans of the calls of a traced container: what was called, for whom, when, for how long, with what outcome."""
 
 import itertools
 import time
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from trade._resources.lock_table import LockTable
 
 MOST: Final = 10_000
-"""So many spans a container keeps: the newest."""
+"""The number of spans that a container keeps: the newest."""
 _LOCKING: Final = frozenset(("acquire", "release"))
-"""Of the middleware's own functions, those that belong to what a program does."""
+"""The middleware's own functions whose calls are part of a program's work."""
 
 
 class Span(Struct, frozen=True, kw_only=True):
-    """One call, as the container noted it that asked for it or that served it. Without arguments and results."""
+    """One call, recorded by its caller's container or by its provider's. Without arguments and results."""
 
     call_id: int
     calls: tuple[int, ...]
@@ -34,26 +34,26 @@ class Span(Struct, frozen=True, kw_only=True):
     service: str
     side: Literal["asked", "served"]
     container: str
-    """The one that noted it."""
+    """The container that recorded it."""
     caller: str
-    """Identity of who asked."""
+    """Identity of the caller."""
     session: str
     began: float
     """``time.time()`` of that container's host."""
     waited_s: float = 0.0
-    """In the queue of a serial provider, for who called from another container; it had not begun then."""
+    """Time in the queue of a serial provider, for a remote call; ``began`` excludes it."""
     took_s: float
-    """From ``began`` to its end; what is called before and after it included."""
+    """From ``began`` to the end, hooks included."""
     outcome: str
     """``ok``, or the type of its error."""
     locks: tuple[str, ...] = ()
-    """The locks it ran under in that container: what for, and whose."""
+    """The locks it ran under in that container: purpose and owner."""
     events: tuple[tuple[float, str], ...] = ()
-    """What was noted of it, and how many seconds after it began."""
+    """Events during the call, each with the seconds since it began."""
     remote: bool = False
     """Whether it was ``served`` for another container."""
     number: int = 0
-    """Counted from 1 in the container that noted it."""
+    """Counted from 1 in the container that recorded it."""
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -62,12 +62,12 @@ class Span(Struct, frozen=True, kw_only=True):
 
 
 def traceable(key: ServiceKey) -> bool:
-    """Whether calls of a service are noted at all."""
+    """Whether calls of a service are recorded at all."""
     return key.domain != DOMAIN or key.name in _LOCKING
 
 
 class Spans:
-    """Owns what one container noted."""
+    """Owns the spans of one container."""
 
     def __init__(
         self,
@@ -81,15 +81,15 @@ class Spans:
         self._identity = identity
         self._session = session
         self.locks = locks
-        """What those tokens stand for here."""
+        """Describes the locks of tokens."""
         self._tell = tell
-        """Told of each span."""
+        """Called with each span."""
         self._lock = Lock()
         self._kept: deque[Span] = deque(maxlen=MOST)
         self._noted = 0
 
     def asked(self, call_id: int, service: str, request: Request, error: BaseException | None) -> None:
-        """A call of this container to another one has ended."""
+        """Record the end of a call to another container."""
         now_ns = time.monotonic_ns()
         took_s = (now_ns - request.deadline_ns) / 1e9 + request.deadline_s
         inherited = request.inherited
@@ -118,7 +118,7 @@ class Spans:
         locks: Sequence[str],
         error: BaseException | None,
     ) -> None:
-        """A call to this container has ended."""
+        """Record the end of a call to this container."""
         ongoing = context.ongoing
         queued_ns = 0 if ongoing is None else ongoing.queued_ns
         self._keep(
@@ -149,7 +149,7 @@ class Spans:
             self._tell(span)
 
     def kept(self, calls: Collection[int] | None = None, after: int = 0) -> list[Span]:
-        """What is kept above that number, oldest first; of these calls and those that they led to, or of all."""
+        """Spans with higher numbers, oldest first; of these calls and those that they led to, or of all."""
         with self._lock:
             old = max(0, after - self._noted + len(self._kept))
             kept = list(itertools.islice(self._kept, old, None))
@@ -157,16 +157,16 @@ class Spans:
 
 
 class SpanRecorder(Interceptor):
-    """Notes a span of each call while the service is traced."""
+    """Records a span of each call while the service is traced."""
 
     def __init__(self, spans: Spans) -> None:
         self._spans = spans
 
     def run(self, call: ServedCall, proceed: Callable[[], Any]) -> Any:
-        """Call the service and note that. Its errors pass."""
+        """Call the service and record a span. Its errors pass through."""
         context = call.context
         structs.force_setattr(context, "events", [])
-        calls = ancestors(context)  # it forgets them when it ends
+        calls = ancestors(context)  # the context forgets them at its end
         locks = self._spans.locks(context.tokens) if context.tokens else ()
         began, began_ns = time.time(), time.monotonic_ns()
         failed: BaseException | None = None
@@ -177,11 +177,11 @@ class SpanRecorder(Interceptor):
             raise
         finally:
             self._spans.served(context, calls, began, began_ns, locks, failed)
-            del failed  # it knows this frame
+            del failed  # it refers to this frame
 
 
 def ancestors(context: CallContext) -> tuple[int, ...]:
-    """The calls that led to one that runs, nearest first."""
+    """The calls that led to a running one, nearest first."""
     return () if context.behalf is None else context.behalf.calls
 
 
@@ -190,7 +190,7 @@ def _outcome(error: BaseException | None) -> str:
 
 
 def new_spans(own: Address, session: str, table: "LockTable", tell: Callable[[Span], None] | None) -> Spans:
-    """For a container, which tells of each as well, if asked; its process keeps what it logs from now on."""
+    """The spans of a container; also starts the log buffer of its process."""
     listen()
 
     def purposes(tokens: Sequence[Token]) -> list[str]:

@@ -1,4 +1,4 @@
-"""What two systems share: `Border` offers chosen groups of each in the other. ``trade gateway`` does it by a file."""
+"""Federation: `Border` offers chosen groups of each of two systems in the other; ``trade gateway`` uses it."""
 
 from trade.sharing._border import SHARED_FROM, Border
 

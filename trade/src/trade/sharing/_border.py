@@ -1,4 +1,4 @@
-"""A border between two systems: what of each is offered in the other, through a container in each of them."""
+"""Federates two systems: offers services of each in the other, through a container in each of them."""
 
 import contextlib
 import logging
@@ -36,22 +36,22 @@ _logger = logging.getLogger("trade")
 
 _PARTING_S: Final = 5.0
 SHARED_FROM: Final = "shared_from"
-"""Metadata of what is at home in another system: its name. What has it is shared no further."""
+"""Metadata of a provider of another system: the name of its system. Such a provider is not shared any further."""
 
 
 class Border:
-    """Two systems that share some of what they offer; each container acts in its system for the other one's clients.
+    """Federates two systems that share some services; each container acts in its system for the other's clients.
 
-    A context manager; `close` withdraws everything. The containers stay open: they are their makers'.
+    A context manager; `close` withdraws everything. The containers stay open; their creators close them.
 
     Args:
         ours: a container of one system.
         theirs: a container of another one.
-        exported: groups of ours that theirs see and call; ``*`` is all.
-        imported: groups of theirs that ours see and call.
+        exported: groups of our system that the other one sees and calls; ``*`` is all.
+        imported: groups of the other system that ours sees and calls.
 
     Raises:
-        ConfigurationError: both are of one system.
+        ConfigurationError: both containers belong to one system.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Border:
     ) -> None:
         names = [one.settings.system for one in (ours, theirs)]
         if names[0] == names[1]:
-            problem = "a system shares nothing with itself; name another one"
+            problem = "a system cannot be shared with itself; name another one"
             raise ConfigurationError(where=f"share with {names[0]}", problem=problem)
         with ExitStack() as leaving:
             self.out = BorderDirection(ours, theirs, exported)
@@ -72,12 +72,12 @@ class Border:
             self._leaving = leaving.pop_all()
 
     def share(self, *, exported: Sequence[str], imported: Sequence[str]) -> None:
-        """Go by other lists from now on; what stays shared is not disturbed."""
+        """Replace the lists of groups; services that stay shared are not affected."""
         self.out.share(exported)
         self.back.share(imported)
 
     def close(self) -> None:
-        """Withdraw everything: what the clients of the other side set moving stops. Idempotent."""
+        """Withdraw everything, and stop the motion that clients of the other side started. Idempotent."""
         self._leaving.close()
 
     def __enter__(self) -> "Border":
@@ -88,19 +88,19 @@ class Border:
 
 
 class BorderDirection:
-    """What is at home in one system and offered in the other one."""
+    """The services of one system (home) that are offered in the other one (remote)."""
 
     reverse: "BorderDirection"
 
-    def __init__(self, home: Container, abroad: Container, groups: Sequence[str]) -> None:
+    def __init__(self, home: Container, remote: Container, groups: Sequence[str]) -> None:
         self._home = home
-        self._abroad = abroad
+        self._remote = remote
         self._groups = tuple(groups)
-        self._names = home.settings.system, abroad.settings.system
-        self._visitors = GuestSessions(abroad.federating, home, self._names[1])
+        self._names = home.settings.system, remote.settings.system
+        self._guests = GuestSessions(remote.federating, home, self._names[1])
         self._offered: dict[Exposed, _Offered] = {}
         self._origins: dict[Exposed, Exposed] = {}
-        """Places abroad -> at home."""
+        """From places in the remote system to places at home."""
         self._resources: WeakValueDictionary[tuple[Address, str], SharedResource] = WeakValueDictionary()
         self._refused: dict[Exposed, str] = {}
         self._codec = handle_codec(self._handle_out, self._handle_in)
@@ -110,9 +110,9 @@ class BorderDirection:
         self._thread = threading.Thread(target=self._keep, name=f"trade-share-{self._names[1]}", daemon=True)
 
     def begin(self) -> None:
-        """Offer what is there, and what comes. Returns when what is there is offered."""
-        self._leaving.callback(self._abroad.session_end.subscribe(self._visitors.ended))
-        self._leaving.callback(self._visitors.close)
+        """Offer current and future services. Returns when the current ones are offered."""
+        self._leaving.callback(self._remote.session_end.subscribe(self._guests.ended))
+        self._leaving.callback(self._guests.close)
         self._leaving.callback(self._withdraw_all)
         self._leaving.callback(self._home.registry.changes.subscribe(self._note))
         self._reconcile()
@@ -122,7 +122,7 @@ class BorderDirection:
         self._leaving.callback(self._home.estopping.unsubscribe, self._estop)
 
     def share(self, groups: Sequence[str]) -> None:
-        """Go by another list."""
+        """Replace the list of groups."""
         self._groups = tuple(groups)
         self._changed.set()
 
@@ -143,7 +143,7 @@ class BorderDirection:
                 _logger.exception("what %s shares with %s could not be brought up to date", *self._names)
 
     def _reconcile(self) -> None:
-        """Let what is offered abroad be what is there and in the list."""
+        """Make the services offered remotely equal to those at home that are in the list."""
         there = {
             place: self._told(info)
             for place, info in self._home.federating.offers().items()
@@ -158,7 +158,7 @@ class BorderDirection:
                 if known is None:
                     self._offer(place, info)
                 elif structs.replace(info, revision=known.info.revision) != known.info:
-                    self._abroad.federating.update(known.provider, info)
+                    self._remote.federating.update(known.provider, info)
                     known.info = info
             except TradeError as refused:
                 self._complain(place, str(refused))
@@ -168,7 +168,7 @@ class BorderDirection:
         return SHARED_FROM not in info.meta and inside(place.domain, self._groups)
 
     def _told(self, info: ProviderInfo) -> ProviderInfo:
-        """What is said of it abroad: nothing of what is not shared."""
+        """The description of a provider for the other system: without anything that is not shared."""
         members = {group: names for group, names in info.members.items() if inside(group, self._groups)}
         meta = {**info.meta, SHARED_FROM: self._names[0]}
         groups = shown(info, self._groups)
@@ -179,7 +179,7 @@ class BorderDirection:
             place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place)
         )
         offered = _Offered(info)
-        offered.place = self._abroad.federating.pass_on(offered.provider, info, home)
+        offered.place = self._remote.federating.pass_on(offered.provider, info, home)
         self._origins[offered.place] = place
         self._offered[place] = offered
         self._refused.pop(place, None)
@@ -195,11 +195,11 @@ class BorderDirection:
         return adopt
 
     def _withdraw(self, place: Exposed, offered: "_Offered") -> None:
-        """First what it moves abroad's clients' way: nobody there could stop it afterwards."""
+        """Stop the motion of the other system's clients first: afterwards they could not stop it."""
         del self._offered[place]
-        with contextlib.suppress(ConfigurationError, ChannelClosed):  # somebody did it before, or all of it is gone
-            self._abroad.federating.withdraw(offered.provider)
-        self._visitors.leave(place)
+        with contextlib.suppress(ConfigurationError, ChannelClosed):  # it was done before, or everything is gone
+            self._remote.federating.withdraw(offered.provider)
+        self._guests.leave(place)
         self._origins.pop(offered.place, None)
 
     def _complain(self, place: Exposed, why: str) -> None:
@@ -210,42 +210,42 @@ class BorderDirection:
     # --- handles
 
     def _handle_out(self, handle: Handle) -> ServiceKey:
-        """A handle of a service of home, as the other system knows it."""
-        key = self._abroad_of(handle.key) or self.reverse.home_of(handle.key)
+        """The key of a home service's handle in the remote system."""
+        key = self._remote_of(handle.key) or self.reverse.home_of(handle.key)
         if key is None:
             raise TypeError(f"{handle.label} is not shared with system {self._names[1]}")
         return key
 
     def _handle_in(self, given: ServiceKey) -> Handle:
-        """A handle of the other system, as home knows it."""
-        key = self.home_of(given) or self.reverse._abroad_of(given)
+        """The home handle of a service key from the remote system."""
+        key = self.home_of(given) or self.reverse._remote_of(given)
         if key is None:
             raise msgspec.ValidationError(f"{given.domain}.{given.name} is not shared with system {self._names[0]}")
         return self._home.handle(key)
 
-    def _abroad_of(self, key: ServiceKey) -> ServiceKey | None:
+    def _remote_of(self, key: ServiceKey) -> ServiceKey | None:
         offered = self._offered.get(Exposed(key.address, key.domain, key.provider))
         return None if offered is None else offered.place.service(key.name)
 
     def home_of(self, key: ServiceKey) -> ServiceKey | None:
-        """A service offered abroad, at home."""
+        """The home service of a service offered in the remote system."""
         place = self._origins.get(Exposed(key.address, key.domain, key.provider))
         return None if place is None else place.service(key.name)
 
-    # --- calls and locks that came abroad, and go on at home
+    # --- calls and locks from the remote system, continued at home
 
     @contextlib.contextmanager
     def _speaking(self, call: CallContext, what: Exposed | None) -> Generator[None]:
-        """Calls at home are made on behalf of one that came abroad, under the locks it has shown."""
+        """Makes home calls on behalf of a remote call, under the locks that it carries."""
         if call.session == NO_CLIENT:  # the deadman of our own container: the stop is ours
             sessions, names = [], [str(self._home.address)]
         else:
-            sessions = self._visitors.of(call, what)
+            sessions = self._guests.of(call, what)
             names = [session.name for session in sessions]
         calls = () if call.behalf is None else call.behalf.calls
         behalf = Behalf(tuple(names[1:]), calls, ())
         there = structs.replace(call, session=names[0], behalf=behalf, ongoing=None, permit=None)
-        locks = self._abroad.borrowed.shown(call)
+        locks = self._remote.borrowed.shown(call)
         with ExitStack() as after:
             after.callback(running.reset, running.set(there))
             after.callback(holding.reset, holding.set(locks))
@@ -255,7 +255,7 @@ class BorderDirection:
     def lock(
         self, call: CallContext, wanted: Wanted, terms: LockRequest, on_lost: OnLost, on_request: OnRequest
     ) -> Lock:
-        """Take what is at home for a client from abroad; we renew it as long as the client renews ours."""
+        """Lock home resources for a remote client; renewed for as long as the client renews its lock there."""
         ours = LockRequest(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
@@ -264,12 +264,12 @@ class BorderDirection:
             ).acquire()
 
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:
-        """Let them move again at home, if a client from abroad may say so; which were stopped."""
+        """Resume resources at home if the client of the other system may do so; returns those that were stopped."""
         with self._speaking(call, None):
             return self._function(address, "resume")(list(names))
 
     def request_release(self, call: CallContext, address: Address, names: Sequence[str], reason: str) -> list[str]:
-        """Ask who has them at home; who was asked."""
+        """Ask the owners at home to release resources; returns the owners asked."""
         with self._speaking(call, None):
             return self._function(address, "request_release")(list(names), reason)
 
@@ -279,9 +279,9 @@ class BorderDirection:
     # --- e-stops
 
     def _estop(self, estop: Estop) -> None:
-        """Told by home: an e-stop holds on both sides, and is cleared on each."""
+        """Called by home: an e-stop applies on both sides, and is cleared on each."""
         with contextlib.suppress(ChannelClosed):
-            self._abroad.estopping.carry(estop, self._names[0])
+            self._remote.estopping.carry(estop, self._names[0])
 
     def _end_thread(self) -> None:
         self._closed = True
@@ -298,11 +298,11 @@ class BorderDirection:
 
 
 class _Offered:
-    """One provider, as it is offered abroad."""
+    """One provider, as it is offered in the other system."""
 
     place: Exposed
 
     def __init__(self, info: ProviderInfo) -> None:
         self.info = info
         self.provider: Final = object()
-        """Stands for it there."""
+        """Its proxy there."""

@@ -1,4 +1,4 @@
-"""The clients of one system while they are at work in another one: a session there for each session here (S03)."""
+"""Opens one session in the remote system for each local client session, so that S03 holds across systems."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -12,21 +12,21 @@ MOST: Final = 1024
 
 
 class RemoteContainer(Protocol):
-    """The container that acts for them."""
+    """The container that acts for the clients."""
 
     def open_session(self, client: str, *, system: str = "") -> Session: ...
 
 
 class LocalContainer(Protocol):
-    """The container they come to."""
+    """The container that the clients call."""
 
     def require_present(self, session: str) -> None:
-        """Raises SessionEnded: nobody of it is there."""
+        """Raises SessionEnded: the session does not exist."""
         ...
 
 
 class GuestSessions:
-    """Sessions in another system, ended with those they stand for."""
+    """Sessions in another system, which end with the local sessions that they represent."""
 
     def __init__(self, here: LocalContainer, there: RemoteContainer, system: str) -> None:
         self._here = here
@@ -38,15 +38,15 @@ class GuestSessions:
         self._closed = False
 
     def of(self, call: CallContext, what: Hashable) -> list[Session]:
-        """For whom a call that came here goes on there, nearest first.
+        """The sessions for which a call continues there, nearest first.
 
         Args:
-            call: as it came.
-            what: names what it is about, for `leave`.
+            call: the incoming call.
+            what: identifies the object of the call, for `leave`.
 
         Raises:
-            SessionEnded: one of them is not there (any more).
-            Busy: too many are at work already.
+            SessionEnded: one of the sessions does not exist (any more).
+            Busy: too many sessions are active already.
         """
         return [self._of(session, call, what) for session in dict.fromkeys(call.sessions)]
 
@@ -60,7 +60,7 @@ class GuestSessions:
             self._here.require_present(session)
             found = self._entered(session)
             try:
-                self._here.require_present(session)  # it may have ended while it was let in, and we were told before
+                self._here.require_present(session)  # it may have ended since, before this session was listed
             except SessionEnded:
                 self.ended(session)
                 raise
@@ -77,11 +77,11 @@ class GuestSessions:
         return kept
 
     def ended(self, session: str) -> None:
-        """Nobody of it (or of one within it) is here any more: what it set moving there stops, its locks fall."""
+        """End the remote sessions of a session (or of one within it) that ended: motion stops, locks are released."""
         self._end(lambda name: within(name, session))
 
     def leave(self, what: Hashable) -> None:
-        """That is withdrawn from all of them: who was about it begins anew."""
+        """An object was withdrawn: end the sessions that used it only; their next call opens new ones."""
         with self._lock:
             names = {name for name, used in self._used.items() if what in used}
         self._end(lambda name: name in names)
@@ -96,7 +96,7 @@ class GuestSessions:
             session.close()
 
     def close(self) -> None:
-        """All of them end. Idempotent."""
+        """End all sessions. Idempotent."""
         with self._lock:
             self._closed = True
         self._end(lambda _: True)
