@@ -223,7 +223,7 @@ def test_a_dry_run_says_on_each_occasion_what_it_would_call_and_calls_nothing(
     firing = engine.next()
     assert firing.dry_run
     assert [did.error.partition(":")[0] for did in firing.steps] == ["NoSuchService", "", ""]
-    assert [did.result for did in firing.steps] == ["", "would be called", "is there"]
+    assert [did.result for did in firing.steps] == ["", "would be called", "exists"]
     assert desk.heard.empty()
 
 

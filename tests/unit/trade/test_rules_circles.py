@@ -70,7 +70,7 @@ def test_rules_that_trigger_each_other_for_ever_are_stopped_and_reported(
         offer()
     wait_until(lambda: any(info.state == "stopped" for info in running.rules()))
     [stopped] = [info for info in running.rules() if info.state == "stopped"]
-    assert stopped.why.startswith("it brings itself about, 3 times over: ")
+    assert stopped.why.startswith("it triggers itself, 3 times over: ")
     assert {"back", "away"} <= set(stopped.why.replace(":", " ").split())
     wait_until(lambda: stopped.why[:60] in health(there))
     firing = next(firing for firing in iter(engine.next, None) if firing.stopped)

@@ -64,7 +64,7 @@ def test_a_file_is_read_as_it_says(tmp_path: Path) -> None:
         (f"{LEFT}\n{DO}\ncooldown = 3", r"rule\.r: has no 'cooldown'; there is when, do, if, cooldown_s"),
         (f"{LEFT}\ndo = [{{ args = [1] }}]", r"do\[0\]: is one of call and wait_for"),
         (f'{LEFT}\ndo = [{STEP}, {{ call = "go" }}]', r"do\[1\]\.call: 'go' is no service; write call = "),
-        (f'{LEFT}\ndo = [{{ call = {{ name = "go" }}, args = [["$servce"]] }}]', r"'\$servce' stands for nothing"),
+        (f'{LEFT}\ndo = [{{ call = {{ name = "go" }}, args = [["$servce"]] }}]', r"'\$servce' is no placeholder"),
         ('when = { every_s = 9 }\ndo = [{ call = "$service" }]', "is of rules with joined, left, changed or if"),
         (f'{EVERY}\n{DO}\nif = {{ service = {{ name = "a" }}, args = ["$service"] }}', "this one has every_s"),
         (f'{EVERY}\n{DO}\nif = {{ service = {{ container = "$container" }} }}', "this one has every_s"),

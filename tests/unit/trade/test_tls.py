@@ -445,7 +445,7 @@ def test_what_happened_to_the_folder_since_the_settings_were_read_is_said(system
 
 
 def test_certificates_take_the_place_of_credentials(papers: Papers) -> None:
-    with pytest.raises(ConfigurationError, match="credentials: certificates take their place"):
+    with pytest.raises(ConfigurationError, match="credentials: certificates replace them"):
         read(tls=papers.of("arm"), credentials=("me", "secret"))
 
 

@@ -1,4 +1,4 @@
-"""What a container counts for those who watch it from outside: integers, added up where calls end."""
+"""Counters of a container for monitoring: integers, incremented where calls end."""
 
 import threading
 from bisect import bisect_left
@@ -9,15 +9,15 @@ from msgspec import Struct
 __all__ = ["Measure"]
 
 BOUNDS_S: Final = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
-"""Upper bounds of the classes that durations are counted in; the last class has none."""
+"""Upper bounds of the histogram's buckets; the last bucket has none."""
 _BOUNDS_NS: Final = tuple(int(bound * 1e9) for bound in BOUNDS_S)
 
 
 class Measure(Struct, frozen=True):
-    """One number as it is now."""
+    """The current value of one number."""
 
     name: str
-    """Such as ``bus_cycles``; those who read it see ``trade_bus_cycles_total``."""
+    """Such as ``bus_cycles``; Prometheus names it ``trade_bus_cycles_total``."""
     doc: str
     value: float
     labels: dict[str, str] = {}
@@ -25,7 +25,7 @@ class Measure(Struct, frozen=True):
 
 
 class Timer:
-    """How long calls of one service took, and how many failed. A list's item is counted up in one step of Python's."""
+    """The durations and failures of one service. A list item is incremented in one step of Python's."""
 
     __slots__ = ("counts", "failures", "sum_ns")
 
@@ -35,7 +35,7 @@ class Timer:
         self.sum_ns = 0
 
     def add(self, took_ns: int, *, failed: bool) -> None:
-        """A call has ended."""
+        """Count a call that has ended."""
         self.counts[bisect_left(_BOUNDS_NS, took_ns)] += 1
         self.sum_ns += took_ns
         if failed:
@@ -43,7 +43,7 @@ class Timer:
 
 
 class CallCounters:
-    """What is counted of the calls of a container."""
+    """The counters of a container's calls."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -51,21 +51,21 @@ class CallCounters:
         self._refusals: dict[str, int] = {}
 
     def of(self, label: str) -> Timer:
-        """Where calls of a service are counted; services of one label are counted together."""
+        """The timer of a service; services of one label share it."""
         with self._guard:
             return self._timed.setdefault(label, Timer())
 
     def refuse(self, reason: str) -> None:
-        """Somebody was refused something."""
+        """Count a refused request."""
         with self._guard:
             self._refusals[reason] = self._refusals.get(reason, 0) + 1
 
     def timed(self) -> dict[str, Timer]:
-        """By service."""
+        """The timers by service."""
         with self._guard:
             return dict(self._timed)
 
     def refusals(self) -> dict[str, int]:
-        """By the type of the error."""
+        """The counts by the type of the error."""
         with self._guard:
             return dict(self._refusals)

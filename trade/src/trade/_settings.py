@@ -1,4 +1,4 @@
-"""Who a container is and where it may be reached; every default stays on this host."""
+"""The identity of a container and the networks it may reach; every default stays on this host."""
 
 import difflib
 import logging
@@ -54,69 +54,69 @@ _CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What a container is started with; ``Settings.read`` fills in the environment and the defaults.
+    """The settings of a container; ``Settings.read`` fills in the environment and the defaults.
 
     Raises:
-        ConfigurationError: a name cannot stand in a key, or the settings would reach beyond this host by accident.
+        ConfigurationError: a name is invalid in a key, or the settings would reach beyond this host by accident.
     """
 
     system: str
-    """Containers of other systems are invisible."""
+    """The system id: containers of other systems are invisible."""
     identity: str
-    """Who speaks."""
+    """The identity that the container's messages carry."""
     container: str
     """Name of the container."""
     listen: tuple[str, ...] = ()
     """Endpoints such as ``tcp/127.0.0.1:7450``; none: any free port of the loopback interface."""
     connect: tuple[str, ...] = ()
-    """Endpoints of others; none: the containers of this system on this host."""
+    """Endpoints of other containers; none: the containers of this system on this host."""
     credentials: tuple[str, str] | None = field(default=None, repr=False)
     """User and password of the whole system; none: a secret that this user's containers on this host share."""
     tls: Path | None = None
     """A folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it: the links are encrypted,
-    both ends show certificates of one authority, and the identity is the certificate's common name. Takes the place of
-    credentials; all endpoints are ``tls/HOST:PORT`` then."""
+    both ends show certificates of one authority, and the identity is the certificate's common name. Replaces the
+    credentials; all endpoints must be ``tls/HOST:PORT``."""
     insecure_lan: bool = False
     """Laboratories only: reach a network without certificates, without encryption, without a policy."""
     policy: Path | None = None
-    """File of the access policy; none: everybody in the system may do everything."""
+    """File of the access policy; none: every identity in the system may do everything."""
     bridge: tuple[str, ...] = ()
-    """Network interfaces such as ``eth0``: carry messages between the containers of their networks, which need no way
-    to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
-    crosses unless ``exports`` says what."""
+    """Network interfaces such as ``eth0``: carry messages between the containers of these networks, which need no route
+    to each other. It has to listen on each; one interface is enough if it dials another bridge. Everything of the
+    system crosses unless ``exports`` limits it."""
     exports: Mapping[str, tuple[str, ...]] | None = None
-    """By interface of the bridge, the groups whose services on that network others see and call; none: everything."""
+    """For each interface of the bridge, the groups of its network that others see and call; none: everything."""
     stream_hz: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
-    """By interface of the bridge and exported group: how many samples a second of each stream others hear at most, one
-    of 1, 2, 5, 10, 20, 50, 100, 200 and 500; of the others: as many as they ask for."""
+    """For each interface of the bridge and exported group: the highest rate at which others receive its streams, one of
+    1, 2, 5, 10, 20, 50, 100, 200 and 500 samples a second; without a limit: the rate they request."""
     explicit_system: bool = False
     lock: str = ""
-    """A lock that the process around this one holds for it; see `Lock.environment`."""
+    """A lock that the parent process holds for this one; see `Lock.environment`."""
     instantiable: tuple[str, ...] = ()
-    """Classes that others may make objects of here, such as ``mypkg.vision:Camera`` or ``mypkg.*``; none: none."""
+    """Classes that other containers may create objects of here, such as ``mypkg.vision:Camera`` or ``mypkg.*``."""
     state_dir: Path | None = None
-    """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
+    """Folder for what must outlive a process, such as open e-stops; none: nothing is kept."""
     trace: bool = False
-    """Note calls from the start; see `Container.set_tracing`."""
+    """Trace calls from the start; see `Container.set_tracing`."""
     otlp: str = ""
-    """URL of a collector that gets what is noted, such as ``http://127.0.0.1:4318``; none: nobody does. Takes the extra
+    """URL of a collector of spans, such as ``http://127.0.0.1:4318``; none: spans are not exported. Requires the extra
     ``trade-core[otel]``."""
     audit: Path | None = None
-    """Folder for a record of who called, locked, stopped, was refused and changed the configuration here; none: none is
-    kept."""
+    """Folder for the audit record: calls, locks, stops, refusals and configuration changes, with their callers; none:
+    no record is kept."""
     audit_reads: bool = False
-    """Have services that only read in it, too."""
+    """Record calls of services that only read, too."""
     audit_keep_days: int = _KEEP_DAYS
-    """How many days it is kept; the newest 10,000 rows stay in any case."""
+    """How many days rows are kept; the newest 10,000 rows stay in any case."""
     audit_keep_rows: int = _KEEP_ROWS
-    """How many rows of it are kept, some 350 bytes each."""
+    """How many rows are kept, some 350 bytes each."""
     metrics: str = ""
-    """Where Prometheus finds ``/metrics``, such as ``127.0.0.1:9464``; none: nowhere. Takes the extra
+    """Where to serve ``/metrics`` for Prometheus, such as ``127.0.0.1:9464``; none: not served. Requires the extra
     ``trade-core[metrics]``."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
-            if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
+            if not is_chunk(text) or text.strip(".") == "":  # the system's name is also that of a folder
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
         self._check_collector(urlsplit(self.otlp))
@@ -149,7 +149,7 @@ class Settings:
             raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
         if not (place.loopback or self.insecure_lan):
             problem = (
-                "anybody there could read who is refused what, as it asks for no proof and is not encrypted; write "
+                "any client there could read the refusals, as it needs no authentication and is not encrypted; write "
                 f"127.0.0.1:{place.port}, and put a proxy that does both in front"
             )
             raise ConfigurationError(where="TRADE_METRICS", problem=problem)
@@ -168,7 +168,7 @@ class Settings:
             check_stream_hz(limits, (self.exports or {}).get(name, ()), f"stream_hz of {name}")
 
     def check_may_dial(self, endpoint: str) -> None:
-        """S21: raises ConfigurationError if that would reach a network by accident."""
+        """S21: raises ConfigurationError if an endpoint would reach a network by accident."""
         self._check_reach(f"connect {endpoint}", Endpoint.read(endpoint))
 
     def _check_reach(self, where: str, endpoint: Endpoint) -> None:
@@ -183,7 +183,7 @@ class Settings:
             problem = f"{self.otlp!r} is no URL of a collector; write http://127.0.0.1:4318"
             raise ConfigurationError(where="TRADE_OTLP", problem=problem)
         if url.scheme == "http" and not (Endpoint("tcp", url.hostname, 0).loopback or self.insecure_lan):
-            problem = f"who calls what would cross the network for all to read; write https://{url.netloc}"
+            problem = f"the callers of services would cross the network unencrypted; write https://{url.netloc}"
             raise ConfigurationError(where="TRADE_OTLP", problem=problem)
 
     def _refused_plain(self, endpoint: Endpoint) -> str:
@@ -200,10 +200,10 @@ class Settings:
 
     def _refused_certified(self, endpoint: Endpoint) -> str:
         if endpoint.protocol != "tls":
-            return f"who has a certificate links by tls alone, so it must be tls/{endpoint.host}:{endpoint.port}"
+            return f"a container with a certificate links only by tls: it must be tls/{endpoint.host}:{endpoint.port}"
         if endpoint.host.startswith("["):
             return "the transport does not link with certificates at IPv6 addresses; use an IPv4 address or a name"
-        if endpoint.rest:  # it could switch off what makes a link safe
+        if endpoint.rest:  # it could switch off the security of a link
             return f"takes nothing after the port; leave out {endpoint.rest}"
         if not (endpoint.loopback or self.explicit_system):
             return "reaching a network needs an explicit system id: set TRADE_SYSTEM"
@@ -219,11 +219,11 @@ class Settings:
             raise ConfigurationError(where=where, problem=problem)
 
     def certificate(self) -> Certificate | None:
-        """What the folder has now; raises ConfigurationError if that is of no use, or another one's."""
+        """The current certificate in the folder; raises ConfigurationError if it is invalid, or another identity's."""
         if self.tls is None:
             return None
         if self.credentials is not None:
-            problem = "certificates take their place; leave out TRADE_CREDENTIALS or TRADE_TLS"
+            problem = "certificates replace them; leave out TRADE_CREDENTIALS or TRADE_TLS"
             raise ConfigurationError(where="credentials", problem=problem)
         certificate = Certificate.read(self.tls)
         if certificate.identity != self.identity:
@@ -264,7 +264,7 @@ class Settings:
         URL), ``TRADE_AUDIT`` (a folder), ``TRADE_AUDIT_READS`` (``1``), ``TRADE_AUDIT_KEEP_DAYS``,
         ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_METRICS`` (``HOST:PORT``), ``TRADE_RUNTIME_DIR`` and
         ``TRADE_STATE_DIR`` (else the user's folder for state).
-        Others that begin with ``TRADE_`` are warned of.
+        A warning is logged for other variables that begin with ``TRADE_``.
         """
         environment = os.environ if environment is None else environment
         _warn_of_unknown(environment)
@@ -299,7 +299,7 @@ class Settings:
 
 
 def check_stream_hz(limits: Mapping[str, float], exported: Sequence[str], where: str) -> None:
-    """Raises ConfigurationError: no such limits, or they would not hold."""
+    """Raises ConfigurationError: invalid limits, or limits without effect."""
     for group, hz in limits.items():
         if group not in exported:
             problem = f"{group!r} is not exported as such; there is {', '.join(exported) or 'nothing'}"
@@ -319,7 +319,7 @@ def _warn_of_unknown(environment: Mapping[str, str]) -> None:
         if name.startswith("TRADE_") and name not in _VARIABLES:
             near = difflib.get_close_matches(name, _VARIABLES, n=1, cutoff=0.8)
             hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(_VARIABLES)}"
-            _logger.warning("the environment variable %s means nothing to TRADE; %s", name, hint)
+            _logger.warning("TRADE does not know the environment variable %s; %s", name, hint)
 
 
 def _path(named: str | None) -> Path | None:
@@ -341,7 +341,7 @@ def _state_dir(environment: Mapping[str, str]) -> Path | None:
     base = environment.get("LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME")
     try:
         return Path(base) / "trade" if base else Path.home() / ".local" / "state" / "trade"
-    except RuntimeError:  # nobody's home
+    except RuntimeError:  # no home directory
         return None
 
 
@@ -369,12 +369,12 @@ def _who(certified: Path | None) -> str:
 
 
 def _user() -> str:
-    import getpass  # noqa: PLC0415 - it loads modules that not every operating system has
+    import getpass  # noqa: PLC0415 - it loads modules that some operating systems lack
 
     try:
         return as_chunk(getpass.getuser())
     except (OSError, KeyError):  # a container image without a user name
-        return "nobody"
+        return "nobody"  # plain: nobody
 
 
 def _program() -> str:

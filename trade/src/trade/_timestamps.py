@@ -1,4 +1,4 @@
-"""Moments in words. Many come from others, who may tell anything, and an error must never fail to say what it is."""
+"""Times as text. Many come from other containers and may be invalid; formatting must not fail because of that."""
 
 import time
 from typing import Final
@@ -9,10 +9,10 @@ _NONE: Final = "?"
 
 
 def clock(at: float, *, ms: bool = False) -> str:
-    """The time of day here of a moment in seconds since the epoch; ``?`` if there is no such moment.
+    """The local time of day of a time in seconds since the epoch; ``?`` if it is invalid.
 
     Args:
-        at: the moment.
+        at: the time.
         ms: with milliseconds.
     """
     text = _written("%H:%M:%S", at)
@@ -20,7 +20,7 @@ def clock(at: float, *, ms: bool = False) -> str:
 
 
 def day_and_clock(at: float) -> str:
-    """The same with the date before it."""
+    """The same, preceded by the date."""
     return _written("%Y-%m-%d %H:%M:%S", at)
 
 

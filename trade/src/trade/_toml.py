@@ -1,4 +1,4 @@
-"""Reading TOML, on every Python the same."""
+"""Reads TOML, in the same way on every Python."""
 
 import sys
 from typing import Any
@@ -15,7 +15,7 @@ def read_toml_text(text: str) -> dict[str, Any]:
     """The tables of a TOML text.
 
     Raises:
-        ValueError: it is no TOML, or nested deeper than can be read.
+        ValueError: the text is not TOML, or is nested too deeply.
     """
     try:
         return tomllib.loads(text)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]

@@ -1,4 +1,4 @@
-"""Audit records for those who read and check them. Containers write their own: see `trade.Settings.audit`."""
+"""Reading and checking audit records. Containers write their own: see `trade.Settings.audit`."""
 
 from trade._audit.events import Kind
 from trade._audit.hash_chain import AuditRow, ChainCheck, Head, verify

@@ -1,4 +1,4 @@
-"""Files in which something outlives its process, for whoever keeps such."""
+"""Files that keep data beyond the life of a process, for programs that need such files."""
 
 from trade._storage.database import Database
 

@@ -1,4 +1,4 @@
-"""For those that listen for strangers: a bound on how many of them there are at once."""
+"""A listening socket with a limit on connections from strangers."""
 
 from trade._transport.bounded_listener import BoundedListener
 

@@ -1,4 +1,4 @@
-"""Access policies for those who look at them from outside, and for whoever opens a session of the transport itself.
+"""Access policies for programs that inspect them, or that open sessions of the transport themselves.
 
 Containers read their own: see `trade.Settings.policy` and `trade.Container.load_policy`.
 """

@@ -1,4 +1,4 @@
-"""Programs started on other hosts through ``ssh``, for whoever brings up a whole system: ``trade system up``."""
+"""Starts programs on other hosts through ``ssh``, for tools that start a whole system: ``trade system up``."""
 
 from trade._remote.ssh import LONGEST_S, Started, end_there, launch, missing_there
 

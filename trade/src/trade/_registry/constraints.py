@@ -1,4 +1,4 @@
-"""``where``: what a service must be. And, or, not, kept as disjunctive normal form; plain data that can be sent."""
+"""``where``: conditions on services with and, or, not, in disjunctive normal form; plain data that can be sent."""
 
 import math
 import re
@@ -18,7 +18,7 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Candidate", "Constraint", "where"]
 
-"""What a group looks like: whole segments joined by dots."""
+"""The form of a group: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000
 _GLOB: Final = frozenset("*?[")
 _Field = Literal[
@@ -27,7 +27,7 @@ _Field = Literal[
 
 
 class Candidate(Protocol):
-    """What a constraint looks at."""
+    """The properties of a service that a constraint tests."""
 
     @property
     def name(self) -> str: ...
@@ -60,12 +60,12 @@ class Term(Struct, frozen=True, array_like=True, order=True):
     negated: bool = False
 
     def __post_init__(self) -> None:
-        """What comes by message is checked like what is written."""
+        """Validates terms from messages like terms from code."""
         match self.field:
             case "args" | "returns":
                 schemas, _ = read_types(self.pattern)
                 if self.field == "returns" and len(schemas) != 1:
-                    raise ValueError("a service returns one thing")
+                    raise ValueError("a service returns one result")
             case "achieves":
                 parse_predicates(self.pattern)
             case "meta":
@@ -138,12 +138,12 @@ def _check_no_pattern(field: str, text: str) -> None:
 
 
 def under(group: str, selected: str) -> bool:
-    """Whether a dotted group is the selected one or beneath it; whole segments only."""
+    """Whether a dotted group is the selected one or beneath it; by whole segments only."""
     return group == selected or group.startswith(selected + ".")
 
 
 def is_exact(pattern: str) -> bool:
-    """Whether a name's pattern stands for one name only."""
+    """Whether a pattern matches only one name."""
     return _GLOB.isdisjoint(pattern)
 
 
@@ -152,7 +152,7 @@ def _like(name: str, pattern: str) -> bool:
 
 
 def _takes(info: ServiceInfo, pattern: str) -> bool:
-    """Whether the service can be called with so many positional arguments of these types."""
+    """Whether the service accepts this number of positional arguments of these types."""
     given, definitions = read_types(pattern)
     places = [parameter for parameter in info.parameters if not parameter.keyword_only]
     left_out = [parameter for parameter in info.parameters if parameter not in places[: len(given)]]
@@ -178,7 +178,7 @@ def _key_and_value(pattern: str) -> tuple[str, Scalar]:
 
 
 def _same(one: Scalar, other: Scalar) -> bool:
-    """Equal, and true is not 1."""
+    """Whether two values are equal, where true is not 1."""
     return one == other and isinstance(one, bool) is isinstance(other, bool)
 
 
@@ -203,7 +203,7 @@ class Constraint(Struct, frozen=True):
         raise TypeError("a constraint is neither true nor false; combine with & | ~ instead of and, or, not")
 
     def matches(self, candidate: Candidate) -> bool:
-        """Whether a service is one of those meant."""
+        """Whether a service meets the constraint."""
         return any(all(term.matches(candidate) for term in clause) for clause in self.clauses)
 
     def __str__(self) -> str:
@@ -214,7 +214,7 @@ class Constraint(Struct, frozen=True):
 
 
 def _normal(clauses: Sequence[frozenset[Term]]) -> Constraint:
-    """Without clauses that contradict themselves or say no more than another one."""
+    """Drops clauses that contradict themselves or that another clause implies."""
     if len(clauses) > _MOST_CLAUSES:
         raise ConfigurationError(problem=f"this constraint has more than {_MOST_CLAUSES} alternatives; make it simpler")
     sound = {clause for clause in clauses if not any(~term in clause for term in clause)}
@@ -225,9 +225,9 @@ class _Where:
     """Makes constraints; see ``where``."""
 
     local: Final = Constraint((frozenset((Term("local", ""),)),))
-    """Services of this very container."""
+    """Services of this container."""
     healthy: Final = Constraint((frozenset((Term("healthy", ""),)),))
-    """Services whose provider says that nothing is wrong."""
+    """Services whose provider reports that it is healthy."""
 
     def __call__(
         self,
@@ -245,26 +245,26 @@ class _Where:
         meta: Mapping[str, Scalar] | None = None,
         healthy: bool | None = None,
     ) -> Constraint:
-        """Services that fit everything said; nothing said: all.
+        """Services that meet all given conditions; without any: all services.
 
         Args:
-            name: the service's name, ``*`` and ``?`` stand for anything.
-            group: a dotted group; selects everything beneath it, too.
-            host: the computer's name, ``*`` and ``?`` allowed.
-            container: the container's name, ``*`` and ``?`` allowed.
-            local: whether it lives in this container.
-            args: types of positional arguments it can be called with; ``[]`` is a call without any. ``int`` fits
-                ``float``, a struct one that asks for no more fields; ``Any`` is an argument of whatever type.
-            returns: the type of its result, or one that fits it; ``None`` is a service without one.
+            name: the service's name; ``*`` and ``?`` are wildcards.
+            group: a dotted group; includes everything beneath it.
+            host: the computer's name; ``*`` and ``?`` allowed.
+            container: the container's name; ``*`` and ``?`` allowed.
+            local: whether the service runs in this container.
+            args: types of positional arguments that it accepts; ``[]`` is a call without arguments. ``int`` fits
+                ``float``, and a struct fits one with a subset of its required fields; ``Any`` fits every type.
+            returns: the type of its result, or one that fits it; ``None`` is a service without a result.
             achieves: a predicate that one of its post-conditions must fit; ``?x`` is a variable. Of several, each must
-                fit one, and a variable means the same in all.
-            uses: a physical resource; selects everything beneath it, too.
-            kind: name of its provider's class, or of a base or interface of that; ``*`` and ``?`` allowed.
-            meta: keys and values it is declared with.
-            healthy: whether its provider says that nothing is wrong.
+                fit one, and a variable has one meaning in all of them.
+            uses: a physical resource; includes everything beneath it.
+            kind: name of its provider's class, or of a base or interface of it; ``*`` and ``?`` allowed.
+            meta: keys and values of its metadata.
+            healthy: whether its provider reports that it is healthy.
 
         Raises:
-            ConfigurationError: a pattern is empty or stands where none may, a type cannot be sent, a predicate is
+            ConfigurationError: a pattern is empty or not allowed there, a type cannot be sent, or a predicate is
                 malformed.
         """
         given: tuple[tuple[_Field, str | None], ...]
@@ -302,7 +302,7 @@ def _meta_text(key: str, value: Scalar) -> str:
 
 
 def checked_meta(meta: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Plain key/values; raises ConfigurationError for anything else."""
+    """Checks plain keys and values; raises ConfigurationError for anything else."""
     for key, value in meta.items():
         plain = value is None or isinstance(value, bool | int | float | str)
         whole = not isinstance(value, int) or -(2**63) <= value < 2**63
@@ -322,4 +322,4 @@ def _pattern(field: str, pattern: str) -> str:
 
 
 where: Final = _Where()
-"""``where(name=..., group=...) & ~where.local``: what a service must be."""
+"""``where(name=..., group=...) & ~where.local``: a condition on services."""

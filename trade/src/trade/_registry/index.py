@@ -1,4 +1,4 @@
-"""Services by what constraints ask for most, so that one among ten thousand is found without looking at all."""
+"""An index of services by the fields that constraints use most, so that a lookup need not test them all."""
 
 from collections.abc import Iterator
 from typing import Generic, Protocol, TypeVar
@@ -8,7 +8,7 @@ from trade._registry.constraints import Candidate, Constraint, Term, is_exact
 from trade._registry.predicates import parse_predicates, read_achieved
 
 _Slot = tuple[str, str]
-"""A field and the one value of it."""
+"""A field and one value of it."""
 
 
 class _Keyed(Candidate, Protocol):
@@ -20,7 +20,7 @@ _Entry = TypeVar("_Entry", bound=_Keyed)
 
 
 class Index(Generic[_Entry]):
-    """Changed by one thread at a time, asked by any: what stays under its key is never missing meanwhile."""
+    """Changed by one thread at a time, read by any: an entry that keeps its key is never missing meanwhile."""
 
     def __init__(self) -> None:
         self._all: dict[ServiceKey, _Entry] = {}
@@ -30,7 +30,7 @@ class Index(Generic[_Entry]):
         return self._all.get(key)
 
     def put(self, entry: _Entry) -> None:
-        """Add it, or replace the one of the same key."""
+        """Add an entry, or replace the one with the same key."""
         old = self._all.get(entry.key)
         self._all[entry.key] = entry
         slots = set(_slots_of(entry))
@@ -52,7 +52,7 @@ class Index(Generic[_Entry]):
                 self._slots.pop(slot, None)
 
     def candidates(self, constraint: Constraint) -> list[_Entry]:
-        """Everything the constraint may match and as little else as the index allows, each once."""
+        """All entries that the constraint may match and as few others as possible, each once."""
         if len(constraint.clauses) == 1:
             return self._of(constraint.clauses[0])
         found: dict[ServiceKey, _Entry] = {}
@@ -61,7 +61,7 @@ class Index(Generic[_Entry]):
         return list(found.values())
 
     def _of(self, clause: frozenset[Term]) -> list[_Entry]:
-        """What stands everywhere the clause insists on: those of the rarest thing that have the other ones, too."""
+        """The entries in every slot that the clause requires, found from the smallest slot."""
         buckets = [self._slots.get(slot, {}) for term in clause if not term.negated for slot in _slots_asked(term)]
         if not buckets:
             return list(self._all.values())
@@ -89,7 +89,7 @@ def _slots_of(entry: Candidate) -> Iterator[_Slot]:
 
 
 def _slots_asked(term: Term) -> Iterator[_Slot]:
-    """Where everything must stand that the term matches; nothing if it may stand anywhere."""
+    """The slots of which one must contain everything that the term matches; empty if there is no such slot."""
     match term.field:
         case "group" | "uses":
             yield term.field, term.pattern

@@ -1,4 +1,4 @@
-"""Predicates such as ``on(cup, table)``: what services achieve, and patterns with variables that ask for it."""
+"""Predicates such as ``on(cup, table)``: post-conditions of services, and patterns with variables that match them."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ _TOKEN: Final = re.compile(r"\s*([?]?[\w.+-]+|[(),])\s*")
 _LONGEST: Final = 1000
 _DEEPEST: Final = 20
 _MOST_STEPS: Final = 10_000
-"""In which a match is found, or there is none: both sides may have been written to keep others busy for ever."""
+"""The limit of steps of a match: both sides may be written so that matching would not end."""
 _Bindings = Mapping[str, "Predicate"]
 
 
@@ -34,12 +34,12 @@ class Predicate(Struct, frozen=True):
 
 @lru_cache(4096)
 def parse_predicates(text: str) -> tuple[Predicate, ...]:
-    """One predicate or several between commas; raises ConfigurationError saying where it goes wrong."""
+    """One predicate or several between commas; raises ConfigurationError with the position of an error."""
     return _Parser(text).read()
 
 
 def parse_achieved(text: str) -> Predicate:
-    """What a service achieves: one predicate, and not just a variable. Raises ConfigurationError."""
+    """A post-condition of a service: one predicate, and not only a variable. Raises ConfigurationError."""
     several = parse_predicates(text)
     if len(several) != 1 or several[0].is_variable:
         raise ConfigurationError(problem=f"{text!r} is no post-condition; write one predicate, such as open(gripper)")
@@ -48,7 +48,7 @@ def parse_achieved(text: str) -> Predicate:
 
 @lru_cache(4096)
 def read_achieved(text: str) -> Predicate | None:
-    """What another container says its service achieves; None for what is no post-condition."""
+    """A post-condition from another container; None for an invalid one."""
     try:
         return _renamed(parse_achieved(text))
     except ConfigurationError:
@@ -65,7 +65,7 @@ class _Parser:
         self._split()
         found = self._several(0)
         if self._at < len(self._tokens):
-            raise self._wrong(f"{self._tokens[self._at]!r} is one too many")
+            raise self._wrong(f"{self._tokens[self._at]!r} is not expected there")
         return found
 
     def _split(self) -> None:
@@ -73,7 +73,7 @@ class _Parser:
         while end < len(self._text) <= _LONGEST:
             token = _TOKEN.match(self._text, end)
             if token is None:
-                raise self._wrong(f"{self._text[end]!r} cannot stand there")
+                raise self._wrong(f"{self._text[end]!r} is not allowed there")
             self._tokens.append(token[1])
             end = token.end()
         if len(self._text) > _LONGEST:
@@ -115,16 +115,16 @@ class _Parser:
 
 
 def _renamed(predicate: Predicate) -> Predicate:
-    """With variables no pattern can have: one side's ``?x`` is not the other's."""
+    """The predicate with variables that no pattern can have: one side's ``?x`` is not the other's."""
     if predicate.is_variable:
         return Predicate("?:" + predicate.functor[1:])
     return Predicate(predicate.functor, tuple(map(_renamed, predicate.arguments)))
 
 
 def achieves_all(achieved: Sequence[str], patterns: Sequence[Predicate]) -> bool:
-    """Whether every pattern fits one of the post-conditions, a variable meaning the same throughout.
+    """Whether every pattern fits one of the post-conditions, where a variable has one meaning throughout.
 
-    What takes too long to find out counts as no.
+    A search that takes too long counts as no match.
     """
     facts = [fact for fact in map(read_achieved, achieved) if fact is not None]
     try:
@@ -134,7 +134,7 @@ def achieves_all(achieved: Sequence[str], patterns: Sequence[Predicate]) -> bool
 
 
 class _TooLong(Exception):
-    """A search has had all its steps."""
+    """A search has used all its steps."""
 
 
 def _step(steps: Iterator[int]) -> None:

@@ -1,4 +1,4 @@
-"""Which services exist, here and elsewhere; every container looks them up locally."""
+"""The registry of all services in the system; every container has a copy for local lookups."""
 
 import logging
 import threading
@@ -20,7 +20,7 @@ __all__ = ["ContainerState", "Record", "Registry"]
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One service as the registry knows it."""
+    """One service in the registry."""
 
     key: ServiceKey
     info: ServiceInfo
@@ -49,7 +49,7 @@ class Record:
 
     @property
     def used(self) -> tuple[str, ...]:
-        """What to lock for its use: a service that names no resources stands for itself."""
+        """The resources to lock for its use; a service without resources is locked by itself."""
         uses = () if self.info.effect == "read" else self.info.uses
         return uses or (f"{self.key.domain}/{self.key.provider}/{self.key.name}",)
 
@@ -60,12 +60,12 @@ class Record:
 
 
 class Entry(NamedTuple):
-    """What a container says of one provider, and what is known by it."""
+    """The announcement of one provider, and the records made from it."""
 
     domain: str
     info: ProviderInfo
     records: list[Record]
-    """None of them if the container may not offer it."""
+    """Empty if the container may not offer the provider."""
 
 
 MayOffer = Callable[[str, str, str, Sequence[str]], bool]
@@ -78,50 +78,50 @@ def _anybody(_identity: str, _domain: str, _provider: str, _groups: Sequence[str
 
 @dataclass(slots=True)
 class ContainerState:
-    """What is known of one boot of one container while its sign of life stands."""
+    """The state of one boot of one container while its sign of life is present."""
 
     address: Address
     providers: dict[str, "Entry"] = field(default_factory=dict)
     """By name."""
     removed: dict[str, str] = field(default_factory=dict)
-    """Deregistered, in this order, and where they moved, if they did: a name is never used twice in one boot."""
+    """Deregistered providers in order, with their new places if they moved: no name is used twice in one boot."""
     heard: RevisionTracker = field(default_factory=RevisionTracker)
     protocol: int = 0
-    """The version that it speaks; 0 before it has said anything. If it is not ours, it has no providers here."""
+    """Its protocol version; 0 before its first message. If it differs from ours, it has no providers here."""
     estops: dict[str, tuple[Estop, ...]] = field(default_factory=dict)
-    """Of one that speaks another version: what is open there, by the provider that tells of it."""
+    """For a container of another version: its open e-stops, by the provider that reports them."""
 
     def open_estops(self) -> list[Estop]:
-        """See ``estops``."""
+        """The open e-stops of ``estops``."""
         return [estop for told in list(self.estops.values()) for estop in told]
 
 
 class Change(NamedTuple):
-    """What a message did to the registry."""
+    """The effect of one message on the registry."""
 
     joined: list[Record]
     left: list[Record]
     replaced: list[Record]
-    """The same services, told anew."""
+    """The same services with new data."""
     before: list[Record]
-    """What was known of those, in the same order."""
+    """The previous records of those, in the same order."""
 
 
 _logger = logging.getLogger("trade")
 
 _SLASHES: Final = 4
-"""In what says where a provider moved."""
+"""Slashes in the text that names a provider's new place."""
 _MOST_GUESTS: Final = 64
-"""So many containers of one identity are known that may offer nothing."""
+"""The most containers of one identity without services that are registered."""
 _MOST_PROVIDERS: Final = 65_536
-"""Of one container: what it announces beyond that is ignored, and of more no withdrawal is remembered."""
+"""Of one container: further announcements are ignored, and further withdrawals not remembered."""
 
 
 class Registry:
-    """Fed by the container's reader threads; asked by everybody.
+    """Written by the container's reader threads; read by all threads.
 
-    Of a container something is known only while its sign of life stands: when that rises it is asked for all it
-    offers. Listeners are told in order, after the change, on the thread that fed it, with no lock held.
+    A container has an entry only while its sign of life is present: when that appears, it is queried for all its
+    services. Subscribers are called in order, after the change, on the thread that made it, without a lock.
     """
 
     def __init__(
@@ -134,32 +134,32 @@ class Registry:
         self._may_offer = may_offer
         self._may_offer_anything = may_offer_anything
         self._crowds: set[str] = set()
-        """Identities that were logged for having too many containers."""
+        """Identities for which too many containers were logged."""
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
         self._changed = InterruptibleCondition()
         self._telling = threading.RLock()
         self.changes: Final = Event[Change]()
-        """What has joined, left or been replaced."""
+        """Services that joined, left or were replaced."""
         self.appear(own)
         self.speaks(own, PROTOCOL)
 
     def between_changes(self, action: Callable[[], None]) -> None:
-        """Do something that no change may come between; subscribers are told before or after it."""
+        """Run an action between two changes; subscribers are called before or after it."""
         with self._telling:
             action()
 
     # --- feeding
 
     def put(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> bool:
-        """A container announces a provider, or that one is gone. Returns whether nothing was missed before it."""
+        """A container announces a provider, or its end. Returns whether no earlier announcement was missed."""
         with self._telling:
             with self._lock:
                 state = self._containers.get(address)
                 if state is None:
                     return True
-                if info.revision <= state.heard.answered:  # its answer told of that, and of what came after it
+                if info.revision <= state.heard.answered:  # its reply contained this revision
                     return state.heard.complete
                 state.protocol = PROTOCOL
                 state.heard.told(info.revision)
@@ -168,7 +168,7 @@ class Registry:
             return state.heard.complete
 
     def count(self, address: Address, revision: int) -> bool:
-        """A container says how much it has announced. Returns whether nothing of it was missed."""
+        """A container announces its revision. Returns whether no announcement was missed."""
         with self._lock:
             state = self._containers.get(address)
             if state is None:
@@ -178,7 +178,7 @@ class Registry:
             return state.heard.complete
 
     def speaks(self, address: Address, version: int) -> bool:
-        """A container speaks a version. Returns whether that is news."""
+        """A container uses a protocol version. Returns whether that is news."""
         with self._lock:
             state = self._containers.get(address)
             if state is None or state.protocol == version:
@@ -188,7 +188,7 @@ class Registry:
             return True
 
     def tells_open(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
-        """One that speaks another version tells what is open there. Returns whether it is there and may tell that."""
+        """A container of another version reports open e-stops. Returns whether it is registered and may report them."""
         if not self._may_offer(address.identity, domain, provider, (domain,)):
             return False
         with self._lock:
@@ -200,9 +200,9 @@ class Registry:
             return True
 
     def settle(self, state: ContainerState, revision: int, offered: Mapping[str, tuple[str, ProviderInfo]]) -> None:
-        """A container has answered with all it offered at a revision: provider to domain and entry.
+        """A container has replied with all its services at a revision: from provider to domain and entry.
 
-        An answer to what was asked before its sign of life fell is none.
+        A reply to a query from before its sign of life disappeared is ignored.
         """
         with self._telling:
             with self._lock:
@@ -217,7 +217,7 @@ class Registry:
             self._tell(change)
 
     def appear(self, address: Address) -> bool:
-        """A container's sign of life rose. Returns whether it is news."""
+        """A container's sign of life appeared. Returns whether that is news."""
         with self._lock:
             if address in self._containers or not self._has_room_for(address):
                 return False
@@ -233,11 +233,11 @@ class Registry:
             return True
         if address.identity not in self._crowds:
             self._crowds.add(address.identity)
-            _logger.warning("%s has %d containers and may offer nothing: no more are known", address.identity, known)
+            _logger.warning("%s has %d containers and may offer nothing: others are ignored", address.identity, known)
         return False
 
     def vanish(self, address: Address) -> None:
-        """A container's sign of life fell; it is known no more, until it returns and is asked."""
+        """A container's sign of life disappeared: remove it until it returns and is queried."""
         with self._telling:
             with self._lock:
                 state = self._containers.pop(address, None)
@@ -247,7 +247,7 @@ class Registry:
     def _change(
         self, state: ContainerState, entries: Mapping[str, tuple[str, ProviderInfo]], gone: Sequence[str]
     ) -> Change:
-        """Take up what is newer than known, and let go of what is gone for good. Under the lock."""
+        """Add what is newer than the current state, and remove what is gone permanently. Under the lock."""
         before, after = list[Record](), list[Record]()
         for provider in gone:
             before += _records(state.providers.pop(provider, None))
@@ -267,7 +267,7 @@ class Registry:
         return self._swap(before, after)
 
     def recheck_access(self) -> None:
-        """Who may offer what has changed: what may no longer be offered leaves, what now may be joins."""
+        """The rights to offer have changed: remove services that may no longer be offered, add those that may now."""
         with self._telling:
             with self._lock:
                 before, after = list[Record](), list[Record]()
@@ -303,7 +303,7 @@ class Registry:
         ]
 
     def _swap(self, before: Iterable[Record], after: Iterable[Record]) -> Change:
-        """Replace records in the index, under the lock. What stays under its key neither joins nor leaves."""
+        """Replace records in the index, under the lock. A service that keeps its key neither joins nor leaves."""
         old = {record.key: record for record in before}
         new = {record.key: record for record in after}
         for record in new.values():
@@ -348,28 +348,28 @@ class Registry:
         return address in self._containers
 
     def left_open(self, address: Address) -> bool:
-        """Whether a container is alive and something it announced may have been missed."""
+        """Whether a container is alive and an announcement of it may have been missed."""
         state = self._containers.get(address)
         return state is not None and not state.heard.complete
 
     def containers(self) -> list[ContainerState]:
         """The containers that are alive, by address."""
-        states = list(self._containers.values())  # at once, as others change it
+        states = list(self._containers.values())  # a copy, as other threads change it
         return sorted(states, key=lambda state: str(state.address))
 
     def removed(self, key: ServiceKey) -> bool:
-        """Whether the provider was deregistered in a boot that still lives."""
+        """Whether the provider was deregistered in a boot that is still alive."""
         state = self._containers.get(key.address)
         return state is not None and key.provider in state.removed
 
     def moved_to(self, key: ServiceKey) -> str:
-        """Where its provider moved, if it was deregistered for that: ``identity/container/epoch/domain/provider``."""
+        """The new place of a provider that moved: ``identity/container/epoch/domain/provider``."""
         state = self._containers.get(key.address)
         return "" if state is None else state.removed.get(key.provider, "")
 
 
 def gone_to(label: str, moved_to: str) -> ServiceGone:
-    """The error of who calls a service that has moved."""
+    """The error for a caller of a service that has moved."""
     container = moved_to.split("/")[1] if moved_to.count("/") == _SLASHES else "another one"
     return ServiceGone(service=label, reason=f"its provider has moved to container {container}", moved_to=moved_to)
 

@@ -1,4 +1,4 @@
-"""What a look-up that found nothing, or too much, tells its caller: what there is instead, and what tells it apart."""
+"""Errors of lookups with no match or too many: they suggest similar services and show how matches differ."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -24,14 +24,14 @@ def no_such_service(
     apart: Sequence[str] = (),
     hidden: str = "",
 ) -> NoSuchService:
-    """The error of a look-up without a match.
+    """The error of a lookup without a match.
 
     Args:
-        constraint: what was looked for.
-        records: all services there are.
-        waited_s: how long, in seconds.
-        apart: where there is no link, and why (`Reachability`).
-        hidden: why the policy does not let it be seen.
+        constraint: the constraint of the lookup.
+        records: all services that exist.
+        waited_s: how long the lookup waited, in seconds.
+        apart: missing links, and the reasons (`Reachability`).
+        hidden: why the policy hides the service.
     """
     known = list(records)
     groups = sorted({group for record in known for group in record.groups} - {DOMAIN})
@@ -53,7 +53,7 @@ def asked_for(constraint: Constraint, field: str) -> str:
 
 
 def _near(group: str, name: str, groups: Sequence[str], records: Sequence[Record]) -> tuple[str, ...]:
-    """What looks like what was asked for. A stop is never proposed beside anything else that is near."""
+    """Similar services. A stop is never suggested if any other service is similar."""
     if not name:
         return tuple(difflib.get_close_matches(group, groups, n=_MOST, cutoff=_LIKE))
     names = set(difflib.get_close_matches(name, sorted({record.name for record in records}), n=20, cutoff=_NAME_LIKE))
@@ -71,7 +71,7 @@ def _near(group: str, name: str, groups: Sequence[str], records: Sequence[Record
 
 
 def too_many_services(constraint: Constraint, matches: Sequence[Record]) -> TooManyServices:
-    """The error of a look-up with several matches: each named so that it differs from the others."""
+    """The error of a lookup with several matches: each is named so that it differs from the others."""
     texts = [f"{record.label} in {record.container}" for record in matches]
     if len(set(texts)) < len(texts):
         texts = [f"{record.label} of {record.key.provider} in {record.container}" for record in matches]

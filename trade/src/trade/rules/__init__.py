@@ -1,4 +1,4 @@
-"""Rules that configure a running system, from a TOML file: on this occasion, if this holds, call these services."""
+"""Rules that configure a running system, from a TOML file: when an event occurs and a condition holds, make calls."""
 
 from trade._protocol.schema_types import publish as _publish
 from trade.rules._engine import GROUP, DryRun, RuleInfo, Rules, rehearse

@@ -1,4 +1,4 @@
-"""Rules that configure a running system: on this occasion, if this holds, take these steps."""
+"""The rule engine: when an event occurs and a condition holds, run steps that configure the system."""
 
 import itertools
 import logging
@@ -21,10 +21,10 @@ from trade.rules._steps import TURNS, Firing, LoopDetector, Mark, StepResult, Wa
 
 GROUP: Final = "rules"
 MOST: Final = 5
-"""So often a rule fires within `WITHIN_S` for the same service; more is a loop."""
+"""A rule that fires this often within `WITHIN_S` for one service is in a loop."""
 WITHIN_S: Final = 60.0
 LOOK_S: Final = 1.0
-"""How often it is looked whether a service is missing."""
+"""How often to check whether a service is missing."""
 _KEPT: Final = 200
 _LONGEST_HEALTH: Final = 500
 
@@ -32,29 +32,29 @@ _logger = logging.getLogger("trade.rules")
 
 
 class RuleInfo(Struct, frozen=True, kw_only=True):
-    """One rule, as everybody may know it."""
+    """The public description of one rule."""
 
     name: str
     occasion: str
     condition: str
     container: str
-    """Where it runs, with whose rights."""
+    """The container that runs it, with whose rights."""
     state: str
     """``standing``, or ``stopped`` until the file is read again."""
     why: str
-    """It was stopped."""
+    """Why it was stopped."""
     cooldown_s: float
     fired: int
     failed: int
-    """Times a step failed, or the condition could not be asked."""
+    """How often a step failed, or the condition could not be checked."""
     skipped: int
-    """Occasions during the cooldown."""
+    """Events during the cooldown."""
     last_error: str
     dry_run: bool
 
 
 class _ActiveRule:
-    """One rule at work. Its occasions are told of one after the other."""
+    """One active rule. Its events are handled one after the other."""
 
     def __init__(self, engine: "Rules", name: str, rule: Rule) -> None:
         self.name: Final = name
@@ -64,13 +64,13 @@ class _ActiveRule:
         self.why = ""
         self._notifications: list[Notification] = []
         self._resting: dict[str, int] = {}
-        """Services, and until when nothing is done for them."""
+        """Services, each with the end of its cooldown."""
         self._recent: deque[tuple[int, str]] = deque()
-        """When it fired, for which service."""
+        """Its recent firings: time and service."""
         self._not_so_ns = time.monotonic_ns()
-        """When what it waits for was last seen not to be so."""
+        """The last time that its condition did not hold."""
         self._way: Way = ()
-        """What led to its being so, while it is."""
+        """The causes of its condition, while it holds."""
         self._fired = self._failed = self._skipped = 0
         self._last_error = ""
 
@@ -112,7 +112,7 @@ class _ActiveRule:
             dry_run=self._engine.dry_run,
         )
 
-    # --- occasions
+    # --- events
 
     def _happened(self, about: Handle) -> None:
         now = time.monotonic_ns()
@@ -123,7 +123,7 @@ class _ActiveRule:
 
     def _altered(self, about: Handle) -> None:
         selection = self.rule.when.selection
-        if selection is not None and selection.constraint().matches(about.record):  # and has not just ceased to
+        if selection is not None and selection.constraint().matches(about.record):  # and still matches
             self._happened(about)
 
     def _there(self, _about: Handle) -> None:
@@ -143,7 +143,7 @@ class _ActiveRule:
         if not held:
             self._not_so()
             return
-        if self.rule.when.every_s is None or self.rule.if_ is not None:  # time alone has no cause
+        if self.rule.when.every_s is None or self.rule.if_ is not None:  # the clock has no cause
             self._way = self._way or self._way_to("", self._not_so_ns)
         self._fire(about, self._way or (Mark(self.name),))
 
@@ -153,7 +153,7 @@ class _ActiveRule:
     def _holds(self, about: Handle | None) -> tuple[bool, Handle | None]:
         try:
             return holds(self._engine.container, self.rule.if_, about)
-        except Exception as error:  # noqa: BLE001 - a condition that cannot be asked does not hold, and is told of
+        except Exception as error:  # noqa: BLE001 - a condition that fails does not hold, and is reported
             self._fail(f"{type(error).__name__}: {error}")
             return False, about
 
@@ -186,11 +186,11 @@ class _ActiveRule:
         return fired(self.name, str(self.rule.when), about, way, dry_run=self._engine.dry_run, stopped=stopped)
 
     def _loop(self, way: Way) -> str:
-        """Why it must not fire once more, if it must not."""
+        """Why it must not fire again; empty if it may."""
         if turns(way) >= TURNS:
             last_turn = max(place for place, mark in enumerate(way[:-1]) if mark == way[-1])
             circle = " -> ".join(mark.rule for mark in way[last_turn:])
-            return f"it brings itself about, {turns(way)} times over: {circle}"
+            return f"it triggers itself, {turns(way)} times over: {circle}"
         if self.rule.when.every_s is not None:
             return ""
         since_ns = time.monotonic_ns() - int(WITHIN_S * 1e9)
@@ -206,13 +206,13 @@ class _ActiveRule:
 
     def _fail(self, error: str) -> None:
         self._failed += 1
-        if error != self._last_error:  # the same again says nothing new
+        if error != self._last_error:  # the same error again is not news
             self._last_error = error
             _logger.warning("rule %s: %s", self.name, error)
 
 
 class Rules:
-    """The rules of a file at work in a container, with its identity and rights. Ends with ``close()``.
+    """Runs the rules of a file in a container, with its identity and rights. Ends with ``close()``.
 
     It is a provider in group ``rules``; its health names the rules that were stopped.
     """
@@ -226,18 +226,18 @@ class Rules:
         dry_run: bool = False,
         tell: Callable[[Firing], object] = lambda _firing: None,
     ) -> None:
-        """Begin.
+        """Start the rules.
 
         Args:
-            container: where they run.
+            container: the container that runs them.
             file: the rules file.
-            audit: a file that gets a line of JSON for every firing; the logger ``trade.rules`` gets them all the same.
-            dry_run: look at what would be called on each occasion, and call nothing.
+            audit: a file that gets a line of JSON for every firing, in addition to the logger ``trade.rules``.
+            dry_run: report the calls of each event without making them.
             tell: called with every firing, on the thread that fired.
 
         Raises:
-            ConfigurationError: the file is wrong, and says where.
-            AccessDenied: the policy does not let this container offer something in group ``rules``.
+            ConfigurationError: the file is wrong; the error names the place.
+            AccessDenied: the policy does not let this container offer services in group ``rules``.
         """
         self.container: Final = container
         self.dry_run: Final = dry_run
@@ -254,12 +254,12 @@ class Rules:
         container.note_change("rules read", str(file))
 
     def load(self, file: Path) -> None:
-        """Go by another file, or by the same one as it is now. Rules that it leaves as they are go on undisturbed.
+        """Replace the rules by those of a file. Unchanged rules continue undisturbed.
 
-        Those that were stopped begin anew.
+        Stopped rules start again.
 
         Raises:
-            ConfigurationError: it is wrong, and says where; all goes on as before.
+            ConfigurationError: the file is wrong; the error names the place, and the old rules stay.
         """
         self._go_by(read_rules(file))
         self.container.note_change("rules read", str(file))
@@ -277,16 +277,16 @@ class Rules:
 
     @service(effect="read")
     def rules(self) -> list[RuleInfo]:
-        """The rules that stand here, and how they fare."""
+        """The active rules, with their state."""
         return [standing.info() for _, standing in sorted(self._standing.items())]
 
     @service(effect="read")
     def rule_firings(self) -> list[Firing]:
-        """The last firings, the oldest first."""
+        """The last firings, oldest first."""
         return list(self._firings)
 
     def note(self, firing: Firing) -> None:
-        """Told by a rule that fired, or was stopped."""
+        """Called by a rule that fired, or was stopped."""
         self._firings.append(firing)
         line = msgspec.json.encode(firing).decode()
         _logger.log(logging.ERROR if firing.stopped else logging.INFO, "%s", line)
@@ -307,7 +307,7 @@ class Rules:
         self.container.set_health(self, health)
 
     def close(self) -> None:
-        """End all rules; what fires finishes. Idempotent."""
+        """End all rules; running firings finish. Idempotent."""
         if not self._closed:
             self._closed = True
             for standing in self._standing.values():
@@ -322,20 +322,20 @@ class Rules:
 
 
 class DryRun(Struct, frozen=True, kw_only=True):
-    """What a rule would do."""
+    """The result of a rehearsal of a rule."""
 
     rule: str
     occasion: str
     condition: str
     now: str
-    """How things stand."""
+    """The current state of its condition."""
     fires: bool
     """Whether it would fire now."""
     steps: tuple[StepResult, ...]
 
 
 def rehearse(container: Container, rules: dict[str, Rule]) -> list[DryRun]:
-    """What the rules would do as things are now, in that container. Reads conditions, and calls nothing else."""
+    """Rehearse rules in a container's current state. Checks conditions, and calls nothing else."""
     return [_rehearsed(container, name, rule) for name, rule in rules.items()]
 
 
@@ -351,7 +351,7 @@ def _rehearsed(container: Container, name: str, rule: Rule) -> DryRun:
         try:
             held, about = holds(container, rule.if_, about)
             now.append("the condition holds" if held else "the condition does not hold")
-        except Exception as error:  # noqa: BLE001 - told in its place
+        except Exception as error:  # noqa: BLE001 - part of the result
             held = False
             now.append(f"the condition cannot be asked: {type(error).__name__}: {error}")
         fires = fires and held

@@ -1,4 +1,4 @@
-"""A rules file: on which occasion what is called. Everything in it is checked before any of it counts."""
+"""A rules file: events and the calls to make. The whole file is checked before any of it applies."""
 
 import math
 import re
@@ -18,9 +18,9 @@ from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
 SERVICE: Final = "$service"
-"""Stands for the service that joined, left or changed; if the occasion is about none, for the one that ``if`` asks."""
+"""The service that joined, left or changed; for an event without one, the service that ``if`` calls."""
 CONTAINER: Final = "$container"
-"""Stands for the name of its container."""
+"""The name of that service's container."""
 
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
@@ -33,7 +33,7 @@ _EXAMPLES: Final = {
 
 
 class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which services: the words of `where` that are plain data; of several each must hold."""
+    """A selection of services: the words of `where` that are plain data; all of them must hold."""
 
     name: str | None = None
     group: str | None = None
@@ -47,7 +47,7 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     healthy: bool | None = None
 
     def constraint(self, about: Handle | None = None) -> Constraint:
-        """The same as a constraint; ``about``: the service that the occasion is about."""
+        """The selection as a constraint; ``about``: the service of the event."""
         container = about.container if about is not None and self.container == CONTAINER else self.container
         return where(
             name=self.name,
@@ -64,29 +64,29 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a rule fires: exactly one of these."""
+    """The event of a rule: exactly one of these."""
 
     joined: Selection | None = None
     left: Selection | None = None
     changed: Selection | None = None
-    """A service matches after its groups, metadata, health or description have become others."""
+    """A service matches after a change of its groups, metadata, health or description."""
     missing: Selection | None = None
-    """As long as no service matches."""
+    """While no service matches."""
     every_s: float | None = None
 
     @property
     def kind(self) -> str:
-        """The one that it is."""
+        """The kind of the event."""
         return next(name for name in self.__struct_fields__ if getattr(self, name) is not None)
 
     @property
     def selection(self) -> Selection | None:
-        """Which services it is about."""
+        """The services that the event is about."""
         return self.joined or self.left or self.changed or self.missing
 
     @property
     def of_services(self) -> bool:
-        """Whether there is a ``$service``."""
+        """Whether ``$service`` exists."""
         return self.missing is None and self.every_s is None
 
     def __str__(self) -> str:
@@ -96,21 +96,21 @@ class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Condition(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"is_": "is"}):
-    """A service that only reads, and what it must answer: True, if nothing is said."""
+    """A service that only reads, and the result it must have: True by default."""
 
     service: Selection
     args: list[Any] | dict[str, Any] = []
     field: str = ""
-    """Of its answer."""
+    """A field of its result."""
     above: float | None = None
     below: float | None = None
     is_: Scalar | UnsetType = UNSET
 
     def holds(self, answer: Any) -> bool:
-        """Whether that answer is as it must be.
+        """Whether a result meets the condition.
 
         Raises:
-            ConfigurationError: it cannot be compared.
+            ConfigurationError: the result cannot be compared.
         """
         value = _picked(answer, self.field)
         if self.is_ is not UNSET:
@@ -142,10 +142,10 @@ def _picked(answer: Any, field: str) -> Any:
 
 
 class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A call of the only service that matches, or waiting until there is one."""
+    """A call of the only service that matches, or a wait until one matches."""
 
     call: Selection | str | None = None
-    """``$service``: the one that the rule is about."""
+    """``$service``: the service of the event."""
     args: list[Any] | dict[str, Any] = []
     """In order, or by name."""
     deadline_s: float = 10.0
@@ -153,7 +153,7 @@ class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     s: float = 10.0
     """How long to wait."""
     always: bool = False
-    """Also after a step that failed."""
+    """Run it even after a failed step."""
 
     def __str__(self) -> str:
         if isinstance(self.wait_for, Selection):
@@ -168,11 +168,11 @@ class Rule(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename
     do: list[Step]
     if_: Condition | None = None
     cooldown_s: float = 0.0
-    """After it has fired, for the same service, occasions are left out for so long."""
+    """After it has fired, events of the same service are ignored for this time."""
 
 
 class RulesFile(Struct, frozen=True, forbid_unknown_fields=True):
-    """All of it."""
+    """A whole rules file."""
 
     rule: dict[str, Any]
 
@@ -181,7 +181,7 @@ def read_rules(path: Path) -> dict[str, Rule]:
     """Read and check a rules file; the rules by name.
 
     Raises:
-        ConfigurationError: names the file, the key and what would be right.
+        ConfigurationError: names the file, the key and the right form.
     """
     file = str(path)
     try:
@@ -189,7 +189,7 @@ def read_rules(path: Path) -> dict[str, Rule]:
         raw = read_toml_text(text)
     except OSError as bad:
         raise ConfigurationError(where=file, problem=f"cannot be read: {bad.strerror or bad}") from None
-    except ValueError as bad:  # no TOML, or no UTF-8
+    except ValueError as bad:  # not TOML, or not UTF-8
         raise ConfigurationError(where=file, problem=f"not valid TOML: {bad}") from None
     tables = _converted(raw, RulesFile, file, "").rule
     rules: dict[str, Rule] = {}
@@ -219,14 +219,14 @@ def _converted(raw: Any, kind: Any, where: str, joint: str) -> Any:
 
 
 def _known(path: str, kind: Any) -> str:
-    """The keys that there are at that place."""
+    """The valid keys at a place."""
     last = re.sub(r"\[.*?\]", "", path).rpartition(".")[2]
     kinds: dict[str, Any] = {"": kind, "when": Occasion, "if": Condition, "do": Step}
     return f"there is {', '.join(kinds.get(last, Selection).__struct_encode_fields__)}"
 
 
 class _Check:
-    """What the types do not say."""
+    """Checks that the types cannot express."""
 
     def __init__(self, rule: Rule, at: str) -> None:
         self._rule = rule
@@ -287,11 +287,11 @@ class _Check:
             self._wrong(at, bad.problem)
 
     def _filled(self, value: Any, at: str, *, known: bool = True) -> None:
-        """What stands for something does so; ``known``: once there is a condition, too."""
+        """Checks the placeholders in a value; ``known``: including a condition's."""
         about = self._rule.when.of_services or (known and self._rule.if_ is not None)
         for text in _texts(value):
             if text.startswith("$") and text not in (SERVICE, CONTAINER):
-                self._wrong(at, f"{text!r} stands for nothing; there is {SERVICE} and {CONTAINER}")
+                self._wrong(at, f"{text!r} is no placeholder; there is {SERVICE} and {CONTAINER}")
             if text in (SERVICE, CONTAINER) and not about:
                 problem = f"{text} is of rules with joined, left, changed or if; this one has {self._rule.when.kind}"
                 self._wrong(at, problem)
@@ -313,7 +313,7 @@ def _texts(value: Any) -> list[str]:
 
 
 def filled(value: Any, about: Handle | None) -> Any:
-    """A value of the file with what ``$service`` and ``$container`` stand for."""
+    """A value of the file with ``$service`` and ``$container`` replaced."""
     if isinstance(value, Mapping):
         return {key: filled(one, about) for key, one in cast("Mapping[str, Any]", value).items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""What a rule does when it fires, what it would do, and what keeps rules from firing each other for ever."""
+"""Runs or rehearses the steps of a rule, and detects rules that fire each other in a loop."""
 
 import threading
 import time
@@ -15,26 +15,26 @@ from trade.errors import ConfigurationError
 from trade.rules._file import SERVICE, Condition, Selection, Step, filled
 
 AFTERMATH_NS: Final = 5_000_000_000
-"""What steps bring about shows within so long."""
+"""The time within which the effects of steps appear."""
 TURNS: Final = 3
-"""So often a rule may be among the causes of its own firing."""
+"""The number of times that a rule may be among the causes of its own firing."""
 _MOST: Final = 1000
 _LONGEST: Final = 64
 
 
 class Mark(NamedTuple):
-    """A rule, and the service it fired about, if any."""
+    """A rule, and the service it fired for, if any."""
 
     rule: str
     service: str = ""
 
 
 Way = tuple[Mark, ...]
-"""What led to a firing, the first cause first; it comes last."""
+"""The causes of a firing, the first one first; it ends with the firing itself."""
 
 
 class Past:
-    """A firing that is under way or over."""
+    """A firing that is running or over."""
 
     def __init__(self, way: Way) -> None:
         self.way: Final = way
@@ -49,20 +49,20 @@ class LoopDetector:
         self._past: deque[Past] = deque(maxlen=_MOST)
 
     def begin(self, way: Way) -> Past:
-        """A rule fires; whoever says so sets ``ended_ns`` when that is over."""
+        """A rule fires; the caller sets ``ended_ns`` at its end."""
         past = Past(way)
         with self._lock:
             self._past.append(past)
         return past
 
     def forget(self, rule: str) -> None:
-        """It begins anew: what it did before leads to nothing any more."""
+        """A rule starts again: its earlier firings are no causes any more."""
         with self._lock:
             kept = [past for past in self._past if all(mark.rule != rule for mark in past.way)]
             self._past = deque(kept, maxlen=_MOST)
 
     def way_to(self, mark: Mark, since_ns: int) -> Way:
-        """What may have led to an occasion that came about between then and now, and the occasion."""
+        """The possible causes of an event between two times, followed by the event."""
         with self._lock:
             latest = list(reversed(self._past))
         ways = [past.way for past in latest if past.ended_ns is None or past.ended_ns + AFTERMATH_NS >= since_ns]
@@ -71,7 +71,7 @@ class LoopDetector:
 
 
 def turns(way: Way) -> int:
-    """How often the last of a way stands in it before."""
+    """How often the last mark of a way occurs in it before."""
     return way[:-1].count(way[-1]) if way else 0
 
 
@@ -79,7 +79,7 @@ _LONGEST_RESULT: Final = 200
 
 
 class RuleHost(Protocol):
-    """What rules need of the container they run in."""
+    """The functions of a container that rules use."""
 
     @property
     def address(self) -> Address: ...
@@ -91,15 +91,15 @@ class RuleHost(Protocol):
 
 
 class StepResult(Struct, frozen=True, kw_only=True):
-    """One step as it was done. Arguments are not repeated: they stand in the file, and may be secret."""
+    """The result of one step. Arguments are not repeated: they are in the file, and may be secret."""
 
     step: str
     service: str = ""
-    """What was called, or waited for."""
+    """The service that was called, or waited for."""
     container: str = ""
     result: str = ""
     error: str = ""
-    """Its type and message."""
+    """Type and message of the error."""
 
 
 class Firing(Struct, frozen=True, kw_only=True):
@@ -108,21 +108,21 @@ class Firing(Struct, frozen=True, kw_only=True):
     rule: str
     occasion: str
     service: str = ""
-    """Which it was about, if any."""
+    """The service of the event, if any."""
     at: float
     """Seconds since the epoch."""
     took_s: float = 0.0
     steps: tuple[StepResult, ...] = ()
     led_by: tuple[str, ...] = ()
-    """Rules that may have brought it about, the first cause first."""
+    """Rules that may have caused it, the first cause first."""
     dry_run: bool = False
-    """Nothing was called: it says what would have been."""
+    """Whether it only reports the calls, without making them."""
     stopped: str = ""
-    """Why it does not fire any more."""
+    """Why it no longer fires."""
 
     @property
     def ok(self) -> bool:
-        """Whether it was done, every step of it."""
+        """Whether every step succeeded."""
         return not self.stopped and not any(did.error for did in self.steps)
 
 
@@ -140,9 +140,9 @@ def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: 
 
 
 def done(home: RuleHost, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
-    """Do the steps one after the other, up to one that fails; beyond it only those that are to be done always.
+    """Run steps one after the other, up to one that fails; after that, only those with ``always``.
 
-    In a dry run each is looked at, and nothing is called.
+    In a dry run each step is checked, and nothing is called.
     """
     do: Callable[[RuleHost, Step, Handle | None], StepResult] = _rehearse if dry_run else _do
     all_done: list[StepResult] = []
@@ -152,7 +152,7 @@ def done(home: RuleHost, steps: Sequence[Step], about: Handle | None, *, dry_run
             continue
         try:
             did = do(home, step, about)
-        except Exception as error:  # noqa: BLE001 - whatever a service raises is noted
+        except Exception as error:  # noqa: BLE001 - every error of a service is recorded
             did, failed = StepResult(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
         all_done.append(did)
     return tuple(all_done)
@@ -176,7 +176,7 @@ def _rehearse(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
             step=str(step),
             service=there.label if there else "",
             container=there.container if there else "",
-            result="is there" if there else "would wait for it",
+            result="exists" if there else "would wait for it",
         )
     handle = _called(home, step, about)
     home.require_call(home.address.identity, handle)
@@ -197,9 +197,9 @@ def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None
 
 
 def holds(home: RuleHost, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
-    """Whether a rule's condition holds now, and which service the steps are about: if the occasion has none, the asked.
+    """Whether a rule's condition holds, and the service for its steps: the event's, else the condition's.
 
-    Raises what finding and asking the service does.
+    Raises the errors of finding and calling the service.
     """
     if condition is None:
         return True, about

@@ -1,4 +1,4 @@
-"""For tests of what is built on TRADE: a whole system in one process, and suites that implementations must pass.
+"""Tools for tests of programs that use TRADE: a whole system in one process, and suites for implementations.
 
 Nothing here needs a test framework; the suites are plain classes with ``test_`` methods, run in a subclass by pytest.
 """

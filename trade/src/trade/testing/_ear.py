@@ -1,4 +1,4 @@
-"""What the suites listen with: a channel read with a deadline, and meeting points."""
+"""The suites' listeners: a channel read with a deadline, and meeting points."""
 
 import contextlib
 import itertools
@@ -10,13 +10,13 @@ from typing import Final
 from trade._transport.base import Channel, ChannelClosed, Message, Transport
 
 PATIENCE_S: Final = 10.0
-"""How long a test waits for what must come; far above what it takes."""
+"""How long a test waits for something that must come; far longer than it takes."""
 
 _meetings = itertools.count()
 
 
 class RecordingListener:
-    """Reads a channel on threads of its own, which end when the channel closes."""
+    """Reads a channel on its own threads, which end when the channel closes."""
 
     def __init__(self, channel: Channel, *, readers: int = 1) -> None:
         self.channel: Final = channel
@@ -36,7 +36,7 @@ class RecordingListener:
         """The next message.
 
         Raises:
-            AssertionError: none came.
+            AssertionError: no message came.
         """
         try:
             return self._heard.get(timeout=PATIENCE_S)
@@ -44,7 +44,7 @@ class RecordingListener:
             raise AssertionError(f"nothing was heard for {PATIENCE_S} s") from None
 
     def until(self, key: str, payload: bytes | None) -> list[Message]:
-        """Everything up to and without a certain message."""
+        """All messages before a certain one."""
         heard: list[Message] = []
         while (message := self.next()) != Message(key, payload):
             heard.append(message)
@@ -58,7 +58,7 @@ class RecordingListener:
 
 
 class Teller:
-    """Answers whoever asks with what stands, on a thread of its own that ends when the transport closes."""
+    """Answers queries with announcements, on its own thread, which ends when the transport closes."""
 
     def __init__(self, transport: Transport, pattern: str, standing: Mapping[str, bytes]) -> None:
         self.questions: Final = transport.questions(pattern)
@@ -76,14 +76,14 @@ class Teller:
 
 
 def listen(listener: Transport, pattern: str, *, speaker: Transport) -> RecordingListener:
-    """Subscribe, and wait until the speaker knows."""
+    """Subscribe, and wait until the speaker knows of it."""
     ear = RecordingListener(listener.subscribe(pattern))
     meet(listener=listener, speaker=speaker)
     return ear
 
 
 def meet(*, listener: Transport, speaker: Transport) -> None:
-    """What the listener has subscribed, the speaker reaches from now on: it sees a sign that rose after it."""
+    """Wait until messages reach the listener's subscriptions: it sees a sign of life published after them."""
     point = f"meeting/{next(_meetings)}"
     ear = RecordingListener(speaker.presences(point))
     sign = listener.appear(point)

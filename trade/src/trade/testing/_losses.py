@@ -1,4 +1,4 @@
-"""What every transport must do when it loses another one and finds it again."""
+"""Conformance of transports: losing another transport and finding it again."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -15,20 +15,20 @@ __all__ = ["LossConformance", "Severable"]
 
 
 class Severable(NamedTuple):
-    """Two transports and what lies between them."""
+    """Two transports and the link between them."""
 
     one: Transport
     other: Transport
     sever: Callable[[], None]
-    """Let them lose each other: when this returns or soon after, signs of life fall on both sides."""
+    """Disconnect them: when this returns or soon after, signs of life disappear on both sides."""
     mend: Callable[[], None]
-    """Let them find each other again, some time after this returns."""
+    """Reconnect them, within some time after this returns."""
 
 
 class LossConformance(ABC):
-    """What holds when transports lose each other and come back, both alive all the time.
+    """The guarantees when transports lose each other and come back, both alive throughout.
 
-    Subclass it under a name that pytest collects and say how such a pair is made.
+    Subclass it under a name that pytest collects and define how to create such a pair.
     """
 
     @abstractmethod
@@ -90,7 +90,7 @@ class LossConformance(ABC):
 
 
 class _Lost:
-    """The first of two, lost to the second; knows when it is back."""
+    """The first of two transports, lost to the second; knows when it is back."""
 
     def __init__(self, one: Transport, other: Transport, sever: Callable[[], None]) -> None:
         self._ear = RecordingListener(other.presences("alive/one"))

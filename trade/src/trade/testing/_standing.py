@@ -1,4 +1,4 @@
-"""What every transport must do with what stands: announcements and signs of life."""
+"""Conformance of transports: announcements, queries and signs of life."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -13,14 +13,14 @@ from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
 
 
 class StandingConformance(ABC):
-    """The part of `TransportConformance` that is about what stands."""
+    """The part of `TransportConformance` about announcements, queries and signs of life."""
 
     @abstractmethod
     def network(self) -> AbstractContextManager[Callable[[], Transport]]:
         """An empty network; it is closed with all its transports at the end.
 
         Returns:
-            A context manager that gives a function. Each call of that opens one more transport and returns when it is
+            A context manager that yields a function. Each call of it opens one more transport and returns when that is
             linked with those opened before.
         """
 
@@ -60,7 +60,7 @@ class StandingConformance(ABC):
             other.announce("shop/other", b"1")
             assert ear.next() == Message("shop/other", b"1")
 
-    # --- questions
+    # --- queries
 
     def test_who_asks_is_told_all_that_stands_by_each_who_answers(self) -> None:
         with self.network() as open_transport:

@@ -1,4 +1,4 @@
-"""A whole system in one process: containers on a network in memory, with faults on demand and no waiting for time."""
+"""A whole system in one process: containers on a network in memory, with faults on demand and a simulated clock."""
 
 import contextlib
 import math
@@ -19,15 +19,15 @@ _TAKING_NOTE_S: Final = 10.0
 _LOOK_AGAIN_S: Final = 0.0005
 
 Named = Container | str
-"""A container, or the name it was started under."""
+"""A container, or the name it was started with."""
 
 
 class MemorySystem:
     """The containers of one test; made by `memory_system`.
 
-    What one container sends arrives at the others at once, unless ``delay`` or ``partition`` say otherwise; their
-    threads take note of it when they run, at the latest when ``settle`` returns. The network has a clock of its own,
-    moved by ``advance`` and its kind alone; deadlines of calls go by the real one.
+    Messages arrive at other containers at once, unless ``delay`` or ``partition`` is set; the containers' threads
+    handle them when they run, at the latest when ``settle`` returns. The network has its own clock, moved only by
+    ``advance`` and its like; deadlines of calls use the real one.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class MemorySystem:
     # --- containers
 
     def container(self, name: str, *, identity: str = "tester", instantiable: Sequence[str] = ()) -> Container:
-        """The container of that name, started if there is none or if it was killed or closed."""
+        """The container of a name, started if it does not run."""
         node = self.network.node(name)
         if node is not None and not node.closed:
             return self._containers[name]
@@ -63,9 +63,9 @@ class MemorySystem:
         return container
 
     def kill(self, container: Named) -> None:
-        """End it as a killed process ends: everything at once, no goodbye.
+        """End a container like a killed process: all at once, without a goodbye.
 
-        Its threads learn that the transport is closed; whatever provider still runs is nobody's any more.
+        Its threads learn that the transport is closed; providers that still run have lost their container.
         """
         self.network.kill(self._node(container))
 
@@ -77,24 +77,24 @@ class MemorySystem:
     # --- faults
 
     def partition(self, one: Named, other: Named, *, one_way: bool = False) -> None:
-        """Cut what lies between two containers; ``one_way``: only what the first one sends.
+        """Cut the link between two containers; ``one_way``: only for messages of the first one.
 
-        What is sent waits. After the lease (``advance``) the two lose each other and what has waited is lost.
+        Messages wait. After the lease (``advance``) the two lose each other and the waiting messages are lost.
         """
         self.network.partition(self._node(one), self._node(other), one_way=one_way)
 
     def heal(self, one: Named | None = None, other: Named | None = None) -> None:
-        """End the partition of two containers, or all of one, or all."""
+        """End the partition of two containers, of one from all, or of all."""
         nodes = [None if named is None else self._node(named) for named in (one, other)]
         self.network.heal(*nodes)
 
     def delay(self, least_s: float, *, jitter_s: float = 0.0, between: tuple[Named, Named] | None = None) -> None:
-        """Let messages travel for ``least_s`` and up to ``jitter_s`` seconds more, drawn from the system's seed.
+        """Delay messages by ``least_s`` and up to ``jitter_s`` seconds more, drawn from the system's seed.
 
         Args:
             least_s: the shortest time, in seconds.
-            jitter_s: how much longer it may take.
-            between: two containers; none: all of them, also those to come.
+            jitter_s: the largest additional time, in seconds.
+            between: two containers; None: all, including later ones.
         """
         nodes = None if between is None else (self._node(between[0]), self._node(between[1]))
         self.network.delay(least_s, jitter_s=jitter_s, between=nodes)
@@ -113,12 +113,12 @@ class MemorySystem:
     # --- time
 
     def advance(self, duration_s: float) -> None:
-        """Move the network's time on: messages arrive, leases end; containers have taken note when this returns."""
+        """Advance the network's time: messages arrive, leases end; containers have handled them on return."""
         self.clock.advance(duration_s)
         self._take_note()
 
     def settle(self) -> None:
-        """Move the network's time on until nothing is under way and all containers have taken note of what arrived."""
+        """Advance the network's time until no message is in flight and all containers have handled what arrived."""
         self.network.traffic.settle()
         self._take_note()
 
@@ -126,32 +126,32 @@ class MemorySystem:
         deadline = time.monotonic() + _TAKING_NOTE_S
         while any(self._node(name).busy for name in list(self._containers)) or self._catching_up():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"a container has not taken note of what arrived within {_TAKING_NOTE_S} s")
+                raise TimeoutError(f"a container has not handled what arrived within {_TAKING_NOTE_S} s")
             threading.Event().wait(_LOOK_AGAIN_S)
 
     def _catching_up(self) -> bool:
         return any(c.catching_up for name, c in list(self._containers.items()) if not self._node(name).closed)
 
     def drive(self, until: Callable[[], bool], limit_s: float = 10.0) -> None:
-        """Move the network's time on, message by message, until something holds that containers bring about.
+        """Advance the network's time, message by message, until a condition holds that containers bring about.
 
         Raises:
-            TimeoutError: it does not hold after ``limit_s`` seconds of the real clock.
+            TimeoutError: the condition does not hold after ``limit_s`` seconds of the real clock.
         """
         self.network.traffic.drive(until, limit_s)
 
     def flowing(self) -> contextlib.AbstractContextManager[None]:
-        """While this lasts, time moves on by itself with the messages: blocking calls over delayed links return."""
+        """Lets the time advance by itself with the messages: blocking calls over delayed links return."""
         return self.network.traffic.flowing()
 
-    # --- what passed
+    # --- messages
 
     def sent(self, *kinds: Kind) -> int:
-        """How many messages went from one container to another so far, of these kinds or of all."""
+        """The number of messages between containers so far, of these kinds or of all."""
         return sum(count for kind, count in self.network.sent.items() if kind in kinds or not kinds)
 
     def tap(self, hear: Callable[[InFlightMessage], None]) -> Callable[[], None]:
-        """Hear of every message between two containers; see `Network.tap`. Returns what ends it."""
+        """See every message between two containers; see `Network.tap`. Returns a function that ends it."""
         return self.network.tap(hear)
 
 
@@ -162,11 +162,11 @@ def memory_system(
     """A system in memory for one test; its containers are closed at the end.
 
     Args:
-        seed: of the generator that draws jitter.
+        seed: seed of the generator of jitter.
         lease_s: how long a partition lasts, on the network's clock, until containers lose each other.
-        beat_s: how soon after an announcement a container says how far it is, in seconds of the real clock: who lost
-            that asks then.
-        state_dir: where containers keep what outlives them, such as open e-stops; none: nowhere.
+        beat_s: the interval of revision announcements, in seconds of the real clock: a container that missed an
+            announcement queries after it.
+        state_dir: folder for what outlives containers, such as open e-stops; None: nothing is kept.
     """
     system = MemorySystem(seed=seed, lease_s=lease_s, beat_s=beat_s, state_dir=state_dir)
     try:

@@ -1,4 +1,4 @@
-"""What every transport must do: the guarantees of `_transport.base`, each a test of its own."""
+"""Conformance of transports: the guarantees of `_transport.base`, each with its own test."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -19,7 +19,7 @@ _BIG_BYTES = 8 * 1024 * 1024
 
 
 class TransportConformance(StandingConformance):
-    """The guarantees of a transport. Subclass it under a name that pytest collects and say how a network is made.
+    """The guarantees of a transport. Subclass it under a name that pytest collects and define how to create a network.
 
     Example::
 
@@ -79,7 +79,7 @@ class TransportConformance(StandingConformance):
         with self.pair() as (one, other):
             for pattern, fitting in fits.items():
                 ear = listen(other, pattern, speaker=one)
-                for key in sorted(keys, key=fitting.__contains__):  # those that must not be heard first
+                for key in sorted(keys, key=fitting.__contains__):  # those that must not be received first
                     one.publish(key).put(b"")
                 assert {ear.next().key for _ in fitting} == fitting, pattern
                 ear.channel.close()
@@ -141,7 +141,7 @@ class TransportConformance(StandingConformance):
             ear = listen(other, "room/a", speaker=one)
             publisher = one.publish("room/a", urgent=True, droppable=True)
             numbers = [str(number).encode() for number in range(100)]
-            for number in numbers:  # one at a time: two that come at once may be one too many
+            for number in numbers:  # one at a time: of two at once one may be dropped
                 publisher.put(number)
                 assert ear.next().payload == number
 
@@ -250,7 +250,7 @@ class TransportConformance(StandingConformance):
         with self.pair() as (one, _):
             channel, interrupted = one.subscribe("room/a"), False
             timer = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT))
-            before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
+            before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
             try:
                 timer.start()
                 channel.receive()
@@ -276,7 +276,7 @@ def _refuses(action: Callable[[], object]) -> bool:
 
 @contextlib.contextmanager
 def _flood(transport: Transport, key: str, payload: bytes) -> Generator[None, None, None]:
-    """Put without a pause from another thread."""
+    """Publish without a pause from another thread."""
     done, publisher = threading.Event(), transport.publish(key)
 
     def put() -> None:
