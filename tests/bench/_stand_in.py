@@ -24,7 +24,7 @@ _ANSWER_S = 20.0
 
 def offer_of(container: Container) -> Offer:
     """What a container tells those who ask it."""
-    standing = dict(container._parts.announcer._standing)
+    standing = dict(container._parts.announcer._current)
     return {(key.split("/")[1], key.split("/")[-1]): decode_provider(payload) for key, payload in standing.items()}
 
 

@@ -37,5 +37,5 @@ def test_an_error_with_a_moment_that_is_none_says_what_it_is(at: float) -> None:
 
 @pytest.mark.parametrize("at", [*NO_MOMENTS, -1.0])
 def test_nothing_is_done_at_a_moment_that_is_none(at: float) -> None:
-    with pytest.raises(ConfigurationError, match="no such moment"):
+    with pytest.raises(ConfigurationError, match="not a valid time"):
         TriggerSpec(occasion="at", at=at).check()

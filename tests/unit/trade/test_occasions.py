@@ -240,8 +240,8 @@ def test_after_counts_from_when_its_condition_holds(
         (lambda here: here.after(-1, print), "s must be seconds, from 0"),
         (lambda here: here.once(print, when=bool, poll_s=0), "poll_s must be seconds, from 0.001"),
         (lambda here: here.at(datetime.now(timezone.utc) - timedelta(seconds=9), print), "has passed, 9"),
-        (lambda here: here.at(datetime.now(), print), "names no time zone"),  # noqa: DTZ005
-        (lambda here: here.at("noon", print), "a datetime says when, not 'noon'"),
+        (lambda here: here.at(datetime.now(), print), "has no time zone"),  # noqa: DTZ005
+        (lambda here: here.at("noon", print), "the time must be a datetime, not 'noon'"),
         (lambda here: here.once("go"), "call must be a handle"),
         (lambda here: here.once(print, if_=True), "a condition must be a handle"),
         (lambda here: here.every(1, print, if_=lambda _percent: True), "a condition is called without arguments"),

@@ -267,7 +267,7 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it listens with the one it was started with, a renewed one in its folder does not help."""
-    monkeypatch.setattr(certificates, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificates, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
     with caplog.at_level(logging.WARNING, "trade"):
         for name, hours in (("arm", 22), ("leg", 23)):
             start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
@@ -280,7 +280,7 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
 def test_the_end_of_a_certificate_is_told_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certificates, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificates, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
     until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
     with caplog.at_level(logging.WARNING, "trade"):
         ending = certificates.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until))

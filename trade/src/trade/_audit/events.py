@@ -258,7 +258,7 @@ class Audited(Interceptor):
         if self._timed is not None:
             self._timed.add(time.monotonic_ns() - began_ns, failed=False)
         if self._rule.always:
-            self._say(call, self._rule.kind, "ok", "", began_ns, outer_id)
+            self._report(call, self._rule.kind, "ok", "", began_ns, outer_id)
         return result
 
     def rejected(self, call: ServedCall, error: BaseException) -> None:
@@ -271,10 +271,10 @@ class Audited(Interceptor):
             self._calls.refuse(type(error).__name__)
         if refused or self._rule.always:
             kind: Kind = "refused" if refused else self._rule.kind
-            told = isinstance(error, TradeError) and not call.service.signature.has_secrets
-            self._say(call, kind, type(error).__name__, str(error) if told else "", began_ns, outer_id)
+            shown = isinstance(error, TradeError) and not call.service.signature.has_secrets
+            self._report(call, kind, type(error).__name__, str(error) if shown else "", began_ns, outer_id)
 
-    def _say(self, call: ServedCall, kind: Kind, outcome: str, why: str, began_ns: int, outer_id: int) -> None:
+    def _report(self, call: ServedCall, kind: Kind, outcome: str, why: str, began_ns: int, outer_id: int) -> None:
         if self._tell is None:
             return
         about: Any = ""

@@ -115,9 +115,9 @@ def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | N
         broken_at, problem = 1, f"rows 1 to {first - 1} are missing, and no row says that just these were dropped"
     if problem:
         return ChainCheck(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
-    told = _dropped_before(first, dropped, witnessed)
-    broken_at, problem = next(((seq, _ANOTHER) for seq, right in told.items() if not right), (0, ""))
-    untold = tuple(sorted(seq for seq in witnessed if seq < first and seq not in told))
+    matched = _dropped_before(first, dropped, witnessed)
+    broken_at, problem = next(((seq, _ANOTHER) for seq, right in matched.items() if not right), (0, ""))
+    untold = tuple(sorted(seq for seq in witnessed if seq < first and seq not in matched))
     return ChainCheck(
         rows=rows,
         first=first,

@@ -117,7 +117,7 @@ class AuditWriter:
             self._some.clear()
             if time.monotonic() - looked >= _LOOK_S:
                 looked, self._to_drop = time.monotonic(), True
-                self._say_head("is at")
+                self._log_head("is at")
             self._write_all(last=False)
         self._write_all(last=True)
         self._part()
@@ -145,18 +145,18 @@ class AuditWriter:
         for _ in range(min(_BATCH, len(self._waiting))):
             self._rows.append(_row_of(self._waiting.popleft(), self._boot))
 
-    def _write(self, *, anew: bool = True) -> bool:
+    def _write(self, *, retry: bool = True) -> bool:
         """Write the rows, into a new file if the present one is corrupt. Returns whether that succeeded."""
         fresh = self._store is None
         try:
             self._store = self._store or AuditStore(self._path)
             self._head = self._store.add(self._rows)
         except (sqlite3.OperationalError, OSError) as trouble:  # no space, no permission, read-only: may be temporary
-            self._say_trouble(str(trouble))
+            self._log_trouble(str(trouble))
             return False
         except sqlite3.DatabaseError as broken:
-            self._let_go()
-            return anew and self._move_aside(str(broken)) and self._write(anew=False)
+            self._close_store()
+            return retry and self._move_aside(str(broken)) and self._write(retry=False)
         self.written += len(self._rows)
         self._unlooked += len(self._rows)
         self._to_drop = self._to_drop or fresh or self._unlooked >= 10 * self._keep.piece
@@ -165,11 +165,11 @@ class AuditWriter:
             self._trouble = ""
             _logger.warning("audit: %s is written again", self._path)
         if fresh:
-            self._say_head("continues at")
+            self._log_head("continues at")
         return True
 
-    def _say_trouble(self, trouble: str) -> None:
-        self._let_go()
+    def _log_trouble(self, trouble: str) -> None:
+        self._close_store()
         if trouble != self._trouble:  # the same trouble again is not news
             self._trouble = trouble
             _logger.error(
@@ -184,7 +184,7 @@ class AuditWriter:
         try:
             aside = move_aside(self._path, str(self._clocks()[0] // 1_000_000))
         except OSError as trouble:
-            self._say_trouble(f"it is broken ({broken}), and cannot be moved aside: {trouble}")
+            self._log_trouble(f"it is broken ({broken}), and cannot be moved aside: {trouble}")
             return False
         _logger.error("audit: %s is broken (%s); it is %s now, a new one was started", self._path, broken, aside.name)
         self._rows.insert(
@@ -200,7 +200,7 @@ class AuditWriter:
         try:
             self._to_drop = self._store.drop(keep, self._row("", "")) > 0
         except (sqlite3.Error, OSError) as trouble:
-            self._say_trouble(f"old rows cannot be dropped: {trouble}")
+            self._log_trouble(f"old rows cannot be dropped: {trouble}")
             return False
         self._unlooked = 0
         return True
@@ -211,15 +211,15 @@ class AuditWriter:
             self._write()
         if unwritten := sum(row.kind != "audit" for row in self._rows) + len(self._waiting):
             _logger.error("audit: %d records of %s were never written", unwritten, self._path)
-        self._say_head("ends at")
-        self._let_go()
+        self._log_head("ends at")
+        self._close_store()
 
-    def _let_go(self) -> None:
+    def _close_store(self) -> None:
         if self._store is not None:
             self._store.close()
             self._store = None
 
-    def _say_head(self, verb: str) -> None:
+    def _log_head(self, verb: str) -> None:
         """Log the end of the record: a witness in another place."""
         if self._head.seq:
             _logger.info("audit: %s %s row %d, %s", self._path, verb, self._head.seq, self._head.hash.hex())

@@ -25,7 +25,7 @@ class Announcer:
         self._transport = transport
         self._own = own
         self._lock = threading.Lock()
-        self._standing: dict[str, bytes] = {}
+        self._current: dict[str, bytes] = {}
         self._revision = 0
         self._shown = False
         self._quiet = 0
@@ -53,9 +53,9 @@ class Announcer:
         with self._lock:
             self._revision, self._quiet = info.revision, 0
             if info.services:
-                self._standing[key] = payload
+                self._current[key] = payload
             else:
-                self._standing.pop(key, None)
+                self._current.pop(key, None)
         if self._shown:
             self._transport.announce(key, payload)
 
@@ -91,8 +91,8 @@ class Announcer:
 
     def _answer(self, question: Question) -> None:
         with self._lock:
-            standing, revision = list(self._standing.items()), self._revision
-        for key, payload in standing:
+            current, revision = list(self._current.items()), self._revision
+        for key, payload in current:
             question.answer(key, payload)
         question.answer(tally_key(self._own), encode_message(Tally(PROTOCOL, revision)))
 

@@ -137,7 +137,7 @@ class Dialer:
                 if not self._has_work():
                     self._thread = None
                     return
-            for step in (self._discover, self._redial, self._judge):
+            for step in (self._discover, self._redial, self._report_refusals):
                 try:
                     step()
                 except Exception:
@@ -165,7 +165,7 @@ class Dialer:
                 if there and endpoint in self._kept:
                     self._kept[endpoint] = there
 
-    def _judge(self) -> None:
+    def _report_refusals(self) -> None:
         """Warn once about each configured endpoint that refuses this container; nothing else would report it."""
         self._unsure = [endpoint for endpoint in self._unsure if not self._links.linked_at(endpoint)]
         if time.monotonic() < self._unsure_until:

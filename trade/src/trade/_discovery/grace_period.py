@@ -37,7 +37,7 @@ class GracePeriods:
         self._due: dict[str, tuple[float, bool]] = {}
         """When to check a session, and whether it is gone then."""
         self._changed = threading.Condition()
-        self._telling = threading.Lock()
+        self._reporting = threading.Lock()
         """Held while a session's end is reported: a session that returns just then waits, and counts as a new one."""
         self._thread: threading.Thread | None = None
         self._closed = False
@@ -56,18 +56,18 @@ class GracePeriods:
 
         If its end is being reported right now, this waits until it was.
         """
-        with self._telling:
-            return self._came_out(session)
+        with self._reporting:
+            return self._forget(session)
 
-    def _came_out(self, session: str) -> bool:
+    def _forget(self, session: str) -> bool:
         """Forget a session; returns whether it had a period."""
         with self._changed:
             return self._due.pop(session, None) is not None
 
     def _run(self) -> None:
         while (session := self._next()) is not None:
-            with self._telling:
-                if self._came_out(session):
+            with self._reporting:
+                if self._forget(session):
                     self._gone(session)
 
     def _next(self) -> str | None:

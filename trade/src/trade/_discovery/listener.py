@@ -122,7 +122,7 @@ class RegistryListener:
         except Malformed as bad:
             self._drop(message.key, bad)
             return
-        if self._registry.tells_open(address, domain, provider, estops):
+        if self._registry.set_open_estops(address, domain, provider, estops):
             self._learn(estops, address)
 
     def _sign(self, message: Message) -> None:
@@ -190,7 +190,7 @@ class RegistryListener:
         if state is not None and revision is not None:
             self._registry.settle(state, revision, offered)  # the tally comes last; without it the reply is incomplete
         elif state is not None and others and others[-1][0].key == tally_key(state.address):
-            state.heard.all_told(0)  # its entries have no tally: one query is enough
+            state.heard.replied(0)  # its entries have no tally: one query is enough
 
     def _drop(self, key: str, bad: Exception) -> None:
         self.malformed += 1

@@ -178,7 +178,7 @@ class HookInterceptor(Interceptor):
         service, _, _, context = call
         called = self._called(call)
         if self._before and service.effect != "stop":
-            self._tell(self._before, called, context)
+            self._call(self._before, called, context)
             if service.too_late(context.expires_ns):
                 raise DeadlineExceeded(service=service.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
         result, error = None, ""
@@ -194,12 +194,12 @@ class HookInterceptor(Interceptor):
                     called, ended=True, result=self._plain(result), error=error, took_s=took_s
                 )
                 if service.effect == "stop":  # nothing holds up the answer to a stop
-                    self._scheduler.begin(lambda: self._tell(self._after, ended, context), time.monotonic_ns())
+                    self._scheduler.begin(lambda: self._call(self._after, ended, context), time.monotonic_ns())
                 else:
-                    self._tell(self._after, ended, context)
+                    self._call(self._after, ended, context)
         return result
 
-    def _tell(self, hooks: Sequence[AttachedHook], called: HookEvent, context: CallContext) -> None:
+    def _call(self, hooks: Sequence[AttachedHook], called: HookEvent, context: CallContext) -> None:
         chain = (*context.chain, context.service)
         until_ns = time.monotonic_ns() + int(ALL_S * 1e9)
         with _as_the_container(context):

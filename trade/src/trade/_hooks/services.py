@@ -22,8 +22,8 @@ class HookServices:
     def __init__(self, hooks: Hooks, home: NotificationServicesHost, access: Authorizer) -> None:
         self._hooks = hooks
         self._watched = home
-        self._judge = access
-        hooks.suspended = self._tell_who_attached
+        self._hook_access = access
+        hooks.suspended = self._notify_hook_owner
 
     @service
     def attach_hook(
@@ -41,7 +41,7 @@ class HookServices:
         asked, found = served_call(), self._hooks.named(name)
         for hook in found:
             if hook.identity != asked.caller:
-                self._judge.require(asked.caller, "administer", DOMAIN, f"hook {name}")
+                self._hook_access.require(asked.caller, "administer", DOMAIN, f"hook {name}")
             self._hooks.detach(hook.owner, name)
         return bool(found)
 
@@ -57,8 +57,8 @@ class HookServices:
             "hook %s (%s), attached from here, is suspended by %s: %s", name, call, served_call().session, error
         )
 
-    def _tell_who_attached(self, hook: AttachedHook) -> None:
+    def _notify_hook_owner(self, hook: AttachedHook) -> None:
         owner = Address(*hook.owner.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # the owner has gone
-            told = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
-            told.start(hook.name, hook.call.label, hook.last_error)
+            suspended = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
+            suspended.start(hook.name, hook.call.label, hook.last_error)

@@ -64,7 +64,7 @@ class ProviderFactory:
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
                 raise NoSuchClass(class_path=class_path, container=where, reason=str(error)) from None
-            raise CannotInstantiate(class_path=class_path, container=where, problem=_told(error)) from error
+            raise CannotInstantiate(class_path=class_path, container=where, problem=_error_text(error)) from error
         for part in qualified.split("."):
             found = getattr(found, "__dict__", {}).get(part)
         if not isinstance(found, type):
@@ -79,7 +79,7 @@ class ProviderFactory:
             return kind(**args) if isinstance(args, Mapping) else kind(*args)
         except Exception as error:
             where = self._home.address.container
-            raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_told(error)) from error
+            raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_error_text(error)) from error
 
     def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
         """Register a created object; close it if that fails."""
@@ -102,7 +102,7 @@ class ProviderFactory:
             made = self._made.get(id(provider))
         return () if made is None else made.args
 
-    def let_go(self, provider: object) -> None:
+    def release(self, provider: object) -> None:
         """Close a provider that has moved away, so that it is not offered again, whatever created it."""
         self._withdrawn.forget(provider)
         with self._lock:
@@ -120,7 +120,7 @@ class ProviderFactory:
             raise ConfigurationError(where=service.label, problem=problem)
         if self._withdrawn.offer(key.provider) is None:
             self._withdrawn.take_off(key)
-        self.let_go(made.provider)
+        self.release(made.provider)
 
     def close(self) -> None:
         """Close all objects created here. Idempotent."""
@@ -145,5 +145,5 @@ def end(made: object) -> None:
             _logger.exception("%s could not be closed", type(made).__qualname__)
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

@@ -212,7 +212,7 @@ class MigrationSource:
             self._ask(there, "arrive", _ARRIVE_S, ticket)
         except (OutcomeUnknown, ContainerLost):
             try:
-                if not self._came(keys, ticket):
+                if not self._is_offered(keys, ticket):
                     problem = "it was not offered there in time"
             except TradeError as error:
                 here = self._home.address.container
@@ -224,9 +224,9 @@ class MigrationSource:
         if problem:
             self._withdrawn.put_back(name, None)
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem, withdrawn=True)
-        self._making.let_go(offer.provider)
+        self._making.release(offer.provider)
 
-    def _came(self, keys: list[ServiceKey], ticket: str) -> bool:
+    def _is_offered(self, keys: list[ServiceKey], ticket: str) -> bool:
         """Whether the target offers it; if not, it never will. Raises TradeError if the target cannot be asked."""
         return self._home.has(keys[0]) or self._ask(keys[0].address, "arrived", _ASK_S, ticket)
 

@@ -70,12 +70,12 @@ class _Ready(Struct, eq=False):
 def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
     """A text that is equal for two classes of one path with the same services and the same version of their state."""
     marked = marked_methods(kind, implements)
-    told = [
+    services = [
         structs.replace(Signature(name, name, mark, function, codec).info, doc="")
         for name, (mark, function) in sorted(marked.items())
     ]
     version = str(getattr(kind, "state_version", ""))
-    return hashlib.sha256(encode_message((path_of(kind), version, is_stateful(kind), told))).hexdigest()
+    return hashlib.sha256(encode_message((path_of(kind), version, is_stateful(kind), services))).hexdigest()
 
 
 class MigrationTarget:

@@ -221,7 +221,7 @@ class ActiveNotification(Notification):
             return None
         match self.terms.occasion:
             case "joined" | "left" | "changed":
-                return self._tell()
+                return self._report()
             case "every":
                 return self._tick(now)
             case "at":
@@ -250,7 +250,7 @@ class ActiveNotification(Notification):
             self._due_ns += missed * period
         return self._due_ns
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         while self._concerned and self._state is State.STANDING:
             self._fire(self._concerned.popleft())
 

@@ -27,10 +27,10 @@ class Notifier:
         self._epoch = epoch
         self._handle = handle
         self._lock = threading.Lock()
-        self._standing: dict[str, ActiveNotification] = {}
+        self._notifications: dict[str, ActiveNotification] = {}
         self._of_services: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
         self._count = 0
-        self.failed: Callable[[ActiveNotification, str], None] = lambda _standing, _error: None
+        self.failed: Callable[[ActiveNotification, str], None] = lambda _notification, _error: None
         """Called for each failure of a notification of another container."""
         self.ended: Callable[[str], None] = lambda _session: None
         """Called when a session of another container has no notification here any more."""
@@ -51,81 +51,83 @@ class Notifier:
         """
         terms.check()
         with self._lock:
-            if owner.identity and len(self._standing) >= _MOST:
-                problem = f"{len(self._standing)} notifications are active here already"
+            if owner.identity and len(self._notifications) >= _MOST:
+                problem = f"{len(self._notifications)} notifications are active here already"
                 raise ConfigurationError(where=self._home.name, problem=problem)
             self._count += 1
             name = f"{self._epoch}.{self._count}"
-            standing = ActiveNotification(name, terms, call, if_, when, owner, self._home, self._forget, self._failed)
-            self._standing[name] = standing
+            notification = ActiveNotification(
+                name, terms, call, if_, when, owner, self._home, self._forget, self._failed
+            )
+            self._notifications[name] = notification
             for record in existing:
-                standing.add(self._handle(record))
-            again = standing.begin(self._scheduler)
+                notification.add(self._handle(record))
+            again = notification.begin(self._scheduler)
             if terms.occasion in OF_SERVICES:
-                self._of_services[name] = (standing, again)
-        return standing
+                self._of_services[name] = (notification, again)
+        return notification
 
-    def _failed(self, standing: ActiveNotification, error: str) -> None:
-        if standing.owner.identity:
-            self.failed(standing, error)
+    def _failed(self, notification: ActiveNotification, error: str) -> None:
+        if notification.owner.identity:
+            self.failed(notification, error)
 
-    def _forget(self, standing: ActiveNotification) -> None:
+    def _forget(self, notification: ActiveNotification) -> None:
         with self._lock:
-            self._standing.pop(standing.id, None)
-            self._of_services.pop(standing.id, None)
-        if standing.owner.identity:
-            self.tidy(standing.owner.session)
+            self._notifications.pop(notification.id, None)
+            self._of_services.pop(notification.id, None)
+        if notification.owner.identity:
+            self.tidy(notification.owner.session)
 
     def tidy(self, session: str) -> None:
         """Check whether a session still has notifications here."""
         with self._lock:
-            left = any(one.owner.session == session for one in self._standing.values())
+            left = any(one.owner.session == session for one in self._notifications.values())
         if not left:
             self.ended(session)
 
     def changed(self, change: Change) -> None:
         """Called by the registry."""
         with self._lock:
-            told = list(self._of_services.values())
+            active = list(self._of_services.values())
         now = time.monotonic_ns()
-        for standing, again in told:
-            concerned = _concerned(standing, change)
+        for notification, again in active:
+            concerned = _concerned(notification, change)
             for record in concerned:
-                standing.add(self._handle(record))
+                notification.add(self._handle(record))
             if concerned:
                 again(now)
 
     def session_ended(self, session: str) -> None:
         """End the notifications of a session that ended, except detached ones."""
         with self._lock:
-            orphans = [one for one in self._standing.values() if one.owner.session == session and not one.detached]
-        for standing in orphans:
-            standing.cancel()
+            orphans = [one for one in self._notifications.values() if one.owner.session == session and not one.detached]
+        for notification in orphans:
+            notification.cancel()
         self.tidy(session)
 
     def get(self, name: str) -> ActiveNotification | None:
-        return self._standing.get(name)
+        return self._notifications.get(name)
 
     def infos(self) -> list[NotificationInfo]:
         """The notifications of this container, oldest first."""
         with self._lock:
-            standing = list(self._standing.values())
-        return [one.info() for one in standing]
+            notifications = list(self._notifications.values())
+        return [one.info() for one in notifications]
 
     def close(self) -> None:
         """End all. Idempotent."""
         with self._lock:
-            standing = list(self._standing.values())
-        for one in standing:
+            notifications = list(self._notifications.values())
+        for one in notifications:
             one.cancel()
 
 
-def _concerned(standing: ActiveNotification, change: Change) -> list[Record]:
-    match standing.terms.occasion:
+def _concerned(notification: ActiveNotification, change: Change) -> list[Record]:
+    match notification.terms.occasion:
         case "joined":
-            return [record for record in change.joined if standing.concerns(record)]
+            return [record for record in change.joined if notification.concerns(record)]
         case "left":
-            return [record for record in change.left if standing.concerns(record)]
+            return [record for record in change.left if notification.concerns(record)]
         case _:
             altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
-            return [new for old, new in altered if standing.concerns(old) or standing.concerns(new)]
+            return [new for old, new in altered if notification.concerns(old) or notification.concerns(new)]

@@ -66,7 +66,7 @@ class NotificationServices:
         self._home = home
         self._rights = access
         self._guests = Guests(home.open_session)
-        notifier.failed = self._tell_owner
+        notifier.failed = self._notify_owner
         notifier.ended = self._guests.leave
 
     @service
@@ -87,18 +87,18 @@ class NotificationServices:
     @service
     def cancel_notification(self, notification: str) -> bool:
         """End a notification in this container; returns whether it existed. Another owner's requires ``administer``."""
-        standing = self._mine_or_administered(notification)
-        if standing is not None:
-            standing.cancel()
-        return standing is not None
+        active = self._mine_or_administered(notification)
+        if active is not None:
+            active.cancel()
+        return active is not None
 
     @service
     def detach_notification(self, notification: str) -> None:
         """Let a notification in this container outlive its owner."""
-        standing = self._mine_or_administered(notification)
-        if standing is None:
+        active = self._mine_or_administered(notification)
+        if active is None:
             raise NoSuchNotification(id=notification)
-        standing.detach()
+        active.detach()
 
     @service
     def notification_failed(self, notification: str, text: str, error: str) -> None:
@@ -108,16 +108,16 @@ class NotificationServices:
         )
 
     def _mine_or_administered(self, notification: str) -> ActiveNotification | None:
-        standing, asked = self._notifier.get(notification), served_call()
-        if standing is not None and (standing.owner.identity or self._home.address.identity) != asked.caller:
+        active, asked = self._notifier.get(notification), served_call()
+        if active is not None and (active.owner.identity or self._home.address.identity) != asked.caller:
             self._rights.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
-        return standing
+        return active
 
-    def _tell_owner(self, standing: ActiveNotification, error: str) -> None:
-        owner = Address(*standing.owner.session.split("/")[:3])
+    def _notify_owner(self, active: ActiveNotification, error: str) -> None:
+        owner = Address(*active.owner.session.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # the owner has gone
-            told = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
-            told.start(standing.id, str(standing.terms), error)
+            failed = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
+            failed.start(active.id, str(active.terms), error)
 
 
 def placed(

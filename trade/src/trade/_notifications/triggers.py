@@ -1,4 +1,4 @@
-"""What a notification is asked for with: an occasion, a call to make, conditions. Data, so that it can be sent."""
+"""Triggers of notifications: an event, a call to make, and conditions. Plain data that can be sent."""
 
 import inspect
 import math
@@ -17,12 +17,12 @@ OF_SERVICES: Final = frozenset({"joined", "left", "changed"})
 
 SHORTEST_S: Final = 0.001
 _YEAR_10000_S: Final = 253_402_300_800
-"""Since 1970."""
+"""In seconds since 1970."""
 LONGEST_S: Final = 10 * 366 * 86_400.0
 
 
 class Action(Struct, frozen=True):
-    """A call that can be sent: of a service, or of the only one that matches when the time has come."""
+    """A call that can be sent: of a service, or of the only one that matches at that time."""
 
     handle: Handle | None = None
     constraint: Constraint | None = None
@@ -37,26 +37,26 @@ class Action(Struct, frozen=True):
 
 
 What = Callable[..., Any] | Handle | Bound | Constraint
-"""What may be called: a service, a bound call, the only service that matches, or a function of this process."""
+"""The target of a call: a service, a bound call, a constraint with one match, or a function of this process."""
 Target = Action | Callable[..., Any]
 
 
 class TriggerSpec(Struct, frozen=True, kw_only=True):
-    """The occasion."""
+    """The event of a notification."""
 
     occasion: Trigger
     constraint: Constraint | None = None
-    """Which services, of joined, left, changed."""
+    """The services of joined, left and changed."""
     existing: bool = False
     s: float = 0.0
     at: float = 0.0
     """Seconds since the epoch."""
     poll_s: float = 1.0
-    """How often ``when`` is asked."""
+    """How often ``when`` is checked."""
     edge: bool = False
 
     def check(self) -> None:
-        """Raises ConfigurationError: no such time."""
+        """Raises ConfigurationError: an invalid time."""
         if self.occasion in OF_SERVICES and self.constraint is None:
             raise ConfigurationError(where=f"trade.{self.occasion}", problem="say which services, with where(...)")
         if self.occasion == "every":
@@ -64,7 +64,7 @@ class TriggerSpec(Struct, frozen=True, kw_only=True):
         elif self.occasion == "after":
             _check_s(self.occasion, "s", self.s, 0.0)
         elif self.occasion == "at" and not 0 <= self.at < _YEAR_10000_S:
-            raise ConfigurationError(where="trade.at", problem=f"there is no such moment: {self.at!r} s since 1970")
+            raise ConfigurationError(where="trade.at", problem=f"{self.at!r} s since 1970 is not a valid time")
         _check_s(self.occasion, "poll_s", self.poll_s, SHORTEST_S)
 
     def __str__(self) -> str:
@@ -87,15 +87,15 @@ def _check_s(occasion: str, name: str, value: float, least: float) -> None:
 
 
 def epoch_s(moment: datetime, now_s: float) -> float:
-    """A moment as seconds since the epoch.
+    """A time as seconds since the epoch.
 
     Raises:
-        ConfigurationError: it has passed, or names no time zone.
+        ConfigurationError: it has passed, or has no time zone.
     """
     if not isinstance(moment, datetime):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise ConfigurationError(where="trade.at", problem=f"a datetime says when, not {moment!r}")
+        raise ConfigurationError(where="trade.at", problem=f"the time must be a datetime, not {moment!r}")
     if moment.tzinfo is None or moment.utcoffset() is None:
-        problem = f"{moment} names no time zone; {moment!r}.astimezone() is that moment by this computer's"
+        problem = f"{moment} has no time zone; {moment!r}.astimezone() adds that of this computer"
         raise ConfigurationError(where="trade.at", problem=problem)
     if moment.timestamp() <= now_s:
         ago_s = now_s - moment.timestamp()
@@ -104,16 +104,16 @@ def epoch_s(moment: datetime, now_s: float) -> float:
 
 
 def target_of(what: What, where: str, argument: str, given: int) -> Target:
-    """What to call, as data if it can be.
+    """The target of a call, as data if possible.
 
     Args:
         what: a service, a bound call, a constraint or a function.
-        where: for whom, for the error.
-        argument: which one it is, for the error.
-        given: so many values it is called with.
+        where: the caller's function, for the error.
+        argument: the name of the argument, for the error.
+        given: the number of values that it is called with.
 
     Raises:
-        ConfigurationError: it cannot be called, or not with so many values.
+        ConfigurationError: it cannot be called, or not with this number of values.
     """
     if isinstance(what, Handle):
         return Action(handle=what)
@@ -131,7 +131,7 @@ def target_of(what: What, where: str, argument: str, given: int) -> Target:
 def _check_takes(function: Callable[..., Any], where: str, argument: str, given: int) -> None:
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # one of C: only calling it shows
+    except (TypeError, ValueError):  # a C function: only a call shows that
         return
     try:
         signature.bind(*range(given))
@@ -142,7 +142,7 @@ def _check_takes(function: Callable[..., Any], where: str, argument: str, given:
 
 
 def deed_of(target: Target, host: str, where: str) -> Action:
-    """The same for another container. Raises ConfigurationError: that one cannot call a function of this process."""
+    """The target for another container. Raises ConfigurationError: that one cannot call a function of this process."""
     if isinstance(target, Action):
         return target
     problem = (
@@ -153,7 +153,7 @@ def deed_of(target: Target, host: str, where: str) -> Action:
 
 
 def text_of(target: Target) -> str:
-    """For people. An object of the middleware's own says of its methods what they are, as ``told_as``."""
+    """The target as text. Methods of the middleware's own objects are described by the object's ``told_as``."""
     if isinstance(target, Action):
         return str(target)
     told_as: str = getattr(getattr(target, "__self__", None), "told_as", "")

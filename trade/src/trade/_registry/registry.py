@@ -72,7 +72,7 @@ MayOffer = Callable[[str, str, str, Sequence[str]], bool]
 """Whether an identity may offer a provider: identity, domain, provider, groups."""
 
 
-def _anybody(_identity: str, _domain: str, _provider: str, _groups: Sequence[str]) -> bool:
+def _every_identity(_identity: str, _domain: str, _provider: str, _groups: Sequence[str]) -> bool:
     return True
 
 
@@ -93,7 +93,7 @@ class ContainerState:
 
     def open_estops(self) -> list[Estop]:
         """The open e-stops of ``estops``."""
-        return [estop for told in list(self.estops.values()) for estop in told]
+        return [estop for opened in list(self.estops.values()) for estop in opened]
 
 
 class Change(NamedTuple):
@@ -127,7 +127,7 @@ class Registry:
     def __init__(
         self,
         own: Address,
-        may_offer: MayOffer = _anybody,
+        may_offer: MayOffer = _every_identity,
         may_offer_anything: Callable[[str], bool] = lambda _: True,
     ) -> None:
         self._own = own
@@ -139,7 +139,7 @@ class Registry:
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
         self._changed = InterruptibleCondition()
-        self._telling = threading.RLock()
+        self._notifying = threading.RLock()
         self.changes: Final = Event[Change]()
         """Services that joined, left or were replaced."""
         self.appear(own)
@@ -147,14 +147,14 @@ class Registry:
 
     def between_changes(self, action: Callable[[], None]) -> None:
         """Run an action between two changes; subscribers are called before or after it."""
-        with self._telling:
+        with self._notifying:
             action()
 
     # --- feeding
 
     def put(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> bool:
         """A container announces a provider, or its end. Returns whether no earlier announcement was missed."""
-        with self._telling:
+        with self._notifying:
             with self._lock:
                 state = self._containers.get(address)
                 if state is None:
@@ -162,9 +162,9 @@ class Registry:
                 if info.revision <= state.heard.answered:  # its reply contained this revision
                     return state.heard.complete
                 state.protocol = PROTOCOL
-                state.heard.told(info.revision)
+                state.heard.announced(info.revision)
                 change = self._change(state, {provider: (domain, info)}, [] if info.services else [provider])
-            self._tell(change)
+            self._notify(change)
             return state.heard.complete
 
     def count(self, address: Address, revision: int) -> bool:
@@ -187,7 +187,7 @@ class Registry:
             self._changed.notify_all()
             return True
 
-    def tells_open(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
+    def set_open_estops(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
         """A container of another version reports open e-stops. Returns whether it is registered and may report them."""
         if not self._may_offer(address.identity, domain, provider, (domain,)):
             return False
@@ -204,17 +204,17 @@ class Registry:
 
         A reply to a query from before its sign of life disappeared is ignored.
         """
-        with self._telling:
+        with self._notifying:
             with self._lock:
                 if self._containers.get(state.address) is not state or revision < state.heard.answered:
                     return
                 known = state.providers.items()
                 gone = [name for name, entry in known if name not in offered and entry.info.revision <= revision]
                 state.protocol = PROTOCOL
-                state.heard.all_told(revision)
+                state.heard.replied(revision)
                 change = self._change(state, offered, gone)
                 self._changed.notify_all()
-            self._tell(change)
+            self._notify(change)
 
     def appear(self, address: Address) -> bool:
         """A container's sign of life appeared. Returns whether that is news."""
@@ -238,11 +238,11 @@ class Registry:
 
     def vanish(self, address: Address) -> None:
         """A container's sign of life disappeared: remove it until it returns and is queried."""
-        with self._telling:
+        with self._notifying:
             with self._lock:
                 state = self._containers.pop(address, None)
                 change = self._swap([] if state is None else _all(state), [])
-            self._tell(change)
+            self._notify(change)
 
     def _change(
         self, state: ContainerState, entries: Mapping[str, tuple[str, ProviderInfo]], gone: Sequence[str]
@@ -268,7 +268,7 @@ class Registry:
 
     def recheck_access(self) -> None:
         """The rights to offer have changed: remove services that may no longer be offered, add those that may now."""
-        with self._telling:
+        with self._notifying:
             with self._lock:
                 before, after = list[Record](), list[Record]()
                 for state in self._containers.values():
@@ -279,7 +279,7 @@ class Registry:
                             before += entry.records
                             after += made
                 change = self._swap(before, after)
-            self._tell(change)
+            self._notify(change)
 
     def _make(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> list[Record]:
         if not self._may_offer(address.identity, domain, provider, info.groups):
@@ -319,7 +319,7 @@ class Registry:
             before=[old[key] for key in new if key in old],
         )
 
-    def _tell(self, change: Change) -> None:
+    def _notify(self, change: Change) -> None:
         if any(change):
             self.changes.emit(change)
 

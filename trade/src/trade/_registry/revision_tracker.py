@@ -22,7 +22,7 @@ class RevisionTracker:
         """Whether everything is known up to the highest revision heard of."""
         return self.answered >= self._first - 1
 
-    def told(self, revision: int) -> None:
+    def announced(self, revision: int) -> None:
         """An announcement of a revision has arrived."""
         if revision > self._last + 1:
             self._first = revision
@@ -33,7 +33,7 @@ class RevisionTracker:
         if revision > self._last:
             self._first, self._last = revision + 1, revision
 
-    def all_told(self, revision: int) -> None:
+    def replied(self, revision: int) -> None:
         """It replied with everything at a revision."""
         self.answered = max(self.answered, revision)
         self.counted(revision)

@@ -119,8 +119,8 @@ def missing_there(
     ended = _run(host, name, ssh_words(host, ssh_config, words))
     if ended.returncode != 0:
         raise _refusal(host, name, command[0], words, ended)
-    told = ended.stdout.splitlines()  # and any output of its shell
-    return [file for file in files if file in told]
+    missing = ended.stdout.splitlines()  # and any output of its shell
+    return [file for file in files if file in missing]
 
 
 def end_there(host: str, name: str, pid: int, ssh_config: Path | None) -> None:

@@ -73,7 +73,7 @@ SOME_HAVE: Final = {
 }
 """Likewise, for functions of containers that supervise others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
-_OF_EVERYBODY: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor")
+_OPEN_TO_ALL: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor")
 """The providers of these functions: offering them needs no right, as each of their callers is checked."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}
@@ -193,7 +193,7 @@ class Authorizer:
         """Whether an identity may offer what a registry entry describes: own functions, or what the policy allows."""
         if self.policy is None:
             return True
-        if domain == DOMAIN and provider in _OF_EVERYBODY and tuple(groups) == (DOMAIN,):
+        if domain == DOMAIN and provider in _OPEN_TO_ALL and tuple(groups) == (DOMAIN,):
             return self.policy.authenticated(who).allowed
         return all(self.policy.decide(who, "register", group).allowed for group in (domain, *groups))
 

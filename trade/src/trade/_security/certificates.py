@@ -185,7 +185,7 @@ def _refusal(refused: ssl.SSLCertVerificationError) -> str:
 
 _logger = logging.getLogger("trade")
 
-_TOLD: Final = (timedelta(days=1), timedelta(hours=1))
+_WARN_AHEAD: Final = (timedelta(days=1), timedelta(hours=1))
 """Times before the end at which a warning is logged, each once; times already past at the start cause one warning."""
 _LOOK_S: Final = 600.0
 """A computer that slept checks the time again within this interval."""
@@ -196,27 +196,27 @@ class ExpiryWatch:
 
     def __init__(self, certificate: Certificate) -> None:
         self._certificate = certificate
-        self._told = 0
+        self._warned = 0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trade-certificate", daemon=True)
-        self._tell()
+        self._warn()
         self._thread.start()
 
     def _run(self) -> None:
-        while self._told < len(_TOLD) and not self._closed.wait(self._until_next_s()):
-            self._tell()
+        while self._warned < len(_WARN_AHEAD) and not self._closed.wait(self._until_next_s()):
+            self._warn()
 
     def _until_next_s(self) -> float:
-        left = self._left() - _TOLD[self._told]
+        left = self._left() - _WARN_AHEAD[self._warned]
         return min(_LOOK_S, max(0.0, left.total_seconds()))
 
     def _left(self) -> timedelta:
         return self._certificate.until - datetime.now(timezone.utc)
 
-    def _tell(self) -> None:
-        due = sum(self._left() <= ahead for ahead in _TOLD)
-        if due > self._told:
-            self._told = due
+    def _warn(self) -> None:
+        due = sum(self._left() <= ahead for ahead in _WARN_AHEAD)
+        if due > self._warned:
+            self._warned = due
             who, until = self._certificate.identity, f"{self._certificate.until:%Y-%m-%d %H:%M} UTC"
             _logger.warning(
                 "the certificate of %s ends %s: renew it (`trade pki issue %s`) and start this container again before "

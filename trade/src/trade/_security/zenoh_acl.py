@@ -38,7 +38,7 @@ _BEHIND: Final = {
     "overwrite": {"priority": "data_low", "express": False},
 }
 
-_ANYBODY: Final = "*"
+_UNIDENTIFIED: Final = "*"
 """In place of an identity where peers are not identified: on links without certificates."""
 
 
@@ -109,7 +109,7 @@ def acl(
     """
     places = networks or {(): _EVERYTHING_CROSSES}
     if policy is None:
-        known, gateways = [_ANYBODY], list[str]()
+        known, gateways = [_UNIDENTIFIED], list[str]()
     else:
         gateways = [name for name in policy.gateways if name not in policy.revoked]
         named = policy.names() if identities is None else identities
@@ -121,8 +121,8 @@ def acl(
     def let(name: str, interfaces: Sequence[str], rows: Iterable[_Row]) -> None:
         who = " ".join((name, *interfaces))
         made = [_rule(who, *row, namespace) for row in rows if row[2]]
-        told: dict[str, Any] = {} if name == _ANYBODY else {subject: [name]}
-        subjects.append({"id": who, **told, **({"interfaces": list(interfaces)} if interfaces else {})})
+        identified: dict[str, Any] = {} if name == _UNIDENTIFIED else {subject: [name]}
+        subjects.append({"id": who, **identified, **({"interfaces": list(interfaces)} if interfaces else {})})
         rules.extend(made)
         policies.append({"rules": [rule["id"] for rule in made], "subjects": [who]})
 

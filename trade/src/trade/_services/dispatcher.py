@@ -367,6 +367,6 @@ def _run(incoming: IncomingCall, service: LocalService, ongoing: ActiveCall | No
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
             text = info.traceback or info.message
-            told = {"call_id": call.id, "outer_id": outer_of(call.id, call.behalf)}
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra=told)
+            ids = {"call_id": call.id, "outer_id": outer_of(call.id, call.behalf)}
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra=ids)
         return Status.ERROR, Raw(encode_message(info))

@@ -45,7 +45,7 @@ class Database:
     def close(self) -> None:
         """End its thread. Idempotent."""
         with contextlib.suppress(RuntimeError):  # it ended already
-            self._thread.submit(self._let_go)
+            self._thread.submit(self._close_file)
         self._thread.shutdown()
 
     def _ask(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> _Result:
@@ -65,7 +65,7 @@ class Database:
         try:
             result = self._tried(what)
         except (sqlite3.Error, OSError) as wrong:
-            self._let_go()
+            self._close_file()
             if not self._trouble:
                 self._trouble = str(wrong)
                 self._tell(f"no {self._what} is saved: {self._path}: {wrong}. Everything else continues")
@@ -81,7 +81,7 @@ class Database:
         except sqlite3.OperationalError:  # a disk error, not a damaged file
             raise
         except (sqlite3.DatabaseError, msgspec.DecodeError) as corrupt:
-            self._let_go()
+            self._close_file()
             aside = self._move_aside()
             self._tell(f"{self._path} is corrupt ({corrupt}): it is {aside.name} now; its contents are not restored")
             return what(self._opened())
@@ -108,7 +108,7 @@ class Database:
                 self._path.with_name(self._path.name + end).replace(aside.with_name(aside.name + end))
         return aside
 
-    def _let_go(self) -> None:
+    def _close_file(self) -> None:
         if self._open is not None:
             with contextlib.suppress(sqlite3.Error):
                 self._open.close()

@@ -70,12 +70,12 @@ class Stream:
         self._keep = keep
         self._body: tuple[bool, bytes] | None = None
         """The last message received that is its own."""
-        self._number = self._missed = self._told = self._overflowed = 0
+        self._number = self._missed = self._reported = self._overflowed = 0
         self._latest: Sample | BaseException | None = None
         self._end: BaseException | None = None
         self._closed = False
         self._changed = InterruptibleCondition()
-        self._told_of_more: set[Callable[[], None]] = set()
+        self._on_more: set[Callable[[], None]] = set()
 
     # --- taking
 
@@ -119,12 +119,12 @@ class Stream:
                 await woken.wait()
                 woken.clear()
         finally:
-            self._told_of_more.discard(wake)
+            self._on_more.discard(wake)
         return taken
 
     def tell(self, more: Callable[[], None]) -> None:
         """Have a function called whenever there is more to take, or the stream ends; it must not block."""
-        self._told_of_more.add(more)
+        self._on_more.add(more)
 
     def take(self) -> Sample | None:
         """The oldest sample not taken yet, None if there is none now. Raises like `next`."""
@@ -136,8 +136,8 @@ class Stream:
             heard = self._waiting.popleft()
             if isinstance(heard, BaseException):
                 raise heard
-            dropped = heard.missed - self._told + self._overflowed
-            self._told, self._overflowed = heard.missed, 0
+            dropped = heard.missed - self._reported + self._overflowed
+            self._reported, self._overflowed = heard.missed, 0
         return msgspec.structs.replace(heard.sample, dropped=dropped) if dropped else heard.sample
 
     def latest(self) -> Sample | None:
@@ -270,5 +270,5 @@ class Stream:
 
     def _ring(self) -> None:
         self._changed.notify_all()
-        for tell in list(self._told_of_more):
+        for tell in list(self._on_more):
             tell()

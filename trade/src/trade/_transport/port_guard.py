@@ -52,13 +52,13 @@ class PortGuard:
         while not self._ending.wait(_LOOK_S):
             try:
                 if self._shut or _open_files() > MOST_STRANGERS:  # counting connections costs more
-                    self._mind(_connections(self._ports) - self._links())
+                    self._update(_connections(self._ports) - self._links())
             except OSError as bad:
                 _logger.debug("the ports of the transport cannot be inspected: %s", bad)
         if self._shut:
             self._filter(shut=False)
 
-    def _mind(self, strangers: int) -> None:
+    def _update(self, strangers: int) -> None:
         if not self._shut and strangers > MOST_STRANGERS:
             _logger.warning(
                 "%d connections at port %s are not links: no new connection is accepted until they end. Stops and "
@@ -97,14 +97,14 @@ def _listening(ports: frozenset[int]) -> list[socket.socket]:
             if not str(file.readlink()).startswith("socket:"):
                 continue
             copy = socket.socket(fileno=os.dup(int(file.name)))
-            if _is_door(copy, ports):
+            if _is_guarded(copy, ports):
                 found.append(copy)
             else:
                 copy.close()
     return found
 
 
-def _is_door(sock: socket.socket, ports: frozenset[int]) -> bool:
+def _is_guarded(sock: socket.socket, ports: frozenset[int]) -> bool:
     if sock.family not in (socket.AF_INET, socket.AF_INET6) or sock.type != socket.SOCK_STREAM:
         return False
     return bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)) and sock.getsockname()[1] in ports

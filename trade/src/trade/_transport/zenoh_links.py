@@ -21,7 +21,7 @@ from trade._transport.credentials import dictionary_file
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface
 from trade.errors import ConfigurationError
 
-_NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
+_NO_PEERS: Final[dict[str, Any]] = {"router": [], "peer": []}
 _DIGITS: Final = 32
 _TAG: Final = 16
 _NAME: Final = 12
@@ -144,7 +144,7 @@ class Links:
     def beacon(self) -> Beacon:
         """Opens a session, linked to the main one, that answers scouts and does not dial, until it is closed."""
         listen = str(self._shown._replace(port=0))
-        return Beacon(self._beside([listen], [self._door()], {**self._scouting(), "id": self._beacon_id}))
+        return Beacon(self._beside([listen], [self._main_endpoint()], {**self._scouting(), "id": self._beacon_id}))
 
     def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
         """Scouts for containers; yields each discoverable container of this system once."""
@@ -170,7 +170,7 @@ class Links:
         Returns:
             The id of the session it is linked to now; empty if none accepts it within ``wait_s``.
         """
-        helper = self._beside([], [self._door(), *endpoints], {})
+        helper = self._beside([], [self._main_endpoint(), *endpoints], {})
         try:
             until = time.monotonic() + wait_s
             while time.monotonic() < until and not ended():
@@ -182,7 +182,7 @@ class Links:
         finally:
             helper.close()
 
-    def _door(self) -> str:
+    def _main_endpoint(self) -> str:
         """The endpoint at which a session of this process reaches the main one."""
         return dialled_from_here(self.listen[0])
 
@@ -194,7 +194,7 @@ class Links:
             "gateway": {},
             "listen/endpoints": list(listen),
             "connect/endpoints": list(connect),
-            "scouting/gossip/autoconnect": _NOBODY,
+            "scouting/gossip/autoconnect": _NO_PEERS,
             **more,
         }
         try:
@@ -206,7 +206,7 @@ class Links:
         return {
             "scouting/multicast/enabled": True,
             "scouting/multicast/listen": True,
-            "scouting/multicast/autoconnect": _NOBODY,
+            "scouting/multicast/autoconnect": _NO_PEERS,
             "scouting/multicast/interface": self._interface(),
         }
 

@@ -246,7 +246,7 @@ class Rules:
         self._tell = tell
         self._firings: deque[Firing] = deque(maxlen=_KEPT)
         self._numbers = itertools.count(1)
-        self._standing: dict[str, _ActiveRule] = {}
+        self._active: dict[str, _ActiveRule] = {}
         self._closed = False
         rules = read_rules(file)
         container.register(self, GROUP)
@@ -265,20 +265,20 @@ class Rules:
         self.container.note_change("rules read", str(file))
 
     def _go_by(self, rules: dict[str, Rule]) -> None:
-        old = self._standing
+        old = self._active
         kept = {name for name, one in old.items() if one.rule == rules.get(name) and not one.why}
-        self._standing = {name: old[name] if name in kept else _ActiveRule(self, name, rules[name]) for name in rules}
+        self._active = {name: old[name] if name in kept else _ActiveRule(self, name, rules[name]) for name in rules}
         for name in old.keys() - kept:
             old[name].end()
         for name in (name for name in rules if name not in kept):
             self.causes.forget(name)
-            self._standing[name].begin()
+            self._active[name].begin()
         self._show_health()
 
     @service(effect="read")
     def rules(self) -> list[RuleInfo]:
         """The active rules, with their state."""
-        return [standing.info() for _, standing in sorted(self._standing.items())]
+        return [active.info() for _, active in sorted(self._active.items())]
 
     @service(effect="read")
     def rule_firings(self) -> list[Firing]:
@@ -302,7 +302,7 @@ class Rules:
         self._tell(firing)
 
     def _show_health(self) -> None:
-        stopped = [f"rule {standing.name}: {standing.why}" for standing in self._standing.values() if standing.why]
+        stopped = [f"rule {active.name}: {active.why}" for active in self._active.values() if active.why]
         health = f"stopped: {'; '.join(stopped)}"[:_LONGEST_HEALTH] if stopped else HEALTHY
         self.container.set_health(self, health)
 
@@ -310,8 +310,8 @@ class Rules:
         """End all rules; running firings finish. Idempotent."""
         if not self._closed:
             self._closed = True
-            for standing in self._standing.values():
-                standing.end()
+            for active in self._active.values():
+                active.end()
             self.container.deregister(self)
 
     def __enter__(self) -> "Rules":

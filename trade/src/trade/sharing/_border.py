@@ -145,7 +145,7 @@ class BorderDirection:
     def _reconcile(self) -> None:
         """Make the services offered remotely equal to those at home that are in the list."""
         there = {
-            place: self._told(info)
+            place: self._described(info)
             for place, info in self._home.federating.offers().items()
             if self._is_shared(place, info)
         }
@@ -167,7 +167,7 @@ class BorderDirection:
     def _is_shared(self, place: Exposed, info: ProviderInfo) -> bool:
         return SHARED_FROM not in info.meta and inside(place.domain, self._groups)
 
-    def _told(self, info: ProviderInfo) -> ProviderInfo:
+    def _described(self, info: ProviderInfo) -> ProviderInfo:
         """The description of a provider for the other system: without anything that is not shared."""
         members = {group: names for group, names in info.members.items() if inside(group, self._groups)}
         meta = {**info.meta, SHARED_FROM: self._names[0]}

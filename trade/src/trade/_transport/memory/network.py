@@ -169,7 +169,7 @@ class Network:
             found = self._routes[key] = [node for node in self._nodes if node.hears(key)]
         return found
 
-    def route_anew(self) -> None:
+    def clear_routes(self) -> None:
         """Clear the routes after a subscription changed. Used under the network's lock."""
         self._routes.clear()
 
@@ -224,7 +224,7 @@ class Network:
         """Send one message over one link; a tap may have removed the link meanwhile."""
         self.sent[kind] += 1
         passage = InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=False)
-        self._tell_taps(passage)
+        self._call_taps(passage)
         if any(loses(passage) for loses in list(self._losing)):
             return
         link = self._link(source, target)
@@ -233,7 +233,7 @@ class Network:
 
         def arrived() -> None:
             arrive()
-            self._tell_taps(InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=True))
+            self._call_taps(InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=True))
 
         arrived() if at_once else link.ways[source].send(kind, arrived)
 
@@ -261,7 +261,7 @@ class Network:
         self._losing.append(which)
         return lambda: self._losing.remove(which)
 
-    def _tell_taps(self, passage: InFlightMessage) -> None:
+    def _call_taps(self, passage: InFlightMessage) -> None:
         for tap in list(self._taps):
             tap(passage)
 

@@ -99,13 +99,13 @@ class Node:
         """A sign of life appears."""
         if token not in self.seen:
             self.seen[token] = (owner, key)
-            self._tell(key, b"")
+            self._report(key, b"")
 
     def lose_sight(self, token: int) -> None:
         """A sign of life disappears."""
         _, key = self.seen.pop(token, (None, None))
         if key is not None:
-            self._tell(key, None)
+            self._report(key, None)
 
     def lose_all_of(self, owner: "Node") -> None:
         """Another node is gone or unreachable."""
@@ -113,7 +113,7 @@ class Node:
             if of is owner:
                 self.lose_sight(token)
 
-    def _tell(self, key: str, payload: bytes | None) -> None:
+    def _report(self, key: str, payload: bytes | None) -> None:
         for watch in self.watches:
             if watch.fits(key):
                 watch.take(Message(key, payload))

@@ -113,7 +113,7 @@ class MemoryTransport(Transport):
             self._check_open()
             channel = MemoryChannel(pattern, self._forget_in(among), of_others=of_others, newest=newest)
             among.append(channel)
-            self.network.route_anew()
+            self.network.clear_routes()
             return channel
 
     def _forget_in(self, among: list[Any]) -> Callable[[Inbox[Any]], None]:
@@ -121,6 +121,6 @@ class MemoryTransport(Transport):
             with self.network.lock:
                 if inbox in among:
                     among.remove(inbox)
-                    self.network.route_anew()
+                    self.network.clear_routes()
 
         return forget
