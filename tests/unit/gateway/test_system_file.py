@@ -102,7 +102,7 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}[container."a/b"]\nproviders = []\n', 4, "is no name for a container"),
         (f'{HEAD}{LAMPS}tls = "nowhere"\n', 4, "nowhere"),
         (f'{HEAD}{LAMPS}policy = "nobody.toml"\n', 4, "nobody.toml"),
-        (f'{HEAD}{LAMPS}connect = ["tcp/robot.example:7450"]\n', 4, "beyond loopback takes certificates"),
+        (f'{HEAD}{LAMPS}connect = ["tcp/robot.example:7450"]\n', 4, "beyond loopback requires certificates"),
         ('[system]\nname = "ho me"\n[container.a]\nproviders = []\n', 1, "is no name for a system"),
     ],
 )

@@ -104,7 +104,7 @@ def test_another_user_cannot_join_through_the_loopback_port(
 
 def test_a_secret_that_others_can_read_is_refused(here: Container, tmp_path: Path) -> None:
     (tmp_path / "runtime" / "trade" / "@secret").chmod(0o644)
-    with pytest.raises(ConfigurationError, match="must be this user's alone; remove it"):
+    with pytest.raises(ConfigurationError, match="must belong to this user alone; remove it"):
         Container(Settings.read(container="second"))
 
 
@@ -133,7 +133,7 @@ def test_S21_a_laboratory_network_is_listened_on_only_on_purpose() -> None:
     settings = Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, system="lab", credentials=ALICE)
     assert settings.listen == tuple(LAN)
     for environment in ({}, {"TRADE_INSECURE_LAN": "0"}, {"TRADE_INSECURE_LAN": ""}):
-        with pytest.raises(ConfigurationError, match="beyond loopback takes certificates"):
+        with pytest.raises(ConfigurationError, match="beyond loopback requires certificates"):
             Settings.read(environment=environment, listen=LAN, system="lab", credentials=ALICE)
 
 

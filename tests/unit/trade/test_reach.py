@@ -37,7 +37,7 @@ BEYOND = ["tcp/0.0.0.0:7450", "tcp/[::]:7450", "tcp/192.168.1.5:0", "udp/10.0.0.
 @pytest.mark.parametrize("end", ["listen", "connect"])
 @pytest.mark.parametrize("endpoint", BEYOND)
 def test_S21_beyond_loopback_is_refused_without_certificates(end: str, endpoint: str) -> None:
-    with pytest.raises(ConfigurationError, match=r"beyond loopback takes certificates: set TRADE_TLS .*and tls/"):
+    with pytest.raises(ConfigurationError, match=r"beyond loopback requires certificates: set TRADE_TLS .*and tls/"):
         read(system="lab", credentials=("me", "secret"), **{end: [endpoint]})
 
 
@@ -58,7 +58,7 @@ def test_an_empty_system_in_the_environment_is_no_explicit_one() -> None:
 
 def test_S21_a_bridge_listens_beyond_loopback_no_more_than_others() -> None:
     lan = ["tcp/192.168.1.5:7450", "tcp/10.0.0.5:7450"]
-    with pytest.raises(ConfigurationError, match="beyond loopback takes certificates"):
+    with pytest.raises(ConfigurationError, match="beyond loopback requires certificates"):
         read(system="lab", credentials=("me", "secret"), listen=lan, bridge=["eth0", "eth1"])
 
 

@@ -132,7 +132,7 @@ def test_connecting_to_a_name_that_means_nothing_says_so(system: str, start_cont
 
 
 def test_S21_a_network_is_not_reached_by_connecting_at_run_time(here: Container) -> None:
-    with pytest.raises(ConfigurationError, match="beyond loopback takes certificates"):
+    with pytest.raises(ConfigurationError, match="beyond loopback requires certificates"):
         here.system.connect("tcp/192.168.1.5:7450")
 
 

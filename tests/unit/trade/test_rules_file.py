@@ -69,7 +69,7 @@ def test_a_file_is_read_as_it_says(tmp_path: Path) -> None:
         (f'{EVERY}\n{DO}\nif = {{ service = {{ name = "a" }}, args = ["$service"] }}', "this one has every_s"),
         (f'{EVERY}\n{DO}\nif = {{ service = {{ container = "$container" }} }}', "this one has every_s"),
         (f'{LEFT}\n{DO}\nif = {{ above = 3 }}', r"rule\.r\.if: service is missing; write service = "),
-        (f'{LEFT}\n{DO}\nif = {{ service = {{ name = "a" }}, above = 3, is = 4 }}', "is goes with neither"),
+        (f'{LEFT}\n{DO}\nif = {{ service = {{ name = "a" }}, above = 3, is = 4 }}', "is cannot be combined with"),
         (f'{LEFT}\ndo = [{{ call = {{ name = "go" }}, deadline_s = 0 }}]', r"do\[0\]\.deadline_s: must be a number"),
         ("when = 3 = 4", "not valid TOML"),
     ],

@@ -397,7 +397,7 @@ def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock
 
 
 def test_a_note_needs_nothing_physical() -> None:
-    with pytest.raises(ConfigurationError, match="a note needs nothing physical"):
+    with pytest.raises(ConfigurationError, match="a note uses no resources"):
         service(effect="note", uses=["pen"])(lambda: None)
 
 

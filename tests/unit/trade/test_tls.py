@@ -452,11 +452,11 @@ def test_certificates_take_the_place_of_credentials(papers: Papers) -> None:
 def test_endpoints_and_certificates_go_together(papers: Papers) -> None:
     folder = papers.of("arm")
     for end in ("listen", "connect"):
-        with pytest.raises(ConfigurationError, match=f"{end} tls/127.0.0.1:7450: goes with certificates.* TRADE_TLS"):
+        with pytest.raises(ConfigurationError, match=f"{end} tls/127.0.0.1:7450: requires certificates.* TRADE_TLS"):
             read(**{end: ["tls/127.0.0.1:7450"]})
         with pytest.raises(ConfigurationError, match=f"{end} tcp/127.0.0.1:7450: .*must be tls/127.0.0.1:7450"):
             read(tls=folder, **{end: ["tcp/127.0.0.1:7450"]})
-        with pytest.raises(ConfigurationError, match="takes nothing after the port"):
+        with pytest.raises(ConfigurationError, match="allows nothing after the port"):
             read(tls=folder, **{end: ["tls/127.0.0.1:7450#verify_name_on_connect=false"]})
         for six in ("[::1]", "[::]", "[fe80::1]"):  # the transport would never link, and never say so
             with pytest.raises(ConfigurationError, match="use an IPv4 address or a name"):

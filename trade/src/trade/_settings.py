@@ -188,11 +188,11 @@ class Settings:
 
     def _refused_plain(self, endpoint: Endpoint) -> str:
         if endpoint.protocol == "tls":
-            return f"goes with certificates, and TRADE_TLS names none: {_CERTIFY}"
+            return f"requires certificates, and TRADE_TLS is not set: {_CERTIFY}"
         if endpoint.loopback:
             return ""
         if not self.insecure_lan:
-            return f"beyond loopback takes certificates: {_CERTIFY}, and tls/{endpoint.host}:{endpoint.port}"
+            return f"beyond loopback requires certificates: {_CERTIFY}, and tls/{endpoint.host}:{endpoint.port}"
         if not (self.explicit_system and self.credentials):
             what = "TRADE_INSECURE_LAN needs an explicit system id and credentials, too"
             return f"{what}: set TRADE_SYSTEM and TRADE_CREDENTIALS=user:password"
@@ -204,7 +204,7 @@ class Settings:
         if endpoint.host.startswith("["):
             return "the transport does not link with certificates at IPv6 addresses; use an IPv4 address or a name"
         if endpoint.rest:  # it could switch off the security of a link
-            return f"takes nothing after the port; leave out {endpoint.rest}"
+            return f"allows nothing after the port; leave out {endpoint.rest}"
         if not (endpoint.loopback or self.explicit_system):
             return "reaching a network needs an explicit system id: set TRADE_SYSTEM"
         return ""

@@ -9,7 +9,7 @@ from trade._context.sessions import speaking
 from trade._notifications.notification import Notification, NotificationInfo, Owner
 from trade._notifications.notifier import Notifier
 from trade._notifications.services import Hosted, placed
-from trade._notifications.triggers import OF_SERVICES, TriggerSpec, What, deed_of, epoch_s, target_of
+from trade._notifications.triggers import OF_SERVICES, TriggerSpec, What, action_of, epoch_s, target_of
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
 from trade._registry.registry import Registry
@@ -179,6 +179,6 @@ class Notifying:
             owner = Owner(str(own) if mine is None else mine.name, acts_as=mine)
             return placed(self._notifier, self._registry, terms, target, conditions[0], conditions[1], owner)
         notify = self._lookup.find(where(name="notify", group=DOMAIN, container=host))
-        deeds = [None if one is None else deed_of(one, host, named) for one in conditions]
-        name = notify(terms, deed_of(target, host, named), *deeds)
+        actions = [None if one is None else action_of(one, host, named) for one in conditions]
+        name = notify(terms, action_of(target, host, named), *actions)
         return Hosted(name, terms, notify.key.address, self._lookup.handle)

@@ -141,7 +141,7 @@ def _check_takes(function: Callable[..., Any], where: str, argument: str, given:
         raise ConfigurationError(where=where, problem=problem) from None
 
 
-def deed_of(target: Target, host: str, where: str) -> Action:
+def action_of(target: Target, host: str, where: str) -> Action:
     """The target for another container. Raises ConfigurationError: that one cannot call a function of this process."""
     if isinstance(target, Action):
         return target

@@ -82,7 +82,7 @@ def service(
     if serial and effect == "stop":
         raise ConfigurationError(problem="a stop cannot be serial, because a stop never waits")
     if uses and effect == "note":
-        raise ConfigurationError(problem="a note needs nothing physical; leave out uses, or have it actuate")
+        raise ConfigurationError(problem='a note uses no resources; leave out uses, or write effect="actuate"')
     for condition in _several(achieves):
         parse_achieved(condition)
     mark = ServiceMark(

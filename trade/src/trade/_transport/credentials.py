@@ -71,4 +71,6 @@ def _check_private(path: Path) -> None:
     state = path.lstat()
     ours = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not stat.S_IMODE(state.st_mode) & 0o077)
     if not ours or not stat.S_ISREG(state.st_mode) or not state.st_size:
-        raise ConfigurationError(where=str(path), problem="must be this user's alone; remove it, a new one is made")
+        raise ConfigurationError(
+            where=str(path), problem="must belong to this user alone; remove it, a new one is made"
+        )

@@ -256,7 +256,7 @@ class _Check:
         self._number("if.above", condition.above, -math.inf, math.inf)
         self._number("if.below", condition.below, -math.inf, math.inf)
         if condition.is_ is not UNSET and (condition.above is not None or condition.below is not None):
-            self._wrong("if", "is goes with neither above nor below")
+            self._wrong("if", "is cannot be combined with above or below")
 
     def _step(self, step: Step, at: str) -> None:
         if (step.call is None) is (step.wait_for is None):
