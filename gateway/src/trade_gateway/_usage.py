@@ -1,18 +1,18 @@
-"""What people type, checked: the error of a wrong word, and the services that words name."""
+"""Checks command-line words: the usage error, and the services that the words name."""
 
 from trade import Constraint, Container, Handle, where
 from trade.errors import ConfigurationError, TooManyServices
 
 
 class UsageError(ConfigurationError):
-    """The words of the command line are wrong: exit code 2."""
+    """A usage error: wrong words on the command line; exit code 2."""
 
 
 def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
-    """The constraint that words of the command line ask for.
+    """Builds a constraint from words of the command line.
 
     Raises:
-        UsageError: they make none.
+        UsageError: the words are no valid constraint.
     """
     try:
         return where(name=name, group=group, container=container)
@@ -21,10 +21,10 @@ def asked_for(what: str, *, name: str | None, group: str | None, container: str 
 
 
 def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
-    """The service of a group and name; one of exactly this group goes before those beneath it.
+    """Finds a service by group and name; an exact group match wins over groups beneath it.
 
     Raises:
-        UsageError: the text names no service.
+        UsageError: the text does not name a service.
     """
     group, _, name = service.rpartition(".")
     constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)

@@ -36,7 +36,7 @@ def test_an_e_stop_names_those_of_another_version_with_it(capsys: pytest.Capture
 def test_a_clearing_says_what_is_to_be_done_about_those_of_another_version(capsys: pytest.CaptureFixture[str]) -> None:
     missing = [line for line in said(REPORT, "cleared", capsys) if line.startswith("MISSING")]
     assert missing == [
-        f"MISSING: door/door (protocol version {OTHER}) is cleared by a `trade` of its version only",
+        f"MISSING: door/door (protocol version {OTHER}) can be cleared only by a `trade` of its own version",
         "MISSING: legs/legs did not answer",
     ]
 

@@ -1,4 +1,4 @@
-"""The command ``trade``, a module a command, and how all of them print."""
+"""The command ``trade``: one module per command, and the output that all of them share."""
 
 import typer
 

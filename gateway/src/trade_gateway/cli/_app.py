@@ -1,4 +1,4 @@
-"""The command ``trade``: bring a robot up, look at a system, call its services."""
+"""The command ``trade``: starts robots, shows a system, calls its services."""
 
 import os
 import sys
@@ -19,8 +19,8 @@ __all__ = ["build", "main"]
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
 _ROBOTS: Final = "Robots, containers and networks"
-_OPERATION: Final = "Keeping it up"
-_HARDWARE: Final = "Setting hardware up"
+_OPERATION: Final = "Operation"
+_HARDWARE: Final = "Hardware setup"
 _WATCHING: Final = "Watching and rules"
 _RECORDINGS: Final = "Recordings and live views"
 _RIGHTS: Final = "Identities and rights"
@@ -75,25 +75,25 @@ _COMMANDS: Final = {
     "policy": (_RIGHTS, "cli.rights._policy:app"),
     "approvals": (_RIGHTS, "cli.rights._approvals:app"),
 }
-"""By name: where help shows it, and the function or the group of commands that does it."""
+"""By name: the help panel, and the function or group of commands that implements it."""
 _COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")
-"""Where shells say what is to be completed."""
+"""Environment variables in which a shell passes the line to complete."""
 _WITH_VALUE: Final = ("--system", "--connect")
-"""Options of every command that take another word."""
+"""Options before the command that take a value."""
 
 
 def build(only: str | None = None) -> typer.Typer:
-    """The command line.
+    """Builds the command line.
 
     Args:
-        only: the one command that will be asked for: what the others need is not imported. None: all of them.
+        only: the only command that will run, so that the others are not imported. None: all commands.
     """
     made = typer.Typer(
         name="trade",
         no_args_is_help=True,
         rich_markup_mode="rich",
-        help="Robots as services: bring one up, see what it offers, call it.",
-        epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
+        help="Start robots, show their services and call them.",
+        epilog="Without hardware: run trade up examples/rosie.toml --sim, and trade services in another terminal.",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     made.callback()(options)
@@ -111,7 +111,7 @@ def build(only: str | None = None) -> typer.Typer:
 
 
 def _asked_for(words: Sequence[str]) -> str | None:
-    """The command among the words of a command line; None if it is to be found out, or help is wanted about all."""
+    """Returns the command among the words of a command line; None if there is none, so that help shows all."""
     left = iter(words)
     for word in left:
         if word in _WITH_VALUE:
@@ -122,7 +122,7 @@ def _asked_for(words: Sequence[str]) -> str | None:
 
 
 def _words() -> Sequence[str]:
-    """Of the command line, or of the one that a shell completes."""
+    """Returns the words of the command line, or of the line that a shell completes."""
     if "_TRADE_COMPLETE" in os.environ:
         line = next((os.environ[name] for name in _COMPLETED if name in os.environ), "")
         return line.split()[1:]
@@ -140,30 +140,31 @@ def _version(wanted: bool) -> None:
 def options(
     context: typer.Context,
     system: Annotated[
-        str | None, typer.Option(help="System id; containers of other systems are invisible. \\[env: TRADE_SYSTEM]")
+        str | None, typer.Option(help="System id. Containers of other systems are invisible. \\[env: TRADE_SYSTEM]")
     ] = None,
     connect: Annotated[
         list[str] | None,
-        typer.Option(help="Endpoint of a container, such as tcp/127.0.0.1:7450; repeatable. \\[env: TRADE_CONNECT]"),
+        typer.Option(help="Endpoint to connect to: tcp/127.0.0.1:7450. Repeatable. \\[env: TRADE_CONNECT]"),
     ] = None,
     with_stdin: Annotated[
-        bool, typer.Option("--with-stdin", hidden=True, help="End when standard input does.")
+        bool, typer.Option("--with-stdin", hidden=True, help="Exit when standard input closes.")
     ] = False,
     leased: Annotated[
-        bool, typer.Option("--leased", hidden=True, help="With it: stay only as long as standard input says.")
+        bool,
+        typer.Option("--leased", hidden=True, help="With --with-stdin: exit when its lease expires."),
     ] = False,
     version: Annotated[  # noqa: ARG001 - answered by its callback
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Options of every command."""
+    """Reads the options before the command."""
     if with_stdin:
         end_with_stdin(leased=leased)
     context.obj = SystemChoice(system, connect)
 
 
 def main() -> None:
-    """Run the command line; errors of ours are one line on stderr and exit code 1, or 2 if its words are wrong."""
+    """Runs the command line; a TRADE error is one line on stderr and exit code 1, a usage error exit code 2."""
     try:
         build(_asked_for(_words()))()
     except UsageError as error:

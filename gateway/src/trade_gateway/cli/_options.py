@@ -1,4 +1,4 @@
-"""What many commands have: options, a default command, cases chosen by name, and rooms that need an extra."""
+"""Parts that commands share: options, a default command, cases chosen by name, and packages of an extra."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -12,20 +12,19 @@ from trade_gateway._usage import UsageError
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Groups = Annotated[
-    list[str] | None, typer.Option("--group", help="Only this group and what is beneath it; repeatable.")
+    list[str] | None, typer.Option("--group", help="Select this group and the groups beneath it. Repeatable.")
 ]
 Readers = Annotated[
     list[str] | None,
     typer.Option(
         "--services",
-        help="Also what this service answers, of those that only read: rosie.hand.state; * and ? stand "
-        "for anything. Repeatable.",
+        help="Also sample this read-only service: rosie.hand.state; * and ? are wildcards. Repeatable.",
     ),
 ]
 
 
 class Case(Protocol):
-    """A check or a scene."""
+    """A check or a scene, known by its name."""
 
     @property
     def name(self) -> str: ...
@@ -35,7 +34,7 @@ C = TypeVar("C", bound=Case)
 
 
 def chosen(cases: Sequence[C], names: Sequence[str], what: str) -> list[C]:
-    """The cases that ``--only`` names, in the order of the table; all of them if it names none. Raises UsageError."""
+    """Returns the cases that ``--only`` names, in the order of the table; by default all. Raises UsageError."""
     known = [case.name for case in cases]
     if unknown := [name for name in names if name not in known]:
         problem = f"there is no such {what}; there is {', '.join(known)}"
@@ -44,7 +43,7 @@ def chosen(cases: Sequence[C], names: Sequence[str], what: str) -> list[C]:
 
 
 def room_of_extra(extra: str, command: str) -> Any:
-    """A room of this package whose libraries an extra of the same name brings. Raises ConfigurationError."""
+    """Imports the subpackage whose libraries the extra of the same name installs. Raises ConfigurationError."""
     try:
         return import_module(f"trade_gateway.{extra}")
     except ImportError as missing:
@@ -53,10 +52,10 @@ def room_of_extra(extra: str, command: str) -> Any:
 
 
 class FirstByDefault(TyperGroup):
-    """``trade audit FOLDER`` is ``trade audit show FOLDER``."""
+    """A command group whose first command is the default: ``trade audit FOLDER`` is ``trade audit show FOLDER``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """What begins with none of the commands is for the first."""
+        """Inserts the first command if the words begin with none."""
         if not args or args[0] not in (*self.commands, "-h", "--help"):
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)

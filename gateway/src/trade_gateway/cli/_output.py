@@ -1,4 +1,4 @@
-"""How the command line speaks: tables for people, JSON lines for programs, errors on stderr."""
+"""Output of the command line: tables for people, JSON lines for programs, errors on stderr."""
 
 import json
 import re
@@ -15,20 +15,20 @@ from trade.errors import DeviceFault
 
 _GAP: Final = "  "
 _SMALL: Final = re.compile(r'^( *(?:"(?:[^"\\]|\\.)*": )?)(-?[\d.]+e-\d+)(?=,?$)', re.MULTILINE)
-"""A number with an exponent, on its line of indented JSON."""
+"""A number with a negative exponent, on its line of indented JSON."""
 _LEAST: Final = 20
-"""No column is cut shorter than this; columns on the right are left out before."""
+"""The least width of a cut column, in characters; columns on the right are left out first."""
 
 
 class Output:
-    """Standard output in one of two languages."""
+    """Standard output, either as text for people or as JSON."""
 
     def __init__(self, *, as_json: bool) -> None:
         self.as_json = as_json
         self._console = Console(highlight=False, soft_wrap=True)
 
     def data(self, value: Any) -> None:
-        """A result: one line of JSON, or indented for people, who get no more digits than anybody reads."""
+        """Prints a result: one line of JSON, or indented for people with rounded numbers."""
         text = msgspec.json.encode(value).decode()
         if not self.as_json:
             text = json.dumps(json.loads(text, parse_float=_readable), indent=2, ensure_ascii=False)
@@ -36,13 +36,13 @@ class Output:
         print(text, flush=True)  # noqa: T201
 
     def say(self, text: str) -> None:
-        """A line for people; programs do not get it."""
+        """Prints a line of text; nothing with JSON."""
         if not self.as_json:
             self._console.print(text)
             sys.stdout.flush()
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Rows for people: in a terminal no wider than it, in a pipe whole."""
+        """Prints a table: cut to the terminal's width, or complete in a pipe."""
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         head, *lines = table_lines(columns, rows, width)
         self._console.print(f"[bold]{escape(head)}[/]")
@@ -52,7 +52,7 @@ class Output:
 
 
 def _readable(number: str) -> float:
-    """Rounded to six places, and never a zero below zero."""
+    """Rounds to six places, without a negative zero."""
     return round(float(number), 6) + 0.0
 
 
@@ -61,13 +61,13 @@ def _without_exponent(found: re.Match[str]) -> str:
 
 
 def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
-    """The lines of a table, the header first.
+    """Returns the lines of a table, the header first.
 
     Args:
-        columns: the headers, the most important one first.
-        rows: as many texts in each.
-        width: of the terminal, in characters: what does not fit is left out from the right, then the widest column is
-            cut. None: nothing is left out or cut.
+        columns: the headers, the most important first.
+        rows: one text per column.
+        width: the terminal's width in characters. Columns that do not fit are left out from the right, then the
+            widest column is cut. None: show everything.
     """
     widths = [max(map(len, texts)) for texts in zip(columns, *rows, strict=True)]
     if width is not None:
@@ -96,7 +96,7 @@ def _cut(text: str, width: int) -> str:
 
 
 def complain(text: str) -> None:
-    """A line on standard error, for programs, too: what went wrong, and that one goes on."""
+    """Prints a warning on standard error; the command continues."""
     Console(stderr=True, highlight=False, soft_wrap=True).print(f"[bold yellow]warning[/]: {escape(text)}")
     sys.stderr.flush()
 
@@ -105,7 +105,7 @@ REMEDIES: Final = {
     "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)": (
         "Wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`"
     ),
-    "Take it again with trade.lock(...)": "Take it again with `trade lock`",
+    "with trade.lock(...)": "with `trade lock`",
     "Look it up again with trade.find(...)": "`trade services` lists all services",
     "take them all with trade.services(...)": "see all of them with `trade services`",
     "handle.with_(deadline_s=...) waits longer": "--deadline SECONDS waits longer",
@@ -113,17 +113,17 @@ REMEDIES: Final = {
     "with_(deadline_s=...) gives it more": "--deadline SECONDS gives it more",
     "trade.resume(...) or `trade resume": "`trade resume",
 }
-"""What errors tell a program to do, and what somebody at a terminal does instead."""
+"""The remedies in errors that name the Python API, and the commands to use at a terminal instead."""
 _CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
 
 
 def as_commands(device: str, remedy: str) -> str:
-    """What a driver says to call, as it is typed: ``call enable()`` is ``trade call rosie.neck.pan.enable``."""
+    """Turns a driver's remedy into a command: ``call enable()`` becomes ``trade call rosie.neck.pan.enable``."""
     return _CALLED.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
 def say_error(error: BaseException) -> None:
-    """The error's name and message on standard error; what helps in words of the command line."""
+    """Prints an error's name and message on standard error, with remedies as commands."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     message = str(error)
     for remedy, ours in REMEDIES.items():

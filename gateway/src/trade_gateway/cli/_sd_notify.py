@@ -1,7 +1,6 @@
-"""Telling systemd how this process fares: datagrams to the socket that it names; without one nothing is told.
+"""Notifies systemd of this process's state: sd_notify(3) datagrams, sent only if systemd named a socket.
 
-After sd_notify(3). Only the process that was started is listened to: the variables are taken out of the environment, so
-that no child speaks for it.
+The variables are removed from the environment, so that no child process sends notifications in its place.
 """
 
 import contextlib
@@ -15,14 +14,14 @@ from typing import Final
 __all__ = ["Notifier"]
 
 _PATIENCE_S: Final = 1.0
-"""How long a message may wait for its reader."""
+"""How long a message may wait for its reader, in seconds."""
 
 
 class Notifier:
-    """The socket of whoever started this process and wants to know.
+    """The notification socket of the service manager that started this process.
 
     Args:
-        environment: of the process; ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are taken out of it.
+        environment: the process's; ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are removed from it.
     """
 
     def __init__(self, environment: MutableMapping[str, str] = os.environ) -> None:
@@ -32,24 +31,24 @@ class Notifier:
         self._socket = _connected(address)
 
     def ready(self, status: str) -> None:
-        """It is up, or has read its configuration again."""
-        self._tell("READY=1", f"STATUS={status}")
+        """Reports that the process is ready, or has reloaded its configuration."""
+        self._send("READY=1", f"STATUS={status}")
 
     def reloading(self) -> None:
-        """It reads its configuration again, and `ready` will follow."""
-        self._tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        """Reports that the process reloads its configuration; call `ready` afterwards."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def alive(self) -> None:
-        """To be told by what would not come by if the process hung."""
+        """Resets the watchdog. Call it from the loop that would stop if the process hung."""
         if self._watched:
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
     def leaving(self) -> None:
-        """It leaves; how long that may take is up to the unit."""
-        self._tell("STOPPING=1", "STATUS=leaving")
+        """Reports that the process shuts down; the unit limits how long that may take."""
+        self._send("STOPPING=1", "STATUS=leaving")
 
     def close(self) -> None:
-        """Tell nothing any more. Idempotent."""
+        """Closes the socket. Idempotent."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -62,15 +61,15 @@ class Notifier:
     ) -> None:
         self.close()
 
-    def _tell(self, *lines: str) -> None:
+    def _send(self, *lines: str) -> None:
         if self._socket is not None:
             text = "\n".join(line.replace("\n", " ") for line in lines)
-            with contextlib.suppress(OSError):  # nobody listens any more: that is nothing to end for
+            with contextlib.suppress(OSError):  # without a reader the process continues
                 self._socket.send(text.encode())
 
 
 def _connected(address: str) -> socket.socket | None:
-    if address[:1] not in ("/", "@"):  # nobody asks, or by a kind of socket that there is not here
+    if address[:1] not in ("/", "@"):  # no socket is named, or one of an unsupported kind
         return None
     opened = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     opened.settimeout(_PATIENCE_S)

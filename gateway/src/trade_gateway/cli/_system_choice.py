@@ -1,4 +1,4 @@
-"""Which system a command speaks to."""
+"""The system that a command connects to."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -8,38 +8,38 @@ import typer
 from trade import Container, Settings
 
 _PATIENCE_S: Final = 3.0
-"""How long nobody may be found where the settings say that it is to connect to."""
+"""How long to wait for a container at the endpoints of the settings, in seconds."""
 
 
 @dataclass(frozen=True)
 class SystemChoice:
-    """What the options before the command say; the environment and the defaults fill in the rest."""
+    """The options before the command; the environment and the defaults fill in the rest."""
 
     system: str | None
     connect: list[str] | None
 
     def settings(self, container: str | None = None) -> Settings:
-        """Settings of a container of this command."""
+        """Returns the settings of a container of this command."""
         return Settings.read(system=self.system, connect=self.connect, container=container)
 
 
 def choice_of(context: typer.Context) -> SystemChoice:
-    """The choice made on the command line."""
+    """Returns the choice made on the command line."""
     found = context.obj
     assert isinstance(found, SystemChoice)  # noqa: S101 - set by the callback of every command
     return found
 
 
 def visitor(context: typer.Context) -> Container:
-    """A short-lived container of this command's own; what it asks for is in the records of who is asked."""
+    """Opens a short-lived container for this command; the containers that it calls keep the audit records."""
     return Container(replace(choice_of(context).settings(), audit=None, metrics=""))
 
 
 def visitor_among_others(context: typer.Context) -> Container:
-    """The same for who asks what there is: where the settings say whom to connect to, somebody has to be there.
+    """Opens the same for queries: if the settings name endpoints, one of them has to answer.
 
     Raises:
-        NobodyFound: nobody is, at any of these endpoints; says why, as far as is known.
+        NobodyFound: none of these endpoints answers; with the reason, if known.
     """
     container = visitor(context)
     try:

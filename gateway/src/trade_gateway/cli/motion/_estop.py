@@ -1,4 +1,4 @@
-"""``trade estop``: stop the whole system, and clear that again."""
+"""``trade estop``: stops the whole system, and clears e-stops."""
 
 from typing import Annotated
 
@@ -17,17 +17,19 @@ from trade_gateway.cli._system_choice import choice_of, visitor
 
 def estop(
     context: typer.Context,
-    ids: Annotated[list[str] | None, typer.Argument(metavar="[ID]...", help="With --clear: which; else all.")] = None,
-    reason: Annotated[str, typer.Option(help="Why, for people.")] = "",
-    clear: Annotated[bool, typer.Option("--clear", help="Clear open e-stops. Nothing moves by itself.")] = False,
-    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Seconds to try.")] = 3.0,
+    ids: Annotated[
+        list[str] | None, typer.Argument(metavar="[ID]...", help="With --clear: e-stop ids; by default all.")
+    ] = None,
+    reason: Annotated[str, typer.Option(help="Reason, shown to people.")] = "",
+    clear: Annotated[bool, typer.Option("--clear", help="Clear open e-stops. This moves nothing.")] = False,
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,
 ) -> None:
-    """Stop everything in the system at once, and let nothing move before it is cleared.
+    """Stop the whole system at once. Nothing moves until the e-stop is cleared.
 
-    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found; also if
-    nobody answers at one of the endpoints of TRADE_CONNECT: who is there was told nothing, and tells nothing.
-    This is software: it is not safety-rated and replaces no switch that cuts the power.
+    The exit code is not 0 if a container did not confirm or could not stop a device, or if none was found.
+    It is also not 0 if an endpoint of TRADE_CONNECT does not answer: containers there did not receive the e-stop.
+    This is software. It is not safety-rated and does not replace a switch that cuts the power.
 
     For example: trade estop --reason "smoke", and later trade estop --clear
     """
@@ -51,11 +53,11 @@ def estop(
         else:
             _say(out, report, system, "cleared" if clear else "stopped", container.address.who)
         if reachability is None:
-            reachability = container.reachability(limit_s=0)  # only now: an order waits for nobody
+            reachability = container.reachability(limit_s=0)  # only now, so that it does not delay the e-stop
     if reachability.apart and not clear:
-        raise reachability.nobody(system, "who is there was not told to stop; use the switch that cuts the power")
+        raise reachability.nobody(system, "containers there were not stopped; use the switch that cuts the power")
     if clear and not reachability.complete:
-        raise reachability.nobody(system, "what is open there stays open until it is cleared once more")
+        raise reachability.nobody(system, "an e-stop that is open there stays open; clear it again when they answer")
     if not report.complete or not (clear or _known(report, container.address.who)):
         raise typer.Exit(1)
 
@@ -64,24 +66,24 @@ def _check_words(ids: list[str] | None, reason: str, *, clear: bool) -> None:
     if ids and not clear:
         raise UsageError(where="trade estop", problem="ids are for clearing: trade estop --clear ID")
     if reason and clear:
-        raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
+        raise UsageError(where="trade estop", problem="--reason is for a new e-stop; leave it out with --clear")
 
 
 def _given(context: typer.Context, reason: str, limit_s: float) -> str:
-    """Give an e-stop on the stop line, before there is a link; its id, under which it is given again on the links."""
+    """Sends an e-stop on the stop line, before any link; returns its id, with which it is sent again on the links."""
     estop_id = new_estop_id()
     StopLines(choice_of(context).settings()).estop(estop_id, reason, limit_s)
     return estop_id
 
 
 def _clear(container: Container, found: Reachability, ids: list[str] | None, limit_s: float) -> EstopReport | None:
-    """Clear those, or all that are open; None: none is, say all that there are.
+    """Clears these e-stops, or all open ones; None: all containers report that none is open.
 
     Raises:
-        NobodyFound: nobody was found, or not everybody, and none of those knows it.
-        NoSuchEstop: everybody was asked, and nobody knows it.
+        NobodyFound: some or all containers were not found, and no other one knows the e-stop.
+        NoSuchEstop: all containers were asked, and none knows it.
     """
-    system, cannot_tell = container.settings.system, "so nobody can tell whether an e-stop is open; none was cleared"
+    system, cannot_tell = container.settings.system, "so it is unknown whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
     if not found.others or not (wanted or found.complete):
         raise found.nobody(system, cannot_tell)
@@ -94,35 +96,35 @@ def _clear(container: Container, found: Reachability, ids: list[str] | None, lim
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
-    others = [name for name in report.confirmed if name != own]  # that this command has heard of it itself says nothing
+    others = [name for name in report.confirmed if name != own]  # this command's own confirmation says nothing
     for name in others or report.confirmed:
         out.say(f"{done}: {escape(name)}{_version(report, name)}")
     for name, problem in report.failed.items():
         out.say(f"[bold red]FAILED: {escape(name)}{_version(report, name)}: {escape(problem)}[/]")
     for name in report.missing:
         hears = done == "stopped" or name not in report.versions
-        missed = "did not answer" if hears else "is cleared by a `trade` of its version only"
+        missed = "did not answer" if hears else "can be cleared only by a `trade` of its own version"
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
     if report.apart:
-        out.say(f"{len(report.apart)} that said nothing may offer nothing, so there is nothing of theirs to stop")
+        out.say(f"{len(report.apart)} containers did not answer; they may offer no services, so nothing to stop")
     known = _known(report, own)
     if not known:
-        out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
+        out.say(f"[bold red]no container was found[/] in system {escape(system)} that has something to stop")
     if done == "cleared" and others:
-        out.say("nothing moves by itself: what others had in use waits for [bold]trade resume GROUP[/]")
+        out.say("nothing moves by itself; to let a group of other clients move again: [bold]trade resume GROUP[/]")
     clear = f"[bold]trade estop --clear {report.id}[/]"
     if done == "stopped" and known:
         out.say(f"e-stop {report.id} is open; when it is safe: {clear}")
     elif done == "stopped":
-        out.say("[bold red]NOT GIVEN to anybody that is known: use the switch that cuts the power[/]")
-        out.say(f"whoever was out of sight may have heard e-stop {report.id} all the same, and then needs {clear}")
+        out.say("[bold red]NOT RECEIVED by any known container: use the switch that cuts the power[/]")
+        out.say(f"an unseen container may still have received e-stop {report.id}; to clear it: {clear}")
 
 
 def _known(report: EstopReport, own: str) -> set[str]:
-    """Who is known to have been told, or to be there; that this command has heard of it itself says nothing."""
+    """Returns the containers that are known to exist, without this command's own."""
     return {*report.confirmed, *report.missing, *report.failed} - {own}
 
 
 def _version(report: EstopReport, name: str) -> str:
-    """Of the protocol, if it is another one than that of this command."""
+    """Returns the container's protocol version, if this command has another one."""
     return f" (protocol version {report.versions[name]})" if name in report.versions else ""

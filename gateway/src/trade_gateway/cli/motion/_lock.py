@@ -1,4 +1,4 @@
-"""``trade lock GROUP -- COMMAND``: hold a lock around any program; its calls are made under it."""
+"""``trade lock GROUP -- COMMAND``: runs a program under a lock, with which its calls are made."""
 
 import os
 import shlex
@@ -20,48 +20,49 @@ from trade_gateway.cli._system_choice import SystemChoice, choice_of, visitor_am
 
 _COMMAND: Final = "trade_gateway.command"
 _KILLED_BY: Final = 128
-"""What shells add to the number of a signal that ended a program."""
+"""What shells add to the number of the signal that ended a program."""
 
 
 class WithCommand(TyperCommand):
-    """A command of ours around another one, which follows two dashes and is left as it is."""
+    """A command that wraps another one, which follows ``--`` and is not parsed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Keep what follows the dashes for the command to run."""
+        """Keeps the words after ``--`` as the command to run."""
         cut = args.index("--") if "--" in args else len(args)
         ctx.meta[_COMMAND] = args[cut + 1 :]
         return super().parse_args(ctx, args[:cut])
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """The usage line."""
+        """Returns the usage line."""
         return [*super().collect_usage_pieces(ctx), "-- COMMAND [ARGUMENT]..."]
 
 
 COMMAND: Final = {"cls": WithCommand}
-"""How the command line is to take it."""
+"""How the command line registers it."""
 
 
 def lock(
     context: typer.Context,
-    group: Annotated[str | None, typer.Argument(help="This group and what is beneath it: rosie.head.")] = None,
+    group: Annotated[str | None, typer.Argument(help="Group to lock, with the groups beneath it: rosie.head.")] = None,
     name: Annotated[
-        list[str] | None, typer.Option(help="Only services of this name; * and ? stand for anything. Repeatable.")
+        list[str] | None, typer.Option(help="Lock only services of this name; * and ? are wildcards. Repeatable.")
     ] = None,
-    purpose: Annotated[str | None, typer.Option(help="What for, as others are told; by default the command.")] = None,
+    purpose: Annotated[str | None, typer.Option(help="Purpose, shown to other clients. Default: the command.")] = None,
     wait: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to wait for others, and for what is not there yet; 0 tries.")
+        float,
+        typer.Option(min=0.0, help="Time to wait for owners and missing services, in seconds."),
     ] = 10.0,
     lease: Annotated[
-        float, typer.Option(min=0.1, max=60.0, help="Seconds that it outlives a command line that dies.")
+        float, typer.Option(min=0.1, max=60.0, help="Time that the lock survives if this command dies, in seconds.")
     ] = 2.0,
-    priority: Annotated[int, typer.Option(help="Who waits with a higher one comes first.")] = 0,
-    partial: Annotated[bool, typer.Option("--partial", help="Also if members of the group are missing.")] = False,
+    priority: Annotated[int, typer.Option(help="Priority while waiting; the highest comes first.")] = 0,
+    partial: Annotated[bool, typer.Option("--partial", help="Lock even if members of the group are missing.")] = False,
 ) -> None:
-    """Run a command while nobody else can use these services; end with its exit code.
+    """Run a command under a lock on these services; end with its exit code.
 
-    Its calls, and those of what it starts, are made under the lock.
+    The calls of the command, and of programs that it starts, are made under the lock.
 
-    If the lock is lost, the command is told to end (SIGTERM), its calls are refused, and the exit code is 1.
+    If the lock is lost, the command gets SIGTERM, its calls are refused, and the exit code is 1.
 
     For example: trade lock rosie.head --purpose "look around" -- python look.py
     """
@@ -98,13 +99,13 @@ def _wanted(group: str | None, names: Sequence[str]) -> Constraint:
 
 
 def _chosen(choice: SystemChoice) -> dict[str, str]:
-    """What the command line says of the system, for the command, too."""
+    """Returns the choice of system as environment variables for the command."""
     connect = {"TRADE_CONNECT": ",".join(choice.connect)} if choice.connect else {}
     return {**({"TRADE_SYSTEM": choice.system} if choice.system else {}), **connect}
 
 
 class _Running:
-    """The command, and the signals that it is sent."""
+    """The command's process, and the signals that are forwarded to it."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -112,7 +113,7 @@ class _Running:
         self._lost: LockLost | None = None
 
     def run(self, environment: dict[str, str]) -> int:
-        """Run it to its end; returns its exit code, or 1 if the lock was lost meanwhile."""
+        """Runs it to its end; returns its exit code, or 1 if the lock was lost meanwhile."""
         with self._signals():
             try:
                 self._process = subprocess.Popen(self._command, env=environment)  # noqa: S603 - it is what was asked for
@@ -126,14 +127,14 @@ class _Running:
         return code if code >= 0 else _KILLED_BY - code
 
     def lost(self, error: LockLost) -> None:
-        """The lock holds no more: nothing of what it does now is its own."""
+        """Ends the command because its lock was lost."""
         self._lost = error  # the core's log says so on standard error
         if self._process is not None:
             self._process.terminate()
 
     @contextmanager
     def _signals(self) -> Generator[None]:
-        """What ends this command line is for the command to hear; this one ends with it."""
+        """Forwards signals that would end this process to the command; this process ends with it."""
         numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
         before = {number: signal.signal(number, self._pass_on) for number in numbers}
         try:
@@ -148,7 +149,7 @@ class _Running:
 
 
 def _in_foreground() -> bool:
-    """Whether a terminal tells the command of Ctrl-C by itself."""
+    """Whether the terminal itself sends Ctrl-C to the command."""
     try:
         return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
     except (AttributeError, OSError, ValueError):  # another operating system, or no terminal

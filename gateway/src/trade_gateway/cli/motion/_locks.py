@@ -1,4 +1,4 @@
-"""``trade locks``, ``unlock`` and ``resume``: who has what for himself, taking it away, letting it move again."""
+"""``trade locks``, ``unlock`` and ``resume``: list locks, break them, and release groups after a stop."""
 
 from typing import Annotated
 
@@ -12,13 +12,13 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
 
-Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosie.head.")]
+Group = Annotated[str, typer.Argument(help="A group, with the groups beneath it: rosie.head.")]
 
 
 def locks(context: typer.Context, as_json: Json = False) -> None:
-    """List what is locked: by whom, what for, since when, how much of the lease is left, who waits.
+    """List locks with owner, purpose, remaining lease and waiting clients.
 
-    What could not be stopped is of nobody, and nobody gets it before somebody resumes it.
+    Resources that could not be stopped have no owner. They cannot be locked until `trade resume`.
 
     For example: trade locks --json
     """
@@ -57,7 +57,7 @@ def _row(info: LockInfo) -> tuple[str, ...]:
         _owner(info),
         info.holder.purpose,
         clock(info.holder.since),
-        f"{info.left_s:.1f} s" if info.token.number else "",  # what nobody gets has no lease
+        f"{info.left_s:.1f} s" if info.token.number else "",  # a blocked resource has no lease
         info.container,
         ", ".join(info.waiting),
     )
@@ -66,9 +66,9 @@ def _row(info: LockInfo) -> tuple[str, ...]:
 def unlock(
     context: typer.Context,
     group: Group,
-    reason: Annotated[str, typer.Option("--break", metavar="REASON", help="Why; the owner is told.")],
+    reason: Annotated[str, typer.Option("--break", metavar="REASON", help="Reason, reported to the owner.")],
 ) -> None:
-    """Take locks away from their owners; what moves under them is stopped.
+    """Break the locks of a group; motion under them is stopped.
 
     For example: trade unlock rosie.head --break "its program hangs"
     """
@@ -82,16 +82,16 @@ def unlock(
 
 
 def _there(container: Container, group: str) -> Constraint:
-    """The services of a group. Raises NoSuchService, with what there is that looks like it."""
+    """Returns the constraint of a group that has services. Raises NoSuchService, with similar names."""
     constraint = asked_for(f"group {group!r}", group=group, name=None)
     container.await_services(constraint, lambda: bool(container.services(constraint)), 0.0)
     return constraint
 
 
 def resume(context: typer.Context, group: Group) -> None:
-    """Let a group move again after a stop by somebody else. It moves nothing itself.
+    """Let a group move again after another client's stop. This moves nothing itself.
 
-    The exit code is 1 while an e-stop is open: nothing moves before that is cleared.
+    The exit code is 1 while an e-stop is open: nothing moves until it is cleared.
 
     For example: trade resume rosie.head
     """

@@ -1,4 +1,4 @@
-"""``trade stop``: stop all that moves in a group."""
+"""``trade stop``: stops all motion in a group."""
 
 from typing import Annotated
 
@@ -14,16 +14,16 @@ from trade_gateway.cli._system_choice import choice_of, visitor
 
 def stop(
     context: typer.Context,
-    group: Annotated[str, typer.Argument(metavar="GROUP", help="Such as rosie.left; all beneath it, too.")],
-    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "",
-    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Seconds to try.")] = 3.0,
+    group: Annotated[str, typer.Argument(metavar="GROUP", help="Group to stop, and the groups beneath it.")],
+    reason: Annotated[str, typer.Option(help="Reason, for the audit record.")] = "",
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,
 ) -> None:
-    """Stop all that moves in a group: every stop service there is, at once. It needs no lock.
+    """Stop all motion in a group: call all its stop services at once. This needs no lock.
 
-    It asks on the stop line first, which works while the ports of the middleware are busy.
-    The exit code is not 0 if something could not be stopped, or if there was nothing to stop.
-    This is software: it is not safety-rated and replaces no switch that cuts the power.
+    The command uses the stop line first, which works while the middleware's links are busy.
+    The exit code is not 0 if a device could not be stopped, or if there was nothing to stop.
+    This is software. It is not safety-rated and does not replace a switch that cuts the power.
 
     For example: trade stop rosie.head, and later trade resume rosie.head
     """
@@ -31,7 +31,7 @@ def stop(
     settings = choice_of(context).settings()
     asked = StopLines(settings).stop(group, reason, limit)
     report = asked.wait()
-    if not report.complete:  # whoever is not on a stop line may be linked
+    if not report.complete:  # a container without a stop line may have a link
         with visitor(context) as container:
             report = container.stop(group, reason, limit_s=limit)
     if as_json:

@@ -1,4 +1,4 @@
-"""``trade ask "..."``: questions about a system, and orders to it, in plain sentences."""
+"""``trade ask "..."``: questions and commands to a system, in plain sentences."""
 
 import sys
 from pathlib import Path
@@ -18,14 +18,14 @@ _FILE: Final = "asked.json"
 
 def ask(
     context: typer.Context,
-    sentence: Annotated[list[str] | None, typer.Argument(help="What to ask; none: a dialogue, line by line.")] = None,
-    lexicon: Annotated[Path | None, typer.Option(help="A file of phrases that go before those that are known.")] = None,
-    phrases: Annotated[bool, typer.Option("--phrases", help="Show what is understood.")] = False,
+    sentence: Annotated[list[str] | None, typer.Argument(help="The question; by default a dialogue.")] = None,
+    lexicon: Annotated[Path | None, typer.Option(help="TOML file of further phrases.")] = None,
+    phrases: Annotated[bool, typer.Option("--phrases", help="List the sentences that it understands.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Ask about services, hosts, containers, locks, faults and what is new, in plain English sentences.
+    """Ask about services, hosts, containers, locks, faults and news in plain English.
 
-    Each becomes the calls that any program could make; a lexicon (TOML) says which, and can be added to.
+    A lexicon (TOML) translates each sentence into ordinary calls. You can add phrases with --lexicon.
 
     For example: trade ask "who has the legs?"
     """
@@ -40,7 +40,7 @@ def ask(
         if sentence:
             _answer(out, talk.say(" ".join(sentence)))
             return
-        out.say("ask, a sentence a line; Ctrl-D ends")
+        out.say("type one sentence per line; Ctrl-D ends")
         for line in sys.stdin:
             if line.strip():
                 try:

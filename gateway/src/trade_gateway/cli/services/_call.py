@@ -1,4 +1,4 @@
-"""``trade call GROUP.NAME ARGUMENT...``: call one service and print its result."""
+"""``trade call GROUP.NAME ARGUMENT...``: calls one service and prints its result."""
 
 import re
 import shlex
@@ -21,25 +21,25 @@ from trade_gateway.cli._system_choice import visitor
 _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
 COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
-"""A negative number is no option."""
+"""Lets negative numbers pass as arguments."""
 _NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
 
 
 def call(
     context: typer.Context,
-    service: Annotated[str, typer.Argument(help="Group and name: rosie.head.move_to.")],
+    service: Annotated[str, typer.Argument(help="Group and name of the service: rosie.head.move_to.")],
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="Each argument as JSON, by place ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
+        typer.Argument(help="Arguments as JSON, by position ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
     ] = None,
-    deadline: Annotated[float, typer.Option(min=0.001, help="Seconds until the call is given up.")] = 10.0,
-    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for the service to appear.")] = 2.0,
-    container: Annotated[str | None, typer.Option(help="Only the service of this container.")] = None,
+    deadline: Annotated[float, typer.Option(min=0.001, help="Deadline of the call, in seconds.")] = 10.0,
+    wait: Annotated[float, typer.Option(min=0.0, help="Time to wait for the service to appear, in seconds.")] = 2.0,
+    container: Annotated[str | None, typer.Option(help="Call the service of this container.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Call a service and print its result; Ctrl-C cancels a motion under way.
+    """Call a service and print its result. Ctrl-C cancels a motion in progress.
 
-    What is printed for people is rounded to six places; --json has all digits.
+    Numbers are rounded to six places; --json prints all digits.
 
     For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
     """
@@ -51,7 +51,7 @@ def call(
 
 
 def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
-    """Call a service; Ctrl-C and its kin end what it began, and raise KeyboardInterrupt."""
+    """Calls a service; Ctrl-C and similar signals cancel the call and raise KeyboardInterrupt."""
     with _interruptible():
         run = handle.start(*args, **kwargs)
         try:
@@ -63,7 +63,7 @@ def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
 
 @contextmanager
 def _interruptible() -> Generator[None]:
-    """A terminal that closes, ``kill`` and ``timeout`` end a call as Ctrl-C does: what it moves is stopped."""
+    """Makes SIGTERM and SIGHUP end a call as Ctrl-C does, so that its motion is stopped."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -78,7 +78,7 @@ def _interruptible() -> Generator[None]:
 
 
 def _cancel(handle: Handle) -> None:
-    """Ctrl-C: end what was begun, and say if that failed."""
+    """Cancels the call after Ctrl-C, and reports if that failed."""
     try:
         handle.cancel_service()()
     except TradeError as error:
@@ -86,7 +86,7 @@ def _cancel(handle: Handle) -> None:
 
 
 def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
-    """Arguments of a call from the words of a command line.
+    """Parses the arguments of a call from words of the command line.
 
     Raises:
         UsageError: a word is not JSON.
@@ -107,7 +107,7 @@ def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
 
 
 def _remedy(value: str, rest: list[str]) -> str:
-    """What was probably meant by a word that is not JSON, given those that follow it."""
+    """Suggests a correction for a word that is not JSON, from the words that follow it."""
     if _NO_NUMBER.search(value):
         return "JSON has no NaN and no infinity, and what moves takes neither"
     for count in range(1, len(rest) + 1 if value[:1] in ("[", "{", '"') else 0):

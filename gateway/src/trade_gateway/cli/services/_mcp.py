@@ -1,4 +1,4 @@
-"""``trade mcp``: a system for an agent, over the Model Context Protocol on standard input and output."""
+"""``trade mcp``: a Model Context Protocol (MCP) server for agents, on standard input and output."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,20 +17,20 @@ from trade_gateway.process._signals import settle
 
 def mcp(
     context: typer.Context,
-    name: Annotated[str, typer.Option(help="Name of its container.")] = "agent",
+    name: Annotated[str, typer.Option(help="Name of the server's container.")] = "agent",
     ask_first: Annotated[
         list[str] | None,
-        typer.Option(help="A group of which nothing is called without a person's word (trade approvals). Repeatable."),
+        typer.Option(help="Require human approval (trade approvals) for calls to this group. Repeatable."),
     ] = None,
     twin: Annotated[
-        Path | None, typer.Option(metavar="ROBOT.toml", help="Dry runs are made on a simulation of this robot.")
+        Path | None, typer.Option(metavar="ROBOT.toml", help="Robot file to simulate for dry runs.")
     ] = None,
-    lexicon: Annotated[Path | None, typer.Option(help="Phrases for the tool ask that go before those known.")] = None,
+    lexicon: Annotated[Path | None, typer.Option(help="TOML file of phrases for the tool ask.")] = None,
 ) -> None:
-    """Let an agent look at the system and, under locks, move what it may; its client starts this as a program.
+    """Serve the system to an agent over MCP; the agent's client starts this command.
 
-    The agent is whoever this process is (--tls of its settings): policy, audit and locks know it by that name.
-    When its client goes away, what it has set moving stops.
+    The agent can read, and can move under locks what the policy allows. Its identity is that of this process.
+    When the client disconnects, the agent's motion stops.
 
     For example: trade mcp --twin rosie.toml --ask-first rosie.legs
     """
@@ -41,9 +41,9 @@ def mcp(
     trying = None if twin is None else room.Twin(twin)
     with Container(choice.settings(name)) as container:
         if container.access.policy is None and not ask_first:
-            complain("there is no policy: this agent may call everything it has locked; see docs/agents.md")
+            complain("there is no policy: this agent may call every service that it has locked; see docs/agents.md")
         if container.access.policy is None and ask_first:
-            complain(f"there is no policy: approve under another identity than {container.address.identity}")
+            complain(f"there is no policy: approve calls under another identity than {container.address.identity}")
         approvals = room.Approvals(container, ask_first or ())
 
         def leave() -> None:

@@ -1,4 +1,4 @@
-"""``trade services`` and ``trade containers``: what there is."""
+"""``trade services`` and ``trade containers``: lists of services and containers."""
 
 from collections.abc import Sequence
 from textwrap import indent
@@ -21,13 +21,13 @@ _STARTS: Final = "; [bold]trade up examples/rosie.toml --sim[/] starts one"
 
 def services(
     context: typer.Context,
-    group: Annotated[str | None, typer.Option(help="Only this group and what is beneath it: rosie.head.")] = None,
-    name: Annotated[str | None, typer.Option(help="Only this name; * and ? stand for anything.")] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Also the middleware's own services.")] = False,
-    doc: Annotated[bool, typer.Option("--doc", help="Show what each service does.")] = False,
+    group: Annotated[str | None, typer.Option(help="List only this group and those beneath it: rosie.head.")] = None,
+    name: Annotated[str | None, typer.Option(help="List only this name; * and ? are wildcards.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also list the middleware's own services.")] = False,
+    doc: Annotated[bool, typer.Option("--doc", help="Show the documentation of each service.")] = False,
     as_json: Json = False,
 ) -> None:
-    """List services: group and name, arguments, where they run.
+    """List services with their arguments, containers and hosts.
 
     For example: trade services --group rosie.head --doc
     """
@@ -50,7 +50,7 @@ def services(
 
 
 def _nothing(container: Container, constraint: Constraint) -> str:
-    """What there is instead of what was asked for."""
+    """Reports that nothing matches, with the groups that exist."""
     others = container.services(~where(group="trade"))
     groups = sorted({group for handle in others for group in handle.groups})
     if groups:
@@ -63,13 +63,13 @@ def _alone(container: Container) -> str:
 
 
 def _starts(container: Container) -> str:
-    """Who tries it out is told how to begin; who has set up a system of his own is not."""
+    """Suggests how to start a robot, unless the user has configured a system."""
     settings = container.settings
     return "" if settings.connect or settings.tls is not None else _STARTS
 
 
 def describe(handle: Handle) -> dict[str, Any]:
-    """Everything a handle tells, as plain data."""
+    """Returns all fields of a handle as plain data."""
     return {
         "service": handle.label,
         "name": handle.name,
@@ -88,7 +88,7 @@ def describe(handle: Handle) -> dict[str, Any]:
 
 
 def _table(found: Sequence[Handle]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Where one is not well, there is a column for it."""
+    """Builds the table of services, with a health column if one is not healthy."""
     columns: dict[str, list[str]] = {"SERVICE": [handle.label for handle in found]}
     if any(handle.health != HEALTHY for handle in found):
         columns["HEALTH"] = [handle.health for handle in found]
@@ -101,7 +101,7 @@ def _table(found: Sequence[Handle]) -> tuple[tuple[str, ...], list[tuple[str, ..
 
 def containers(
     context: typer.Context,
-    load: Annotated[bool, typer.Option("--load", help="How busy each is, over one second.")] = False,
+    load: Annotated[bool, typer.Option("--load", help="Show how busy each container is, over 1 s.")] = False,
     as_json: Json = False,
 ) -> None:
     """List the containers of the system.
@@ -123,7 +123,7 @@ def containers(
 
 
 def _containers_table(found: Sequence[ContainerInfo]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Where one speaks another version of the protocol, or has not answered yet, there is a column for it."""
+    """Builds the table of containers, with a protocol column if one has another version or has not answered."""
     columns: dict[str, list[str]] = {
         "CONTAINER": [info.name for info in found],
         "IDENTITY": [info.identity for info in found],

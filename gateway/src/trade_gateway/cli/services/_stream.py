@@ -1,4 +1,4 @@
-"""``trade stream GROUP.NAME``: print what a service answers, again and again."""
+"""``trade stream GROUP.NAME``: prints the samples of a stream."""
 
 import itertools
 from typing import Annotated
@@ -16,15 +16,15 @@ from trade_gateway.cli._system_choice import visitor
 
 def stream(
     context: typer.Context,
-    service: Annotated[str, typer.Argument(help="Group and name of what only reads: rosie.head.state.")],
-    hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Samples a second, at most.")] = 10.0,
-    on_change: Annotated[bool, typer.Option("--on-change", help="Only samples unlike the one before.")] = False,
-    count: Annotated[int | None, typer.Option(min=1, help="End after so many; else with Ctrl-C.")] = None,
-    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for the service to appear.")] = 2.0,
-    container: Annotated[str | None, typer.Option(help="Only the service of this container.")] = None,
+    service: Annotated[str, typer.Argument(help="Group and name of a read-only service: rosie.head.state.")],
+    hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Highest sample rate, in Hz.")] = 10.0,
+    on_change: Annotated[bool, typer.Option("--on-change", help="Print a sample only if it changed.")] = False,
+    count: Annotated[int | None, typer.Option(min=1, help="End after this many samples; by default at Ctrl-C.")] = None,
+    wait: Annotated[float, typer.Option(min=0.0, help="Time to wait for the service to appear, in seconds.")] = 2.0,
+    container: Annotated[str | None, typer.Option(help="Stream the service of this container.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Print samples of a service as they come; with --json one object a line.
+    """Print the samples of a service as they arrive; with --json one object per line.
 
     For example: trade stream rosie.head.state --hz 20 --json
     """
