@@ -115,7 +115,7 @@ def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
         (["call", "rosie.head.move_to", "[0.1,", "-0.2]"], "forgot quotes? The shell splits at spaces: '[0.1, -0.2]'"),
         (["call", "rosie.*.stop"], "UsageError: service 'rosie.*.stop': group='rosie.*' would match nothing"),
         (["services", "--group", "rosie*"], "UsageError: --group rosie*: group='rosie*' would match nothing"),
-        (["up", ROSIES_HEAD, "--sim-log", "log"], "UsageError: --sim-log: is the log of the simulator; it needs --sim"),
+        (["up", ROSIES_HEAD, "--sim-log", "log"], "UsageError: --sim-log: needs --sim: it is the simulator's log"),
     ],
 )
 def test_wrong_words_are_one_line_and_exit_code_2(words: list[str], complaint: str, trade_command: Command) -> None:
@@ -162,7 +162,7 @@ def test_S19_silence_is_told_once_and_with_its_time_and_who_was_not_seen_at_rest
     rosie.program.signal(signal.SIGINT)
     rosie.program.wait()
     said = [line for line in rosie.program.errors if "rosie.neck.pan" in line]
-    assert said == ["warning: left without being seen at rest: rosie.neck.pan, rosie.neck.tilt\n"]
+    assert said == ["warning: shut down without confirmation that these are at rest: rosie.neck.pan, rosie.neck.tilt\n"]
 
 
 def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(system: str, run, tmp_path) -> None:
@@ -198,7 +198,7 @@ def test_what_a_killed_simulation_left_is_removed_by_the_next(run, system: str) 
 
 def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(run, system: str) -> None:
     up = run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim")
-    while "to strike the simulator with faults" not in (line := up.line()):
+    while "to inject faults into the simulator" not in (line := up.line()):
         pass
     program, *words = line.split(": ")[1].partition(" FAULT")[0].split()
     assert program == "trade-hil-sim"
@@ -215,7 +215,7 @@ def test_each_bus_is_announced_with_its_devices(run, system: str, tmp_path: Path
     (tmp_path / "rosie.toml").write_text(hand + spare)
     up = run("-m", "trade_gateway", "up", tmp_path / "rosie.toml", "--sim")
     assert up.line().endswith("/hand: left.hand (2F-85, id 9)\n")
-    assert up.line().endswith('/spare: no device; one that is on it says bus = "spare"\n')
+    assert up.line().endswith('/spare: no device; a device on it has bus = "spare"\n')
 
 
 def test_help_names_every_command(trade_command: Command) -> None:

@@ -134,7 +134,7 @@ def _tried(member: Member) -> str:
 def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) -> None:
     site.change(site.file, 'policy = "policy.toml"', 'polcy = "policy.toml"')
     wait_until(lambda: "polcy: unknown key" in site.complaints(), "it is said")
-    assert "going on as before" in site.complaints()
+    assert "continuing as before" in site.complaints()
     planner.ask("move", "rosie.arm", "2")
     site.change(site.file, 'polcy = "policy.toml"', 'policy = "policy.toml"\nconnect = ["tcp/10.231.2.9:1"]')
     wait_until(lambda: "must be tls/10.231.2.9:1" in site.complaints(), "so is this")

@@ -102,7 +102,7 @@ def test_a_gateway_tells_when_it_is_up_reads_its_file_and_leaves(
         assert [service.tells() for _ in range(2)] == [{"WATCHDOG": "1"}] * 2
         file.write_text(file.read_text().replace("system =", "sytem ="))
         assert service.next_but_alive()["RELOADING"] == "1"
-        assert "going on as before" in service.next_but_alive()["STATUS"]
+        assert "continuing as before" in service.next_but_alive()["STATUS"]
         file.write_text(file.read_text().replace("sytem =", "system ="))
         assert service.next_but_alive()["RELOADING"] == "1"
         assert service.next_but_alive() == first

@@ -51,7 +51,7 @@ class Terminal:
             _, said = self._shell.run(command)
         said = said.replace(str(self._shell.folder), "/home/you")
         said = re.sub(r"^\d\d:\d\d:\d\d ", "", said, flags=re.MULTILINE)
-        said = re.sub(r"^warning: this host passes packets on.*\n", "", said, flags=re.MULTILINE)  # some CI does
+        said = re.sub(r"^warning: this host forwards packets.*\n", "", said, flags=re.MULTILINE)  # some CI does
         said = re.sub(r"since \d\d:\d\d:\d\d", "since TIME", said)
         said = re.sub(r"e-stop [0-9a-f]{8}|--clear [0-9a-f]{8}", lambda found: f"{found[0].rsplit(' ', 1)[0]} ID", said)
         return normalised(said, numbers="status" not in command) if said else ""

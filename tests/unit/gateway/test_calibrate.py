@@ -102,7 +102,7 @@ def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[
 
 
 def test_nobody_is_waited_for_without_an_end() -> None:
-    with pytest.raises(ConfigurationError, match="nobody went on"):
+    with pytest.raises(ConfigurationError, match="no answer to the prompt"):
         Sweep(Hand([0.0, 0.0, 0.0]), 1, PLACE).until(lambda: False, 0.0)  # type: ignore[arg-type]
 
 

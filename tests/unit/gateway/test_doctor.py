@@ -41,7 +41,7 @@ def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, m
 
 def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> None:
     assert only(host.ports([])).text == "no adapter is plugged in"
-    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names 2, looked at below")
+    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names 2, checked below")
 
 
 def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> None:
@@ -77,7 +77,7 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(
 
 
 @pytest.mark.parametrize(
-    ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "nobody")]
+    ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "it is unknown")]
 )
 def test_the_clock_is_synchronised_or_not_or_nobody_knows(said: str, level: str, text: str) -> None:
     found = only(host.clock([sys.executable, "-c", f"print({said!r})"]))
@@ -85,7 +85,7 @@ def test_the_clock_is_synchronised_or_not_or_nobody_knows(said: str, level: str,
 
 
 def test_a_host_without_the_tool_does_not_know() -> None:
-    assert only(host.clock(["/no/such/tool"])).text.startswith("nobody")
+    assert only(host.clock(["/no/such/tool"])).text.startswith("it is unknown")
 
 
 @pytest.mark.parametrize(("symbol", "level"), [(b"sem_clockwait", "ok"), (b"sem_timedwait", "warning")])
@@ -103,7 +103,7 @@ def test_a_python_whose_waits_go_by_the_clock_on_the_wall_is_told_of(tmp_path: P
     [
         (timedelta(hours=1), "ok", "is valid until"),
         (timedelta(days=6), "warning", "expires on"),
-        (timedelta(days=8), "error", "has expired"),
+        (timedelta(days=8), "error", "expired on"),
         (timedelta(days=-2), "error", "is valid only from"),
     ],
 )
@@ -179,7 +179,7 @@ def test_who_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.do(Mute(ids=(1,), instruction="ping", skip=3, count=2))
         pan, _ = of_devices(robot_file)
-    assert (pan.level, pan.text) == ("error", "answered 8 of 10 questions as it should")
+    assert (pan.level, pan.text) == ("error", "answered 8 of 10 requests correctly")
     assert "termination" in pan.fix
 
 
@@ -219,7 +219,7 @@ def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: 
     (tmp_path / "neck").write_text("a file\n")
     found = only(of_devices(robot_file))
     assert (found.level, "head.toml: bus.neck.port" in found.text) == ("error", True)
-    assert "is no serial port" in found.text and "end what uses it" not in found.fix
+    assert "is no serial port" in found.text and "end the program that uses it" not in found.fix
 
 
 WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
@@ -255,7 +255,7 @@ def test_where_it_is_to_connect_and_nobody_answers_is_an_error(system: str, monk
     [error] = [one for one in json.loads(said.stdout) if one["about"] == nowhere]
     assert error["level"] == "error"
     assert "nothing accepts connections there" in error["text"]
-    assert "no container is in sight" not in said.stdout
+    assert "no container is visible" not in said.stdout
 
 
 def test_who_has_bad_papers_is_not_told_to_do_without(

@@ -37,19 +37,19 @@ def test_each_change_is_told_once_in_both_directions(
     found: Found, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     watch, out = FaultWatch(log, {"rosie.pan": create_autospec(Motor, instance=True)}), Output(as_json=True)
-    assert not watch.tell(out)
+    assert not watch.report(out)
     log.begin("rosie.pan", found, 0.0, 0.0)
-    assert [watch.tell(out), watch.tell(out)] == [True, False]
+    assert [watch.report(out), watch.report(out)] == [True, False]
     assert told(capsys) == [("rosie.pan", line)]
     log.end("rosie.pan", found.kind, 1.0, 1.0)
-    assert [watch.tell(out), watch.tell(out)] == [True, False]
+    assert [watch.report(out), watch.report(out)] == [True, False]
     assert told(capsys) == [("rosie.pan", "")]
 
 
 def test_of_a_gripper_that_is_said_which_is_enough(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
     watch = FaultWatch(log, {"rosie.pan": create_autospec(Gripper, instance=True)})
     log.begin("rosie.pan", OVERLOAD, 0.0, 0.0)
-    watch.tell(Output(as_json=True))
+    watch.report(Output(as_json=True))
     assert told(capsys) == [("rosie.pan", "rosie.pan: overload. When you have looked: trade call rosie.pan.activate")]
 
 
@@ -59,10 +59,10 @@ def test_of_two_faults_the_newest_is_told_and_it_is_well_when_both_are_gone(
     watch, out = FaultWatch(log, {}), Output(as_json=True)
     log.begin("rosie.pan", PROTECTIVE, 0.0, 0.0)
     log.begin("rosie.pan", SILENT, 0.0, 0.0)
-    watch.tell(out)
+    watch.report(out)
     log.end("rosie.pan", "silent", 1.0, 1.0)
-    watch.tell(out)
+    watch.report(out)
     log.end("rosie.pan", "protective stop", 1.0, 1.0)
-    watch.tell(out)
+    watch.report(out)
     remedied = "rosie.pan: protective stop; `trade call rosie.pan.unlock_protective_stop`"
     assert [text for _, text in told(capsys)] == ["rosie.pan did not answer", remedied, ""]

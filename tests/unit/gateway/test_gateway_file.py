@@ -418,7 +418,7 @@ def test_a_host_that_forwards_between_the_networks_is_told_of(
     assert on == ["net.ipv4.conf.eth0.forwarding", "net.ipv6.conf.eth1.forwarding"]
     has(monkeypatch)
     monkeypatch.setattr(_gateway, "forwarding", lambda names: forwarding(names, sysctls))
-    assert "packets on between its networks (net.ipv4.conf.eth0.forwarding, net" in checked(file)
+    assert "packets between its networks (net.ipv4.conf.eth0.forwarding, net" in checked(file)
     shutil.rmtree(sysctls)
     assert checked(file) == ""
 

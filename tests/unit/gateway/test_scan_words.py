@@ -41,7 +41,7 @@ def test_help_has_an_example(command: str) -> None:
 def test_ids_are_numbers_and_ranges() -> None:
     assert _numbers("1-3,9", "--ids") == [1, 2, 3, 9]
     assert _numbers(None, "--ids") == []
-    with pytest.raises(UsageError, match="no number and no range"):
+    with pytest.raises(UsageError, match="neither a number nor a range"):
         _numbers("1-x", "--ids")
 
 
@@ -64,7 +64,7 @@ def test_a_program_gets_them_as_json(line: DynamixelBus) -> None:
 def test_nobody_is_an_exit_code_of_its_own(line: DynamixelBus) -> None:
     said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "7", "--driver", "dynamixel")
     assert said.exit_code == 1
-    assert "nobody answers" in said.output
+    assert "no device answers" in said.output
 
 
 def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: DynamixelBus, tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: Dyna
     [
         ({"problem": "two share it"}, "two share it"),
         ({"baud": 57_600}, "57600 and 1000000 baud"),
-        ({"driver": "feetech"}, "of dynamixel and feetech"),
+        ({"driver": "feetech"}, "drivers dynamixel and feetech"),
     ],
 )
 def test_what_cannot_be_in_one_robot_file_is_told(second: dict[str, object], complaint: str) -> None:
@@ -131,7 +131,7 @@ def test_motors_on_a_can_bus_become_a_robot_file(bus: Any, device: Any, model: s
     robot = parse((tmp_path / "can.toml").read_text(encoding="utf-8"), "can.toml")
     assert [(joint.id, joint.model) for joint in robot.joints] == [(3, model), (4, model)]
     assert robot.buses[0].port == port
-    assert ("not looked for: driver cia402: ODrives talk" in said.output) == (bus is OdriveBus)
+    assert ("not scanned for: driver cia402: ODrives talk" in said.output) == (bus is OdriveBus)
 
 
 def test_a_host_without_a_controller_is_named() -> None:
@@ -143,7 +143,7 @@ def test_a_host_without_a_controller_is_named() -> None:
 def test_a_driver_whose_devices_are_set_up_otherwise_says_so(line: DynamixelBus) -> None:
     error = trade("scan", "--port", line.port, "--driver", "ur").exception
     assert isinstance(error, ConfigurationError)
-    assert "it has no scan" in str(error)
+    assert "driver ur has no scan" in str(error)
 
 
 def test_a_scan_that_finds_a_problem_tells_its_exit_code(tmp_path: Path) -> None:

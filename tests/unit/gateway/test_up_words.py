@@ -8,18 +8,18 @@ from typer.testing import CliRunner
 from tests.support.simulated_robots import HAND, TAIL
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli.robots._up import ports_told
+from trade_gateway.cli.robots._up import ports_named
 
 
 def test_a_port_of_the_command_line_may_have_any_sign_in_it() -> None:
-    assert ports_told(["neck=/dev/by=id", "legs=socketcan:can1"]) == {"neck": "/dev/by=id", "legs": "socketcan:can1"}
-    assert ports_told([]) == {}
+    assert ports_named(["neck=/dev/by=id", "legs=socketcan:can1"]) == {"neck": "/dev/by=id", "legs": "socketcan:can1"}
+    assert ports_named([]) == {}
 
 
 @pytest.mark.parametrize("words", [["neck"], ["neck="], ["=/dev/ttyUSB0"], ["neck=/dev/ttyUSB0", "neck=/dev/ttyUSB1"]])
 def test_what_is_no_port_of_a_part_is_refused(words: list[str]) -> None:
     with pytest.raises(UsageError, match="--port"):
-        ports_told(words)
+        ports_named(words)
 
 
 def test_a_check_of_a_right_file_says_so_and_touches_nothing(system: str, tmp_path: Path) -> None:

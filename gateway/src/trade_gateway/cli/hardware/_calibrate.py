@@ -1,4 +1,4 @@
-"""``trade calibrate ROBOT.toml JOINT``: zero and range of a joint, measured while somebody moves it by hand."""
+"""``trade calibrate ROBOT.toml JOINT``: measures zero and range of a joint while a person moves it by hand."""
 
 import difflib
 import os
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 __all__ = ["Sweep", "calibrate", "homed", "measured", "with_values"]
 
 _MARGIN_RAD: Final = 0.02
-"""How far inside of what was reached the range ends: the last bit is the stop giving way."""
+"""How far inside the measured ends the range lies: a mechanical stop yields a little."""
 _LEAST_RAD: Final = 0.1
 _APART_S: Final = 0.3
 _STILL_RAD: Final = 0.01
-"""What is held still has moved by no more since it was looked at before: a hand trembles."""
+"""The most that a joint held still by hand moves between two readings."""
 _LONGEST_S: Final = 600.0
-"""How long somebody may take between two prompts."""
+"""How long a person may take between two prompts, in seconds."""
 _DIGITS: Final = 4
 _PATIENCE_S: Final = 2.0
-"""So long a device that does not answer is asked again: what was shown by hand before is not lost by a loose plug."""
+"""How long to retry a device that does not answer, so that a loose plug does not lose the measurement."""
 _AGAIN_S: Final = 0.02
 
 _Number = TypeVar("_Number", int, float)
@@ -45,17 +45,17 @@ _Number = TypeVar("_Number", int, float)
 
 def calibrate(
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
-    joint: Annotated[str, typer.Argument(help="The joint, as the file names it: neck.pan.")],
-    zero_here: Annotated[bool, typer.Option("--zero-here", help="Its zero is where it stands still now.")] = False,
+    joint: Annotated[str, typer.Argument(help="Name of the joint in the file: neck.pan.")],
+    zero_here: Annotated[bool, typer.Option("--zero-here", help="Use the current position as zero.")] = False,
     range_from_motion: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", min=1.0, max=_LONGEST_S, help="Its range is where it is moved meanwhile."),
+        typer.Option(metavar="SECONDS", min=1.0, max=_LONGEST_S, help="Time to move it over its range, in seconds."),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the file is written.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Write the file without a prompt.")] = False,
 ) -> None:
-    """Measure zero and range of a joint while you move it by hand, and write them into the robot file.
+    """Measure zero and range of a joint that you move by hand, and write them into the robot file.
 
-    Its torque must be off, and stays off: nothing is written to the device. Comments of the file stay as they are.
+    The joint's torque must be off. Nothing is written to the device. Comments in the file are kept.
 
     For example: trade calibrate rosie.toml neck.pan
     """
@@ -73,7 +73,7 @@ def calibrate(
 
 
 class Ends(Struct, frozen=True):
-    """Where a device was moved to, in its own sense."""
+    """The ends that a device was moved to, in its own direction."""
 
     low: float
     high: float
@@ -84,26 +84,26 @@ class Sweep:
     """Readings of one device while it is moved by hand.
 
     Args:
-        bench: its line.
-        device_id: its id there.
-        where: which joint that is and on which port, for messages.
-        patience_s: how long it is asked again if it does not answer.
+        bench: the device's line.
+        device_id: its id on the line.
+        where: the joint and its port, for messages.
+        patience_s: how long to retry if it does not answer.
     """
 
     def __init__(self, bench: Bench, device_id: int, where: str, patience_s: float = _PATIENCE_S) -> None:
         self._bench, self._id, self._where, self._patience_s = bench, device_id, where, patience_s
 
     def until(self, done: Callable[[], bool], longest_s: float) -> Ends:
-        """Read until something holds.
+        """Reads positions until a condition holds.
 
         Raises:
-            ConfigurationError: it jumped over the end of its encoder, or nothing happened in time.
+            ConfigurationError: the device passed the end of its encoder, or the condition did not hold in time.
         """
         low = high = last = self.read()
         until = time.monotonic() + longest_s
         while not done():
             if time.monotonic() > until:
-                problem = f"nobody went on for {longest_s:g} s; nothing was written"
+                problem = f"no answer to the prompt for {longest_s:g} s; nothing was written"
                 raise ConfigurationError(where=self._where, problem=problem)
             now = self.read()
             if abs(now - last) > pi or abs(now) > pi:
@@ -113,10 +113,10 @@ class Sweep:
         return Ends(low, high, last)
 
     def still(self) -> float:
-        """Where it stands, seen twice.
+        """Returns the position of a device that is held still, from two readings.
 
         Raises:
-            ConfigurationError: it moves.
+            ConfigurationError: the device moves.
         """
         before = self.read()
         time.sleep(_APART_S)
@@ -127,14 +127,14 @@ class Sweep:
         return now
 
     def read(self) -> float:
-        """Where it stands, from its own centre, in rad."""
-        return self._told(self._bench.angle_rad)
+        """Returns the position from the device's own centre, in rad."""
+        return self._retried(self._bench.angle_rad)
 
     def homing_counts(self) -> int:
-        """By how much it shifts its zero itself."""
-        return self._told(self._bench.homing_counts)
+        """Returns the device's own homing offset, in counts."""
+        return self._retried(self._bench.homing_counts)
 
-    def _told(self, ask: Callable[[int], _Number]) -> _Number:
+    def _retried(self, ask: Callable[[int], _Number]) -> _Number:
         until = time.monotonic() + self._patience_s
         while True:
             try:
@@ -148,15 +148,15 @@ class Sweep:
 
 
 def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, float]:
-    """The values of a joint's keys that change.
+    """Returns the values of a joint's keys that change.
 
     Args:
-        joint: what the file says of it.
-        zero: the device's angle at the joint's zero; None leaves it as it is.
-        ends: where the device was moved to; None leaves the range as it is.
+        joint: the joint in the file.
+        zero: the device's angle at the joint's zero; None keeps the zero.
+        ends: the ends that the device was moved to; None keeps the range.
 
     Raises:
-        ConfigurationError: it was not moved far enough to be a range.
+        ConfigurationError: the joint was moved too little for a range.
     """
     sign = -1 if joint.reversed else 1
     offset = joint.offset_rad if zero is None else -sign * zero
@@ -171,10 +171,10 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
 
 
 def homed(joint: Joint, found: int, *, zero_measured: bool) -> dict[str, float]:
-    """The key that changes if the servo's own homing offset is not what the file says.
+    """Returns the key that changes if the servo's own homing offset differs from the file.
 
     Raises:
-        WrongDevice: its zero has moved, and was not measured.
+        WrongDevice: the servo's zero has moved, and was not measured.
     """
     if found == joint.homing_counts:
         return {}
@@ -185,8 +185,8 @@ def homed(joint: Joint, found: int, *, zero_measured: bool) -> dict[str, float]:
 
 
 def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:
-    """The text of a robot file with other values for some keys of a joint; everything else stays as it is."""
-    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+    """Returns the text of a robot file with new values for some keys of a joint; all else is unchanged."""
+    import tomlkit  # noqa: PLC0415 - slow, and only needed here
 
     for key in values:
         text = _with_key(text, joint, key)
@@ -198,8 +198,8 @@ def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:
 
 
 def _with_key(text: str, joint: str, key: str) -> str:
-    """The text with a line for a key that a joint has not got, above its ``min_rad``."""
-    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+    """Returns the text with a line for a joint's missing key, above its ``min_rad``."""
+    import tomlkit  # noqa: PLC0415 - slow, and only needed here
 
     document = tomlkit.parse(text)
     table = _table(document, joint)
@@ -222,7 +222,7 @@ def _table(document: "tomlkit.TOMLDocument", joint: str) -> dict[str, object]:
 
 
 def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
-    """A joint whose servo can be turned by hand, and its bus."""
+    """Returns a joint whose servo can be turned by hand, and its bus."""
     joint = next((one for one in robot.joints if one.name == name), None)
     if any(one.name == name for one in robot.grippers):
         activate = f"`trade call {robot.name}.{name}.activate`, once it is up"
@@ -232,7 +232,7 @@ def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
         raise UsageError(where=robot.where, problem=f"there is no joint {name!r}; there is {there}")
     bus = next(one for one in robot.buses if one.name == joint.bus)
     if not isinstance(bus, SerialBus):
-        problem = "is no servo on a serial line: its zero is found by its own homing"
+        problem = "is no servo on a serial line; its own homing finds its zero"
         raise ConfigurationError(where=f'{robot.where}: joint."{name}"', problem=problem)
     return joint, bus
 
@@ -243,7 +243,7 @@ def _place(bus: SerialBus, joint: Joint) -> str:
 
 @contextmanager
 def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
-    """The line of a joint whose torque is off."""
+    """Opens the line of a joint whose torque is off."""
     commissioner = load_driver(bus.driver, f"bus.{bus.name}.driver", Driver).commissioner
     if commissioner is None:
         raise ConfigurationError(where=joint.name, problem=f"driver {bus.driver} has nothing to calibrate by hand")
@@ -263,7 +263,7 @@ def _measure(
     seconds: float | None,
     enter: Callable[[], bool] | None = None,
 ) -> dict[str, float]:
-    """What changes, by the ways that were asked for; by prompts if none was."""
+    """Measures the values that the options ask for; prompts if there are no options."""
     name, asked = escape(joint.name), enter or _enter_pressed
     zero, ends = sweep.still() if zero_here else None, None
     if seconds is not None:
@@ -276,21 +276,21 @@ def _measure(
         out.say(f"Now move [bold]{name}[/] slowly from one end to the other, and press Enter")
         ends = sweep.until(asked, _LONGEST_S)
     if zero is not None and ends is None:
-        out.say("its range keeps its numbers, counted from the new zero")
+        out.say("the range keeps its values, relative to the new zero")
     return measured(joint, zero, ends)
 
 
 def _enter_pressed() -> bool:
-    """Whether a line has come since; never waits for one.
+    """Whether a line has arrived on standard input; does not wait.
 
     Raises:
-        UsageError: nobody is there to press anything.
+        UsageError: standard input is closed.
     """
     fd = sys.stdin.fileno()
     while select.select([fd], [], [], 0)[0]:
         match os.read(fd, 1):
             case b"":
-                problem = "nobody is there to press Enter; --zero-here and --range-from-motion ask nobody"
+                problem = "standard input is closed; --zero-here and --range-from-motion need no prompt"
                 raise UsageError(where="trade calibrate", problem=problem)
             case b"\n":
                 return True
@@ -300,9 +300,9 @@ def _enter_pressed() -> bool:
 
 
 def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> None:
-    """Show what changes, ask, and replace the file as a whole."""
+    """Shows the changes, prompts, and replaces the whole file."""
     if before == after:
-        out.say("it is so already; nothing is written")
+        out.say("the file has these values already; nothing was written")
         return
     name = str(path)
     for line in difflib.unified_diff(before.splitlines(), after.splitlines(), name, name, n=1, lineterm=""):
@@ -312,9 +312,9 @@ def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> No
         raise typer.Exit(1)
     target = path.resolve()
     if target.read_text(encoding="utf-8") != before:
-        raise ConfigurationError(where=name, problem="was changed by somebody else meanwhile; nothing was written")
+        raise ConfigurationError(where=name, problem="was changed meanwhile; nothing was written")
     try:
         replace(target, after.encode(), stat.S_IMODE(target.stat().st_mode))
     except OSError as bad:
-        raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is as it was") from None
+        raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is unchanged") from None
     out.say(f"[bold]{escape(name)}[/] is written")

@@ -1,4 +1,4 @@
-"""``trade doctor [ROBOT.toml]``: what is wrong with this host and this robot, each finding with its fix."""
+"""``trade doctor [ROBOT.toml]``: finds problems of this host and this robot, each with its fix."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,15 +26,15 @@ def doctor(
     context: typer.Context,
     robot_file: Annotated[
         Path | None,
-        typer.Argument(metavar="[ROBOT.toml]", help="A robot file, to look at its lines and devices, too."),
+        typer.Argument(metavar="[ROBOT.toml]", help="Robot file whose lines and devices to check."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Look for what keeps a robot from working, and say what helps. Nothing is changed; the exit code is 1 on errors.
+    """Check this host and a robot for problems, and suggest fixes. Nothing is changed.
 
-    Of the host: rights and latency of serial ports, libraries, clock, certificates, who is in sight. With a robot file:
-    what its drivers refuse of it, its ports and CAN interfaces, whether its devices answer and are set up as it says,
-    and which have no watchdog. Lines that a driver holds are left alone.
+    Host: rights and latency of serial ports, libraries, clock, certificates, visible containers.
+    Robot file: errors that its drivers find, ports, CAN interfaces, devices and their setup, missing watchdogs.
+    Lines in use by a driver are skipped. The exit code is 1 on errors.
 
     For example: trade doctor rosie.toml
     """
@@ -43,7 +43,7 @@ def doctor(
     for one in (*_of_host(context, robot_file), *(() if robot_file is None else _of_robot(robot_file))):
         found.append(one)
         if not as_json:
-            _tell(out, one)
+            _print(out, one)
     if as_json:
         out.data(found)
     errors = sum(one.level == "error" for one in found)
@@ -78,13 +78,13 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
 
 
 def _fix_of(bad: TradeError) -> str:
-    """Papers are not left out: without TRADE_TLS a system that has them lets nobody in."""
-    papers = isinstance(bad, ConfigurationError) and bad.where.endswith(".pem")
-    return "the message says what helps" if papers else "correct that variable, or leave it out"
+    """Suggests a fix; not to remove TRADE_TLS, which a system with certificates needs."""
+    of_certificate = isinstance(bad, ConfigurationError) and bad.where.endswith(".pem")
+    return "the message says what helps" if of_certificate else "correct that variable, or leave it out"
 
 
 def _lines_of(path: Path | None) -> list[str]:
-    """The serial ports that a robot file names; none if it cannot be read, which is told later."""
+    """Returns the serial ports that a robot file names; none if it cannot be read, which is reported later."""
     try:
         return [bus.port for bus in load(path).buses if isinstance(bus, SerialBus)] if path is not None else []
     except TradeError:
@@ -115,7 +115,7 @@ def _of_robot(path: Path) -> Iterator[Finding]:
 
 
 def _no_robot(path: Path) -> Finding | None:
-    """That it is a file of another kind; None: it is none that is known."""
+    """Returns a finding that the file is of another known kind, or None."""
     try:
         system = read_toml_text(path.read_text(encoding="utf-8")).get("system")
     except (OSError, ValueError):
@@ -125,11 +125,11 @@ def _no_robot(path: Path) -> Finding | None:
     kind, check = (
         ("gateway", "trade gateway {} --check") if isinstance(system, str) else ("system", "trade system up {} --check")
     )
-    text = f"is a {kind} file; trade doctor looks at robot files, such as those that it names"
+    text = f"is a {kind} file; trade doctor checks robot files, such as those that it names"
     return Finding(level="error", about=str(path), text=text, fix=check.format(path))
 
 
-def _tell(out: Output, one: Finding) -> None:
+def _print(out: Output, one: Finding) -> None:
     out.say(f"[{_COLOURS[one.level]}]{one.level:7}[/]  {escape(one.about)}: {escape(one.text)}")
     if one.fix:
         out.say(f"         fix: {escape(one.fix)}")

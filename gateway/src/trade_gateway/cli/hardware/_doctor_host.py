@@ -1,4 +1,4 @@
-"""What ``trade doctor`` looks at on the host. Each check is given the places it looks in."""
+"""Checks of ``trade doctor`` on the host. The paths that a check reads are its arguments."""
 
 import grp
 import os
@@ -23,28 +23,28 @@ _MAPS: Final = Path("/proc/self/maps")
 _SOON: Final = timedelta(days=2)
 _PATIENCE_S: Final = 5.0
 _MULTICAST: Final = "239.255.71.68"
-"""An address of the site's own scope; nobody but this check listens there."""
+"""A multicast address of the site's own scope; only this check listens there."""
 
 
 class Finding(Struct, frozen=True, kw_only=True):
-    """One thing that was looked at."""
+    """The result of one check."""
 
     level: Literal["ok", "warning", "error"]
     about: str
     text: str
     fix: str = ""
-    """What to do, where something is wrong."""
+    """What to do about a problem."""
 
 
 def ports(paths: Sequence[str], named: Sequence[str] = ()) -> Iterator[Finding]:
-    """Whether this user may open the serial devices there are.
+    """Checks whether this user may open the serial ports.
 
     Args:
-        paths: of those that the system lists.
-        named: those of the robot file, which are looked at with their devices.
+        paths: the ports that the system lists.
+        named: the ports of the robot file, which are checked with their devices.
     """
     if not paths:
-        others = f"; the robot file names {len(named)}, looked at below" if named else ""
+        others = f"; the robot file names {len(named)}, checked below" if named else ""
         yield Finding(level="ok", about="serial ports", text=f"no adapter is plugged in{others}")
     for path in paths:
         if os.access(path, os.R_OK | os.W_OK):
@@ -52,7 +52,7 @@ def ports(paths: Sequence[str], named: Sequence[str] = ()) -> Iterator[Finding]:
         else:
             group = _group(path)
             fix = f"sudo usermod -aG {group} $USER, then log out and in again"
-            yield Finding(level="error", about=path, text=f"may be opened by root and group {group} alone", fix=fix)
+            yield Finding(level="error", about=path, text=f"may be opened only by root and group {group}", fix=fix)
 
 
 def _group(path: str) -> str:
@@ -64,19 +64,19 @@ def _group(path: str) -> str:
 
 
 def latencies(folder: Path = _LATENCIES) -> Iterator[Finding]:
-    """How long USB adapters sit on what has come."""
+    """Checks how long USB adapters delay received bytes."""
     for timer in sorted(folder.glob("*/latency_timer")):
         about, ms = timer.parent.name, int(timer.read_text(encoding="ascii"))
         if ms <= _LATEST_MS:
-            yield Finding(level="ok", about=about, text=f"hands on what has come within {ms} ms")
+            yield Finding(level="ok", about=about, text=f"delivers received bytes within {ms} ms")
             continue
-        text = f"sits on what has come for up to {ms} ms, so that a cycle takes that long"
-        fix = f"echo 1 | sudo tee {timer}; for good, by the udev rules of `trade install`"
+        text = f"delays received bytes by up to {ms} ms, so that a cycle takes that long"
+        fix = f"echo 1 | sudo tee {timer}; permanently: the udev rules of `trade install`"
         yield Finding(level="warning", about=about, text=text, fix=fix)
 
 
 def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
-    """Whether the vendor libraries of drivers are installed."""
+    """Checks whether the vendor libraries of drivers are installed."""
     for name in names:
         missing = load_driver(name, "driver", AnyDriver).missing()
         if not missing:
@@ -87,7 +87,7 @@ def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
 
 
 def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
-    """Whether the clock is set by others; certificates, logs and traces need it, motion does not."""
+    """Checks whether the clock is synchronised; certificates, logs and traces need it, motion does not."""
     try:
         said = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False).stdout.strip()  # noqa: S603 - ours
     except (OSError, subprocess.TimeoutExpired):
@@ -96,35 +96,35 @@ def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
     if said == "yes":
         yield Finding(level="ok", about="clock", text="is synchronised")
     elif said == "no":
-        text = "is not synchronised: certificates may not be valid yet, or any more, and logs of hosts do not match"
+        text = "is not synchronised: certificates may seem invalid, and the logs of hosts do not match"
         yield Finding(level="warning", about="clock", text=text, fix=fix)
     else:
-        text = "nobody here can tell whether it is synchronised"
+        text = "it is unknown whether it is synchronised"
         yield Finding(level="warning", about="clock", text=text, fix="compare `date -u` on all hosts")
 
 
 def waits(maps: Path = _MAPS) -> Iterator[Finding]:
-    """Whether waits of this Python end in time although the clock is set meanwhile.
+    """Checks whether the timeouts of this Python are independent of clock changes.
 
-    CPython waits for its locks by `sem_clockwait` where it was built with a C library that has it (glibc 2.30), else by
-    the clock on the wall.
+    CPython waits for locks with `sem_clockwait` if its C library had that at build time (glibc 2.30), else by the
+    wall clock.
     """
     loaded = {Path(line.split(maxsplit=5)[-1]) for line in maps.read_text().splitlines() if "/" in line}
     pythons = [path for path in loaded if "python" in path.name and path.is_file()]
     if any(b"sem_clockwait" in path.read_bytes() for path in pythons):
-        yield Finding(level="ok", about="waits", text="end in time also if the clock is set")
+        yield Finding(level="ok", about="waits", text="end in time even if the clock is set")
         return
-    text = "end late by as much as the clock is set back meanwhile, those of locks and drivers, too"
-    fix = "use the Python of the distribution, or a newer build; else set the clock before the robot is started"
+    text = "end late by as much as the clock is set back meanwhile, including those of locks and drivers"
+    fix = "use the distribution's Python, or a newer build; else set the clock before you start the robot"
     yield Finding(level="warning", about="waits", text=text, fix=fix)
 
 
 def certificate(folder: Path, now: datetime | None = None) -> Iterator[Finding]:
-    """Whether the certificate of this user's containers is valid, and for how long."""
+    """Checks whether the certificate of this user's containers is valid, and for how long."""
     from cryptography import x509  # noqa: PLC0415 - loads what others do not need
 
     path, now = folder / "cert.pem", now or datetime.now(timezone.utc)
-    fix = f"trade pki issue NAME where the authority is, and copy what it made to {folder}"
+    fix = f"run `trade pki issue NAME` on the authority's host, and copy the files that it made to {folder}"
     try:
         found = x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError) as bad:
@@ -132,10 +132,10 @@ def certificate(folder: Path, now: datetime | None = None) -> Iterator[Finding]:
         return
     begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
     if now < begins:
-        text = f"is valid only from {begins:%Y-%m-%d %H:%M} UTC on"
+        text = f"is valid only from {begins:%Y-%m-%d %H:%M} UTC"
         yield Finding(level="error", about=str(path), text=text, fix="set the clock of this host")
     elif now > ends:
-        yield Finding(level="error", about=str(path), text=f"has expired on {ends:%Y-%m-%d %H:%M} UTC", fix=fix)
+        yield Finding(level="error", about=str(path), text=f"expired on {ends:%Y-%m-%d %H:%M} UTC", fix=fix)
     elif ends - now < _SOON:
         yield Finding(level="warning", about=str(path), text=f"expires on {ends:%Y-%m-%d %H:%M} UTC", fix=fix)
     else:
@@ -143,8 +143,8 @@ def certificate(folder: Path, now: datetime | None = None) -> Iterator[Finding]:
 
 
 def multicast(group: str = _MULTICAST, patience_s: float = 1.0) -> Iterator[Finding]:
-    """Whether what is sent to a group of hosts goes out and comes in here, which discovery on a network needs."""
-    fix = "allow UDP multicast in the firewall, or do without: TRADE_CONNECT names whom to dial"
+    """Checks whether UDP multicast works on this host, which discovery on a network needs."""
+    fix = "allow UDP multicast in the firewall, or name endpoints in TRADE_CONNECT instead"
     try:
         with _datagrams() as ear, _datagrams() as mouth:
             ear.bind(("", 0))
@@ -154,10 +154,10 @@ def multicast(group: str = _MULTICAST, patience_s: float = 1.0) -> Iterator[Find
             mouth.sendto(b"trade doctor", (group, ear.getsockname()[1]))
             ear.recv(64)
     except OSError as bad:
-        text = f"what is sent to a group of hosts does not come back ({bad}); discovery on a network needs that"
+        text = f"multicast datagrams do not arrive ({bad}); discovery on a network needs them"
         yield Finding(level="warning", about="multicast", text=text, fix=fix)
     else:
-        yield Finding(level="ok", about="multicast", text="goes out and comes in")
+        yield Finding(level="ok", about="multicast", text="datagrams are sent and received")
 
 
 def _datagrams() -> socket.socket:
@@ -165,17 +165,17 @@ def _datagrams() -> socket.socket:
 
 
 def in_sight(member: Container, system: str) -> Iterator[Finding]:
-    """Which containers of the system are seen from here."""
+    """Lists the containers of the system that are visible from here."""
     reachability = member.reachability(limit_s=_PATIENCE_S if member.settings.connect else 0)
     for endpoint, why in reachability.apart.items():
-        fix = "the text says what may be wrong there; else correct TRADE_CONNECT"
-        yield Finding(level="error", about=endpoint, text=f"nobody answers there (TRADE_CONNECT): {why}", fix=fix)
+        fix = "the text says what may be wrong; else correct TRADE_CONNECT"
+        yield Finding(level="error", about=endpoint, text=f"no container answers there (TRADE_CONNECT): {why}", fix=fix)
     others = sorted(one.name for one in member.containers() if one.epoch != member.address.epoch)
     about = f"system {system}"
     if others:
-        yield Finding(level="ok", about=about, text=f"in sight: {', '.join(others)}")
+        yield Finding(level="ok", about=about, text=f"visible: {', '.join(others)}")
         return
     if reachability.apart:
         return
-    fix = "`trade up ROBOT.toml` starts one; elsewhere, the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
-    yield Finding(level="ok", about=about, text="no container is in sight", fix=fix)
+    fix = "`trade up ROBOT.toml` starts one; another host needs the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
+    yield Finding(level="ok", about=about, text="no container is visible", fix=fix)

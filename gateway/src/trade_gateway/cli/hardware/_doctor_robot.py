@@ -1,4 +1,4 @@
-"""What ``trade doctor`` looks at of a robot: its lines, its devices, and what stops them when all else fails."""
+"""Checks of ``trade doctor`` on a robot: its lines, its devices, and their watchdogs."""
 
 import socket
 from collections import Counter
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 __all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
-"""How often a device is asked: a bad line shows in some of them."""
+"""How often each device is asked: a bad line loses some answers."""
 _DASHBOARD: Final = 29999
 _PATIENCE_S: Final = 3.0
 _BAD_LINE: Final = (
-    "check the cable, its length and its ends: a long line needs its termination (120 ohm) at both ends and nowhere "
-    "else, a common ground, and one baud rate"
+    "check the cable, its length and its ends: a long line needs a termination (120 ohm) at both ends only, "
+    "a common ground, and one baud rate"
 )
 
 
 def unwatched(robot: Robot) -> Iterator[Finding]:
-    """Devices that nothing in themselves stops when their driver is gone."""
+    """Reports devices without a watchdog that stops them when their driver ends."""
     for bus in robot.buses:
         without = load_driver(bus.driver, bus.name, Driver).without_watchdog
         named = [device.name for device in (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))]
@@ -51,21 +51,21 @@ def unwatched(robot: Robot) -> Iterator[Finding]:
 
 
 def unmeasured(robot: Robot, path: Path) -> Iterator[Finding]:
-    """Joints whose zero and range nobody has measured: they are as a scan writes them."""
+    """Reports joints whose zero and range are still those that a scan writes."""
     lines = {bus.name for bus in robot.buses if isinstance(bus, SerialBus)}
     for joint in robot.joints:
         if (joint.offset_rad, joint.min_rad, joint.max_rad) == (0.0, -UNMEASURED_RAD, UNMEASURED_RAD):
             fix = (
                 f"trade calibrate {path} {joint.name}"
                 if joint.bus in lines
-                else "measure it, and write it into the file"
+                else "measure them, and write them into the file"
             )
-            text = "its zero and range are those that `trade scan` wrote, and nobody's"
+            text = "its zero and range are the placeholders that `trade scan` wrote"
             yield Finding(level="warning", about=joint.name, text=text, fix=fix)
 
 
 def interfaces(robot: Robot) -> Iterator[Finding]:
-    """CAN interfaces of the operating system: there, up, at the rate of the file, and well."""
+    """Checks the CAN interfaces of the operating system: present, up, without errors, at the file's bit rate."""
     for bus in robot.buses:
         if not isinstance(bus, CanBus) or bus.interface != "socketcan":
             continue
@@ -74,12 +74,12 @@ def interfaces(robot: Robot) -> Iterator[Finding]:
         try:
             yield judged(bus, look_at(bus.channel))
         except OSError as bad:
-            fix = "is its adapter plugged in, and its module loaded? `ip link show type can` shows those there are"
+            fix = "plug its adapter in and load its kernel module; `ip link show type can` lists the interfaces"
             yield Finding(level="error", about=bus.channel, text=str(bad), fix=fix)
 
 
 def judged(bus: CanBus, link: "Link") -> Finding:
-    """What is to be said of a CAN interface."""
+    """Returns the finding about a CAN interface."""
     about = bus.channel
     up = f"sudo ip link set {about} up type can bitrate {bus.bitrate} restart-ms 100"
     if not link.up:
@@ -88,10 +88,10 @@ def judged(bus: CanBus, link: "Link") -> Finding:
         text = f"runs at {link.bitrate} bit/s, and the robot file says {bus.bitrate}"
         return Finding(level="error", about=about, text=text, fix=f"sudo ip link set {about} down; {up}")
     if link.state:
-        text = f"its controller meets errors ({link.state.name.lower().replace('_', '-')})"
+        text = f"its controller reports errors ({link.state.name.lower().replace('_', '-')})"
         fix = (
-            "nobody may be listening, or the ends are wrong: exactly two terminations of 120 ohm (60 ohm between CAN_H "
-            f"and CAN_L without power), one bit rate for all, power for the drives. Then: sudo ip link set {about} "
+            "no device may be listening, or the ends are wrong: use two terminations of 120 ohm (60 ohm between CAN_H "
+            f"and CAN_L without power), one bit rate for all, powered drives. Then: sudo ip link set {about} "
             f"down; {up}"
         )
         return Finding(level="error", about=about, text=text, fix=fix)
@@ -99,23 +99,21 @@ def judged(bus: CanBus, link: "Link") -> Finding:
 
 
 def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
-    """What drivers refuse of the file, before any device is asked."""
+    """Reports the errors that drivers find in the file, before any device is asked."""
     buses = {bus.name for bus in robot.buses}
     for part, refusal in refusals.items():
-        about, then = (
-            (f"bus {part}", "; its line was not looked at, so look again then") if part in buses else (part, "")
-        )
+        about, then = (f"bus {part}", "; its line was not checked, so run this again") if part in buses else (part, "")
         yield Finding(level="error", about=about, text=str(refusal), fix=f"correct the file{then}")
 
 
 def devices(robot: Robot) -> Iterator[Finding]:
-    """Whether the devices on serial lines answer, reliably, and are those of the file. Nothing is written to them."""
+    """Checks whether the devices on serial lines answer reliably and match the file. Writes nothing to them."""
     for bus in robot.buses:
         driver = load_driver(bus.driver, bus.name, Driver)
         if not isinstance(bus, SerialBus) or driver.commissioner is None:
             continue
         if not Path(bus.port).exists():
-            fix = "plug its adapter in; `trade scan` lists the ports there are, /dev/serial/by-id has lasting names"
+            fix = "plug its adapter in; `trade scan` lists the ports, /dev/serial/by-id has lasting names"
             yield Finding(level="error", about=f"bus {bus.name}", text=f"there is no {bus.port}", fix=fix)
             continue
         try:
@@ -125,14 +123,14 @@ def devices(robot: Robot) -> Iterator[Finding]:
 
 
 def _unseen(robot: Robot, bus: SerialBus, bad: ConfigurationError) -> Finding:
-    """A line that could not be had."""
+    """Returns the finding about a line that could not be opened."""
     about = f"bus {bus.name}"
     if TAKEN in bad.problem:
-        fix = "end what uses it and look again; while a robot is up, `trade up` tells of its devices"
-        return Finding(level="warning", about=about, text=f"was not looked at: {bad}", fix=fix)
-    text = f"was not looked at: {robot.where}: bus.{bus.name}.port: {bad.problem}"
+        fix = "end the program that uses it and run this again; while a robot is up, `trade up` reports its devices"
+        return Finding(level="warning", about=about, text=f"was not checked: {bad}", fix=fix)
+    text = f"was not checked: {robot.where}: bus.{bus.name}.port: {bad.problem}"
     return Finding(
-        level="error", about=about, text=text, fix="have port name the line of these devices, and look again"
+        level="error", about=about, text=text, fix="set port to the line of these devices, and run this again"
     )
 
 
@@ -146,7 +144,7 @@ def _on_line(robot: Robot, bus: SerialBus, driver: Driver, commissioner: Commiss
 def _unfit(
     driver: Driver, bench: Bench, robot: Robot, bus: SerialBus, device: Joint | Gripper, about: str
 ) -> Finding | None:
-    """What `trade up` would refuse of a device that answers; None if nothing."""
+    """Returns what `trade up` would refuse about a device that answers, or None."""
     try:
         driver.fits(bench, robot, bus, device)
     except ConfigurationError as bad:
@@ -161,13 +159,13 @@ def _of_device(bench: Bench, device: Joint | Gripper, bus: SerialBus) -> Finding
     looks = [bench.look(device.id) for _ in range(_LOOKS)]
     good = [found for found in looks if found is not None and not found.problem]
     if not any(looks):
-        fix = f"check its power and cable; `trade scan --port {bus.port}` shows under which id and rate it answers"
+        fix = f"check its power and cable; `trade scan --port {bus.port}` shows the id and rate that it answers at"
         return Finding(level="error", about=about, text=f"does not answer at {bus.baud} baud", fix=fix)
     if not good:
         problem = Counter(found.problem for found in looks if found is not None).most_common(1)[0][0]
         return Finding(level="error", about=about, text="cannot be used", fix=problem)
     if len(good) < _LOOKS:
-        text = f"answered {len(good)} of {_LOOKS} questions as it should"
+        text = f"answered {len(good)} of {_LOOKS} requests correctly"
         return Finding(level="error", about=about, text=text, fix=_BAD_LINE)
     return _identity(about, device, good[0])
 
@@ -177,21 +175,21 @@ def _identity(about: str, device: Joint | Gripper, found: Found) -> Finding:
     for key, expected, said in (("model", device.model, found.model), ("firmware", firmware, found.firmware)):
         if expected is not None and expected != said:
             text = f"its {key} is {said}, and the robot file says {expected}"
-            fix = f"attach the device that is meant, or correct {key} and calibrate it"
+            fix = f"attach the intended device, or correct {key} and calibrate it"
             return Finding(level="error", about=about, text=text, fix=fix)
     said = f"{found.model}, firmware {found.firmware}," if found.firmware else found.model
     return Finding(level="ok", about=about, text=f"{said} answers")
 
 
 def controllers(robot: Robot) -> Iterator[Finding]:
-    """Whether the controllers of arms are to be reached."""
+    """Checks whether the controllers of arms are reachable."""
     for bus in robot.buses:
         if not isinstance(bus, UrBus):
             continue
         try:
             socket.create_connection((bus.host, _DASHBOARD), _PATIENCE_S).close()
         except OSError as bad:
-            fix = "is it switched on, and in this network? On its screen: Settings, System, Network"
-            yield Finding(level="error", about=bus.host, text=f"does not let itself be reached: {bad}", fix=fix)
+            fix = "switch it on and connect it to this network; on its screen: Settings, System, Network"
+            yield Finding(level="error", about=bus.host, text=f"cannot be reached: {bad}", fix=fix)
         else:
-            yield Finding(level="ok", about=bus.host, text="is to be reached")
+            yield Finding(level="ok", about=bus.host, text="can be reached")

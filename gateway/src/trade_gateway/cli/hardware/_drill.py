@@ -1,4 +1,4 @@
-"""``trade drill ROBOT.toml``: take away what stops a robot while it moves, and measure how long it goes on."""
+"""``trade drill ROBOT.toml``: removes what a moving robot depends on, and measures how long it takes to stop."""
 
 import platform
 import signal
@@ -24,20 +24,20 @@ _COLOURS = {True: "green", False: "bold red"}
 
 def drill(
     robot_file: Annotated[
-        Path | None, typer.Argument(metavar="ROBOT.toml", help="The robot file; its table \\[drill] has the limits.")
+        Path | None, typer.Argument(metavar="ROBOT.toml", help="Robot file; its table \\[drill] has the limits.")
     ] = None,
-    only: Annotated[list[str] | None, typer.Option(metavar="SCENE", help="Only this scene; again for another.")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="SCENE", help="Play only this scene. Repeatable.")] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write drill.json and drill.html there.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder to write drill.json and drill.html to.")
     ] = None,
-    listed: Annotated[bool, typer.Option("--list", help="Only say which scenes there are.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the scenes and exit.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Kill, freeze, unplug and cut off, one after the other, whatever a moving robot hangs on; it must stop each time.
+    """Kill, freeze and disconnect each part that a moving, simulated robot depends on; it must stop each time.
 
-    All on simulated devices: no hardware is touched. One joint or arm of each bus moves, across two gateways; the
-    simulator's own log says when it came to rest. The exit code is 1 if that took longer than the limit, which is what
-    the robot file says in \\[drill], or what follows from the rules (docs/drill.md).
+    All devices are simulated; no hardware is touched.
+    One joint or arm of each bus moves, across two gateways. The simulator's log shows when it came to rest.
+    The exit code is 1 if that took longer than the limit in \\[drill] of the robot file (docs/drill.md).
 
     For example: trade drill examples/head.toml --report .
     """
@@ -51,13 +51,13 @@ def drill(
     robot = load(robot_file)
     targets, left_out = targets_of(robot)
     if not targets:
-        raise ConfigurationError(where=robot.where, problem="nothing in it could be moved for a drill")
-    without(robot, left_out)  # or it says why it cannot be
+        raise ConfigurationError(where=robot.where, problem="it has no device that a drill can move")
+    without(robot, left_out)  # raises if that is impossible
     for part, why in left_out.items():
         out.say(f"[bold]{robot.name}[/]: {escape(part)} is left out: {escape(why)}")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind, least of all frozen
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind, frozen or not
     impossible = {
-        scene.name: "it concerns nothing that moves here" for scene in scenes if not any(map(scene.concerns, targets))
+        scene.name: "it concerns no device that moves here" for scene in scenes if not any(map(scene.concerns, targets))
     }
     played: list[Played] = []
     with tempfile.TemporaryDirectory(prefix="trade-drill-") as folder:
@@ -66,7 +66,7 @@ def drill(
             for scene in scenes:
                 if scene.name not in impossible:
                     played.append(play(stand, scene, targets, robot.drill))
-                    _tell(out, played[-1])
+                    _print(out, played[-1])
     found = Report(
         robot=robot.name,
         file=robot.where,
@@ -92,7 +92,7 @@ def _list(out: Output) -> None:
     out.table(("SCENE", "WHAT IS DONE", "SHOWS"), [(scene.name, scene.what, scene.shows) for scene in SCENES])
 
 
-def _tell(out: Output, played: Played) -> None:
+def _print(out: Output, played: Played) -> None:
     out.say(f"{played.scene}: {escape(played.what)}")
     for problem in played.problems:
         out.say(f"  [{_COLOURS[False]}]not held[/]: {escape(problem)}")
@@ -121,4 +121,4 @@ def _conclude(out: Output, found: Report, folder: Path | None) -> None:
     if found.ok:
         out.say(f"[bold green]passed[/]: {len(found.scenes)} scenes, all within their limits")
     elif not failed:
-        out.say("[bold red]failed[/]: there was no scene that this robot can play")
+        out.say("[bold red]failed[/]: this robot can play no scene")

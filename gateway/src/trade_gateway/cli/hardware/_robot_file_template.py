@@ -1,4 +1,4 @@
-"""A robot file to begin with, out of what a scan found."""
+"""A template of a robot file, made from the devices that a scan found."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,10 +12,10 @@ from trade_drivers import Found, parse
 __all__ = ["UNMEASURED_RAD", "first_file"]
 
 UNMEASURED_RAD: Final = 0.1
-"""The range of a joint that nobody has measured, to both sides of a zero that nobody has measured."""
+"""The placeholder range of a joint that was not measured, to both sides of zero."""
 
 _HEAD: Final = """\
-# Written by `trade scan`. Give the robot, its buses and its devices names of your own, as in [joint."neck.pan"].
+# Written by `trade scan`. Name the robot, its buses and its devices, as in [joint."neck.pan"].
 # `trade calibrate FILE JOINT` measures zero and range of a joint and writes them here; docs/commissioning.md.
 
 [robot]
@@ -24,11 +24,10 @@ name = "robot"
 
 
 def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
-    """The text of a robot file with these devices, each with the port it was found on.
+    """Returns the text of a robot file with these devices, each with its port.
 
     Raises:
-        ConfigurationError: a device has a problem, or those of one port speak at different rates or are of different
-            drivers.
+        ConfigurationError: a device has a problem, or the devices of one port have different rates or drivers.
     """
     for port, one in found:
         if one.problem:
@@ -39,13 +38,11 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
         rates = sorted({one.baud for one in here})
         if len(rates) > 1:
             several = " and ".join(map(str, rates))
-            problem = f"its devices speak at {several} baud; have all speak at one (`trade set-baud`)"
+            problem = f"its devices use {several} baud; set all to one rate with `trade set-baud`"
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
         names = sorted({one.driver for one in here})
         if len(names) > 1:
-            problem = (
-                f"its devices are of {' and '.join(names)}; a robot file has one driver a bus, so scan with --driver"
-            )
+            problem = f"its devices have the drivers {' and '.join(names)}; a bus has one driver, so scan with --driver"
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
         text += _table(f"bus.line{number}", _bus(port, here[0]))
         for one in here:
@@ -68,20 +65,20 @@ def _bus(port: str, one: Found) -> list[str]:
     else:
         keys = [f"port = {_text(str(Path(port).absolute()))}", f"baud = {one.baud}"]
     if one.driver == "odrive":
-        keys.append('leave = "relax"    # without its driver an ODrive lets go: brake what would fall')
+        keys.append('leave = "relax"    # without its driver an ODrive releases the motor: add a brake')
     return [f"driver = {_text(one.driver)}", *keys]
 
 
 def _joint(one: Found) -> list[str]:
     keys = [f"id = {one.id}", f"model = {_text(one.model)}"]
     if one.firmware:
-        keys.append(f"firmware = {_text(one.firmware)}      # another one is refused: it would be another device")
+        keys.append(f"firmware = {_text(one.firmware)}      # any other is refused as another device")
     if one.serial_number is not None:
-        keys.append(f"serial_number = {one.serial_number}    # another one is refused: it would be another device")
+        keys.append(f"serial_number = {one.serial_number}    # any other is refused as another device")
     if one.wire == "can":
         if one.driver == "cia402":
-            keys.append("counts_per_rev = 4096   # of its encoder, for one turn of the motor: see its data sheet")
-        keys.append("gear = 1.0              # turns of the motor for one of the joint")
+            keys.append("counts_per_rev = 4096   # encoder counts per motor turn: see the data sheet")
+        keys.append("gear = 1.0              # motor turns per joint turn")
         measures = "to be measured"
     else:
         measures = "`trade calibrate` measures both"

@@ -1,4 +1,4 @@
-"""``trade container``: a process with nothing in it, for others to put providers into."""
+"""``trade container``: runs an empty container, in which other programs create providers."""
 
 from dataclasses import replace
 from typing import Annotated
@@ -18,17 +18,17 @@ _LOOK_EVERY_S = 0.2
 
 def container(
     context: typer.Context,
-    name: Annotated[str | None, typer.Option(help="Its name. \\[env: TRADE_CONTAINER]")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the container. \\[env: TRADE_CONTAINER]")] = None,
     allow: Annotated[
         list[str] | None,
         typer.Option(
-            help="Classes that may be made in it: mypkg.vision:Camera, mypkg.*; repeatable. \\[env: TRADE_INSTANTIABLE]"
+            help="Classes it may create: mypkg.vision:Camera, mypkg.*. Repeatable. \\[env: TRADE_INSTANTIABLE]"
         ),
     ] = None,
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Keep an empty container up until Ctrl-C, SIGTERM or its function terminate_container.
+    """Run an empty container until Ctrl-C, SIGTERM or a call of its terminate_container.
 
     For example: trade container --name eyes --allow "mypkg.vision:*"
     """

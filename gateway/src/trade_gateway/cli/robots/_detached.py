@@ -1,4 +1,4 @@
-"""A command of ours that goes on without the terminal, or the connection, that it was given in."""
+"""Runs a command as a detached process, which outlives its terminal or connection."""
 
 import os
 import socket
@@ -21,15 +21,15 @@ from trade.starting import Started
 from trade_gateway.cli._output import Output
 
 _UP_S: Final = 45.0
-"""Below the time that a start through ssh may take."""
+"""The longest start in seconds; less than a start through ssh may take."""
 _END_S: Final = 10.0
 _LOOK_EVERY_S: Final = 0.05
 
-Detach = Annotated[bool, typer.Option("--detach", help="Return when it is up; it goes on without this terminal.")]
+Detach = Annotated[bool, typer.Option("--detach", help="Return when it is up, and keep it running in the background.")]
 
 
 def detach_now(out: Output, settings: Settings) -> None:
-    """Run this very command again, on its own, and say so when it is up. Raises CannotStart."""
+    """Runs this command again as a detached process, and reports when it is up. Raises CannotStart."""
     words = [word for word in sys.argv[1:] if word not in {"--detach", "--json"}]
     started = detached(words, settings)
     if out.as_json:
@@ -38,22 +38,22 @@ def detach_now(out: Output, settings: Settings) -> None:
 
 
 def detached(words: Sequence[str], settings: Settings, environment: Mapping[str, str] | None = None) -> Started:
-    """Run ``trade WORDS --json`` on its own; returns what it says when it is up.
+    """Runs ``trade WORDS --json`` as a detached process; returns its first line, printed when it is up.
 
-    What it complains of goes to ``logs/CONTAINER.log`` in the folder for state, what it says to ``CONTAINER.jsonl``.
+    Standard error goes to ``logs/CONTAINER.log`` in the folder for state, standard output to ``CONTAINER.jsonl``.
 
     Args:
-        words: a command that says in its first line that its container is up.
-        settings: of its container: name, system and folder for state.
-        environment: of its process; none: this one's.
+        words: a command whose first line reports that its container is up.
+        settings: the container's name, system and folder for state.
+        environment: the process's environment; by default this one's.
 
     Raises:
-        CannotStart: it ended, or was not up in time; with what it complained of.
+        CannotStart: the process ended, or was not up in time; with its standard error.
     """
     name, folder = settings.container, (settings.state_dir or Path(tempfile.gettempdir())) / settings.system / "logs"
     folder.mkdir(parents=True, exist_ok=True)
-    told, log = folder / f"{name}.jsonl", folder / f"{name}.log"
-    with told.open("w") as output, log.open("w") as errors:
+    reported, log = folder / f"{name}.jsonl", folder / f"{name}.log"
+    with reported.open("w") as output, log.open("w") as errors:
         process = subprocess.Popen(  # noqa: S603 - this very program
             [sys.executable, "-m", "trade_gateway", *words, "--json"],
             stdin=subprocess.DEVNULL,
@@ -63,28 +63,28 @@ def detached(words: Sequence[str], settings: Settings, environment: Mapping[str,
             start_new_session=True,
         )
     try:
-        return msgspec.json.decode(_first_line(told, process), type=Started)
+        return msgspec.json.decode(_first_line(reported, process), type=Started)
     except msgspec.DecodeError:
         _end(process)
         said = log.read_text(errors="replace").strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
         here, why = socket.gethostname(), "it did not come up"
         raise CannotStart(host=here, container=name, reason=why, said=said, remedy=f"its log is {log}") from None
-    except BaseException:  # nobody waits for it any more
+    except BaseException:  # an interrupted start is ended, too
         _end(process)
         raise
 
 
 def ready(container: Container) -> dict[str, object]:
-    """What the first line of a command says whose container is up."""
+    """Returns the first line of JSON of a command whose container is up."""
     address = container.address
     up = {"ready": True, "container": address.container, "epoch": address.epoch, "pid": os.getpid()}
     return {**up, "system": container.settings.system}
 
 
-def _first_line(told: Path, process: "subprocess.Popen[bytes]") -> bytes:
+def _first_line(reported: Path, process: "subprocess.Popen[bytes]") -> bytes:
     until, pause = time.monotonic() + _UP_S, threading.Event()
     while process.poll() is None and time.monotonic() < until:
-        line, ended, _ = told.read_bytes().partition(b"\n")
+        line, ended, _ = reported.read_bytes().partition(b"\n")
         if ended:
             return line
         pause.wait(_LOOK_EVERY_S)

@@ -1,4 +1,4 @@
-"""``trade gateway GATEWAY.toml``: join networks, and let across what the file and its policy allow."""
+"""``trade gateway GATEWAY.toml``: joins networks, and forwards calls that the file and its policy allow."""
 
 import queue
 import tempfile
@@ -28,24 +28,24 @@ _LOOK_EVERY_S: Final = 1.0
 
 def gateway(
     file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file.")],
-    check: Annotated[bool, typer.Option("--check", help="Only say whether the file is right.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check the file and exit.")] = False,
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Carry calls between networks that have no way to each other, as far as the file and its policy allow.
+    """Forward calls between separate networks, as far as the file and its policy allow.
 
-    It may be a guest in other systems, too, and share some groups with them. Containers of its host that the file names
-    it starts, and starts again when they crash or hang; they end with it.
+    A gateway can also share groups with other systems.
+    It supervises the containers of its host that the file names: it restarts them when they crash or hang.
 
-    The file is read again when it changes, when its policy, its revoked names or its certificate do, and on SIGHUP.
-    What is wrong with it is said, and the gateway goes on as before.
+    It reads the file again when the file, its policy, its revoked names or its certificate change, and on SIGHUP.
+    If the new file has an error, the gateway reports it and continues as before.
 
     For example: trade gateway /etc/trade/gateway.toml --check
     """
     out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     plan.check_here(file)
-    unnamed = plan.unnamed  # once: when the gateway is up, the policy may be half written
+    unnamed = plan.unnamed  # read once: later the policy may be half written
     _warn_of_forwarding(plan)
     if check:
         if unnamed:
@@ -72,11 +72,11 @@ def gateway(
                 _say_news(out, running.news)
                 now = digest(file)
                 if now != seen or hangup.is_set():
-                    seen, anew = now, hangup.is_set()
+                    seen, reopen = now, hangup.is_set()
                     hangup.clear()
                     notifier.reloading()
-                    good = running.reload(file, out, anew=anew)
-                    notifier.ready(_status(running) if good else f"{file} is wrong; going on as before")
+                    good = running.reload(file, out, reopen=reopen)
+                    notifier.ready(_status(running) if good else f"{file} has an error; continuing as before")
         finally:
             notifier.leaving()
             out.say("leaving")
@@ -85,22 +85,22 @@ def gateway(
 
 
 class Gateway:
-    """The container that joins the networks, its guests in other systems, its children, as the file says now."""
+    """The gateway's container, its guests in other systems and its children, as the file says now."""
 
     def __init__(self, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
         self._plan = plan
         self._leave = leave
-        """What ends the gateway when its container is terminated."""
+        """Ends the gateway when its container is terminated."""
         self._named = named
-        """What the files said that it names."""
+        """The contents of the files that the gateway file names."""
         self._guests = Guests()
         self._container = Container(plan.settings)
         self._container.terminating.close = leave
         self._running: Settings | None = plan.settings
-        """What the container that is open was started with."""
+        """The settings of the open container."""
         self._supervisor: Supervisor | None = None
         self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
-        """What becomes of the children."""
+        """Reports about the children."""
         try:
             self._guests.apply(self._container, plan)
             self._look_after(plan)
@@ -110,36 +110,36 @@ class Gateway:
 
     @property
     def container(self) -> Container:
-        """The one that runs now."""
+        """The container that runs now."""
         return self._container
 
     @property
     def healthy(self) -> bool:
-        """Whether it can take a call now, and its children are looked after."""
+        """Whether it can serve a call now, and its children are supervised."""
         return self._container.healthy() and (self._supervisor is None or self._supervisor.alive)
 
-    def reload(self, file: Path, out: Output, *, anew: bool = True) -> bool:
-        """Go by the file as it is now; returns whether that could be done. If not, all stays as it was.
+    def reload(self, file: Path, out: Output, *, reopen: bool = True) -> bool:
+        """Applies the file as it is now; returns False, with nothing changed, if that fails.
 
         Args:
             file: the gateway file.
-            out: where to tell of it.
-            anew: open everything anew, even where the file says nothing else.
+            out: where to report it.
+            reopen: open all connections again, even if the file is unchanged.
         """
         try:
             plan = read_gateway_file(file)
             plan.check_here(file)
             named = named_by(file, plan)
         except TradeError as wrong:
-            complain(f"{file} was changed and is wrong; going on as before: {wrong}")
+            complain(f"{file} was changed and has an error; continuing as before: {wrong}")
             return False
         changed = named.since(self._named)
-        anew = anew or named.digests != self._named.digests
+        reopen = reopen or named.digests != self._named.digests
         try:
-            self._go_by(plan, anew=anew)
+            self._go_by(plan, reopen=reopen)
         except TradeError as refused:
-            self._go_by(self._plan, anew=False)
-            complain(f"{file} was changed and cannot be used; going on as before: {refused}")
+            self._go_by(self._plan, reopen=False)
+            complain(f"{file} was changed and cannot be used; continuing as before: {refused}")
             return False
         self._plan, self._named = plan, named
         self._container.note_change("gateway file read", f"{file}: {changed}" if changed else str(file))
@@ -149,8 +149,8 @@ class Gateway:
             out.data({"reloaded": str(file), "changed": changed})
         return True
 
-    def _go_by(self, plan: Plan, *, anew: bool) -> None:
-        if anew or plan.settings != self._running:
+    def _go_by(self, plan: Plan, *, reopen: bool) -> None:
+        if reopen or plan.settings != self._running:
             self._running = None
             self._leave_networks()
             self._container = opened(plan.settings)
@@ -160,7 +160,7 @@ class Gateway:
         self._guests.apply(self._container, plan)
 
     def _look_after(self, plan: Plan) -> None:
-        """The children are as the file says; those of which it says nothing new go on."""
+        """Supervises the children that the file names; unchanged ones keep running."""
         if self._supervisor is None and plan.children:
             state = plan.settings.state_dir or Path(tempfile.gettempdir())
             self._supervisor = Supervisor(lambda: self._container, self.news.put, state / plan.settings.system)
@@ -177,20 +177,20 @@ class Gateway:
         self._container.close()
 
     def close(self) -> None:
-        """End the children, then leave all networks and systems. Idempotent."""
+        """Ends the children, then leaves all networks and systems. Idempotent."""
         if self._supervisor is not None:
             self._supervisor.close()
         self._leave_networks()
 
 
 def _warn_of_forwarding(plan: Plan) -> None:
-    """The host's kernel would carry what the gateway does not."""
+    """Warns if the host's kernel forwards packets between the gateway's networks."""
     interfaces = [network.interface for network in plan.file.network.values()]
     if len(plan.file.network) + len(plan.file.share) > 1 and (on := forwarding(interfaces)):
         complain(
-            f"this host passes packets on between its networks ({', '.join(on)}), so who has a route through it can "
-            "dial containers beyond the gateway, and no `export` counts there; sudo sysctl -w net.ipv4.ip_forward=0 "
-            "net.ipv6.conf.all.forwarding=0, or have a firewall drop what is forwarded between them"
+            f"this host forwards packets between its networks ({', '.join(on)}), so a host with a route through it can "
+            "connect to containers past the gateway, and `export` does not apply; run sudo sysctl -w "
+            "net.ipv4.ip_forward=0 net.ipv6.conf.all.forwarding=0, or let a firewall drop forwarded packets"
         )
 
 
@@ -199,9 +199,9 @@ def _status(running: Gateway) -> str:
     return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
 
 
-def _say_news(out: Output, told: "queue.SimpleQueue[News]") -> None:
-    while not told.empty():
-        news = told.get()
+def _say_news(out: Output, waiting: "queue.SimpleQueue[News]") -> None:
+    while not waiting.empty():
+        news = waiting.get()
         if out.as_json:
             out.data(news)
         elif news.bad:

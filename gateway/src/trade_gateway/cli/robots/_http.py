@@ -1,4 +1,4 @@
-"""``trade door``: HTTP and WebSocket for those who speak nothing else."""
+"""``trade door``: the HTTP gateway, which serves HTTP and WebSocket clients and the dashboard."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -20,32 +20,32 @@ _NAME: Final = "door"
 
 app = typer.Typer(
     invoke_without_command=True,
-    help="Let HTTP and WebSocket clients in, each as an identity of its own.\n\n"
+    help="Serve HTTP and WebSocket clients and the dashboard, each client with its own identity.\n\n"
     "For example: trade door token anna, and then trade door",
 )
 
-TokenFile = Annotated[Path, typer.Option("--tokens", help="File of tokens; trade door token makes it.")]
+TokenFile = Annotated[Path, typer.Option("--tokens", help="File of tokens, which trade door token makes.")]
 
 
 @app.callback()
 def door(
     context: typer.Context,
-    listen: Annotated[str, typer.Option(help="HOST:PORT; beyond this host only with --tls and a policy.")] = (
+    listen: Annotated[str, typer.Option(help="HOST:PORT to listen on; other hosts need --tls and a policy.")] = (
         "127.0.0.1:7080"
     ),
     tokens: TokenFile = _TOKENS,
     tls: Annotated[
         Path | None,
-        typer.Option(help="A folder of trade pki issue: encrypted, and its authority's certificates are let in."),
+        typer.Option(help="Certificate folder of trade pki issue. Also accepts its authority's client certificates."),
     ] = None,
     origin: Annotated[
-        list[str] | None, typer.Option(help="A site whose pages may come in: http://localhost:5173. Repeatable.")
+        list[str] | None, typer.Option(help="Allowed origin of web pages: http://localhost:5173. Repeatable.")
     ] = None,
-    host: Annotated[list[str] | None, typer.Option(help="A further name it is called by; repeatable.")] = None,
-    name: Annotated[str, typer.Option(help="Name of its container.")] = _NAME,
+    host: Annotated[list[str] | None, typer.Option(help="Further host name of this server. Repeatable.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the gateway's container.")] = _NAME,
     as_json: Json = False,
 ) -> None:
-    """Let HTTP and WebSocket clients into the system, until Ctrl-C."""
+    """Serve HTTP and WebSocket clients until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)
@@ -69,19 +69,19 @@ def door(
         _say_ready(out, container, standing.url)
         while not asked_to_leave.wait(_LOOK_EVERY_S):
             if not standing.serving:
-                raise ConfigurationError(where=standing.url, problem="the door has ended; its log says why")
+                raise ConfigurationError(where=standing.url, problem="the HTTP gateway has ended; its log says why")
         out.say("leaving")
 
 
 @app.command()
 def token(
-    identity: Annotated[str, typer.Argument(help="The identity it is for.")],
+    identity: Annotated[str, typer.Argument(help="Identity of the client.")],
     tokens: TokenFile = _TOKENS,
     as_json: Json = False,
 ) -> None:
-    """Make a token for an identity. It is shown once: the file has its hash alone.
+    """Make a token for an identity. It is shown once; the file keeps only its hash.
 
-    To take it back, take its line out of the file; what its holder has moving stops then.
+    To revoke the token, remove its line from the file. Motion of its client stops then.
 
     For example: trade door token anna
     """
@@ -90,8 +90,8 @@ def token(
     if as_json:
         out.data({"identity": identity, "token": made})
         return
-    out.say(f"{escape(identity)} is whoever shows this token; it is not shown again:\n  [bold]{made}[/]")
-    out.say("for example, where DOOR is the address that trade door says:")
+    out.say(f"token of {escape(identity)}; it is not shown again:\n  [bold]{made}[/]")
+    out.say("for example, where DOOR is the address that trade door prints:")
     out.say(f"  [bold]curl -H 'Authorization: Bearer {made}' DOOR/services[/]")
 
 
@@ -99,7 +99,7 @@ def _say_ready(out: Output, container: Container, url: str) -> None:
     if out.as_json:
         out.data({**ready(container), "url": url})
         return
-    out.say(f"[bold green]the door is open[/] at {url} in system {escape(container.settings.system)}")
+    out.say(f"[bold green]the HTTP gateway is up[/] at {url} in system {escape(container.settings.system)}")
     if container.access.policy is None:
-        out.say("there is no policy: whoever has a token may do everything")
-    out.say("Ctrl-C closes it")
+        out.say("there is no policy: every client with a token may do everything")
+    out.say("Ctrl-C ends it")

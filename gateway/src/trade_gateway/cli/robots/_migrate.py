@@ -1,4 +1,4 @@
-"""``trade migrate GROUP --to CONTAINER``: a provider goes on in another container."""
+"""``trade migrate GROUP --to CONTAINER``: moves a provider with its state to another container."""
 
 from typing import Annotated
 
@@ -14,17 +14,16 @@ from trade_gateway.cli.services._services import describe
 
 def migrate(
     context: typer.Context,
-    group: Annotated[str, typer.Argument(help="The provider's group, or one above it that has no other provider.")],
-    to: Annotated[str, typer.Option(help="Name of the container; with * or ?, the least busy one that fits.")],
-    name: Annotated[
-        str | None, typer.Option(help="Of one of its services, if the group has several providers.")
-    ] = None,
-    container: Annotated[str | None, typer.Option(help="The container it is in, if there are several.")] = None,
+    group: Annotated[str, typer.Argument(help="Group of the provider, or a group with only this provider.")],
+    to: Annotated[str, typer.Option(help="Target container; with * or ?, the least busy match.")],
+    name: Annotated[str | None, typer.Option(help="Name of a service, if the group has several providers.")] = None,
+    container: Annotated[str | None, typer.Option(help="Current container, if several have the group.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Have a provider go on in another container, on this host or another one, with its state.
+    """Move a provider with its state to another container, on this or another host.
 
-    It is refused while it is locked or moves; what fails leaves it where it is. Its class must be allowed there.
+    It is refused while the provider is locked or moves. If it fails, the provider stays where it is.
+    The target container must allow the provider's class.
 
     For example: trade migrate rosie.planner --to spare
     """

@@ -1,4 +1,4 @@
-"""``trade ros``: a bridge between a system and ROS, 1 or 2, by what a file says."""
+"""``trade ros``: a bridge between a system and ROS 1 or ROS 2, as a file maps it."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -20,17 +20,15 @@ _UP_WITHIN_S: Final = 30.0
 
 def ros(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="What is mapped; see docs/ros.md.")],
-    check: Annotated[bool, typer.Option("--check", help="Only say whether the file is right, and what it maps.")] = (
-        False
-    ),
-    name: Annotated[str, typer.Option(help="Name of its container.")] = "ros",
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The bridge file; see docs/ros.md.")],
+    check: Annotated[bool, typer.Option("--check", help="Check the file, list what it maps, and exit.")] = (False),
+    name: Annotated[str, typer.Option(help="Name of the bridge's container.")] = "ros",
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Have ROS, 1 or 2, see and call what a file names, and the other way round; until Ctrl-C or SIGTERM.
+    """Bridge a system and ROS 1 or ROS 2 until Ctrl-C or SIGTERM.
 
-    Each node of ROS is a client of its own: what it moves stops when it dies, and its locks fall.
+    Each ROS node is its own client: when it dies, its motion stops and its locks are released.
 
     For example: trade ros examples/ros.toml --check
     """
@@ -39,7 +37,7 @@ def ros(
     if check:
         _say_checked(out, file, room.planned(read, file))
         return
-    room.planned(read, file)  # what is wrong with its types is said before anything is joined
+    room.planned(read, file)  # reports wrong types before it joins anything
     choice: SystemChoice = context.obj
 
     def say(line: str) -> None:
@@ -56,7 +54,7 @@ def ros(
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade ros")
         if container.access.policy is None:
-            complain("there is no policy: every node of that ROS may call what the file maps; see docs/ros.md")
+            complain("there is no policy: every ROS node may call what the file maps; see docs/ros.md")
         graph = room.join(read, file)
         try:
             bridge = room.Bridge(container, graph, read, say)

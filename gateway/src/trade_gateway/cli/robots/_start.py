@@ -1,4 +1,4 @@
-"""``trade start HOST NAME``: an empty container on another host."""
+"""``trade start HOST NAME``: starts an empty container on another host."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,18 +13,18 @@ from trade_gateway.cli._system_choice import visitor
 
 def start(
     context: typer.Context,
-    host: Annotated[str, typer.Argument(metavar="HOST", help="As for ssh: HOST or USER@HOST.")],
+    host: Annotated[str, typer.Argument(metavar="HOST", help="HOST or USER@HOST, as for ssh.")],
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the container.")],
-    allow: Annotated[list[str] | None, typer.Option(help="Classes that may be made in it; repeatable.")] = None,
-    dial: Annotated[list[str] | None, typer.Option(help="Endpoint it dials, as seen from there; repeatable.")] = None,
-    command: Annotated[str, typer.Option(help="Path of trade there.")] = "trade",
-    ssh_config: Annotated[Path | None, typer.Option(help="Instead of ~/.ssh/config.")] = None,
-    wait: Annotated[float, typer.Option(min=0.0, max=600.0, help="Seconds until it must be seen here.")] = 10.0,
+    allow: Annotated[list[str] | None, typer.Option(help="Classes it may create. Repeatable.")] = None,
+    dial: Annotated[list[str] | None, typer.Option(help="Endpoint to connect to from HOST. Repeatable.")] = None,
+    command: Annotated[str, typer.Option(help="Path of trade on HOST.")] = "trade",
+    ssh_config: Annotated[Path | None, typer.Option(help="Configuration of ssh instead of ~/.ssh/config.")] = None,
+    wait: Annotated[float, typer.Option(min=0.0, max=600.0, help="Time until it must be visible, in seconds.")] = 10.0,
     as_json: Json = False,
 ) -> None:
-    """Start an empty container on another host, through ssh; it stays up when this command ends.
+    """Start an empty container on another host through ssh; it outlives this command.
 
-    Only hosts whose key is known are talked to, and nothing is asked: set up ssh before.
+    Set up ssh before: the host's key must be known, and ssh may not prompt.
 
     For example: trade start robot.example eyes --allow "mypkg.vision:*"
     """

@@ -1,4 +1,4 @@
-"""``trade system``: bring up what a system file describes, over its hosts; see how it fares; take it down."""
+"""``trade system``: starts the containers of a system file on their hosts, shows their state, ends them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,33 +12,31 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of
-from trade_gateway.cli.robots._system_up import Bringing, Told, check_hosts
+from trade_gateway.cli.robots._system_up import Bringing, Report, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
 
-app = typer.Typer(no_args_is_help=True, help="A whole system from one file, over its hosts.")
+app = typer.Typer(no_args_is_help=True, help="Start, show and end the system that a file describes, on all its hosts.")
 
 File = Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="The system file.")]
-SshConfig = Annotated[Path | None, typer.Option(help="Instead of ~/.ssh/config.")]
+SshConfig = Annotated[Path | None, typer.Option(help="Configuration of ssh instead of ~/.ssh/config.")]
 
 
 @app.command("up")
 def up(
     context: typer.Context,
     file: File,
-    check: Annotated[
-        bool, typer.Option("--check", help="Only say whether the file is right, and its hosts in reach.")
-    ] = False,
-    keep: Annotated[bool, typer.Option("--keep", help="If one fails, leave those that were started.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check the file and its hosts, and exit.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="If one fails, keep those already started.")] = False,
     wait: Annotated[
-        float, typer.Option(min=0.1, max=600.0, help="Seconds until each must be seen here, and an object be made.")
+        float, typer.Option(min=0.1, max=600.0, help="Time limit for each container and object, in seconds.")
     ] = 30.0,
     ssh_config: SshConfig = None,
     as_json: Json = False,
 ) -> None:
-    """Start the containers of a file that are not up, in order; they stay up when this command ends.
+    """Start the containers of a file that are not up, in order; they outlive this command.
 
-    All is checked before anything is started. If one fails, those that were started are taken down again.
+    The file and its hosts are checked first. If a start fails, the containers started before are ended.
 
     For example: trade system up examples/system.toml --check
     """
@@ -48,26 +46,26 @@ def up(
         _say_order(out, plan)
         return
     with leaving() as interrupted, Container(plan.settings) as member:
-        bringing = Bringing(plan, member, ssh_config=ssh_config, wait_s=wait, tell=_teller(out))
+        bringing = Bringing(plan, member, ssh_config=ssh_config, wait_s=wait, report=_reporter(out))
         bringing.up(keep=keep, interrupted=interrupted)
     out.say(f"[bold green]system {escape(plan.settings.system)} is up[/]; to end it: trade system down {file}")
 
 
 @app.command("status")
 def status(context: typer.Context, file: File, as_json: Json = False) -> None:
-    """Say of each container of a file whether it is up. Exit code 0: all are; 1: something is missing.
+    """Show whether each container of a file is up. The exit code is 1 if one is missing or incomplete.
 
     For example: trade system status examples/system.toml
     """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
-        found = list(Bringing(plan, member, ssh_config=None, wait_s=0.0, tell=_teller(out)).status())
+        found = list(Bringing(plan, member, ssh_config=None, wait_s=0.0, report=_reporter(out)).status())
     if as_json:
         out.data(found)
     else:
-        rows = [(told.container, told.state, told.host, str(told.pid or ""), str(told.services)) for told in found]
+        rows = [(one.container, one.state, one.host, str(one.pid or ""), str(one.services)) for one in found]
         out.table(("CONTAINER", "STATE", "HOST", "PID", "SERVICES"), rows)
-    if any(told.state != "up" for told in found):
+    if any(one.state != "up" for one in found):
         raise typer.Exit(1)
 
 
@@ -76,38 +74,38 @@ def down(
     context: typer.Context,
     file: File,
     force: Annotated[
-        bool, typer.Option("--force", help="End also what is locked or moves; it is brought to rest first.")
+        bool, typer.Option("--force", help="Also end containers that are locked or move; motion is stopped first.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """End the containers of a file, those first that were started last; stop at one that is locked or moves.
+    """End the containers of a file in reverse order; stop at one that is locked or moves.
 
     For example: trade system down examples/system.toml
     """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
-        bringing = Bringing(plan, member, ssh_config=None, wait_s=5.0, tell=_teller(out))
+        bringing = Bringing(plan, member, ssh_config=None, wait_s=5.0, report=_reporter(out))
         bringing.down(only_at_rest=not force)
 
 
 def _plan(context: typer.Context, file: Path) -> SystemPlan:
     plan, said = read_system_file(file), choice_of(context)
     if said.system not in (None, plan.settings.system) or said.connect:
-        problem = f"{file} says which system it is, and whom to dial; leave out --system and --connect"
+        problem = f"{file} names the system and its endpoints; leave out --system and --connect"
         raise UsageError(where="trade system", problem=problem)
     return plan
 
 
-def _teller(out: Output) -> Callable[[Told], None]:
-    def tell(told: Told) -> None:
+def _reporter(out: Output) -> Callable[[Report], None]:
+    def report(one: Report) -> None:
         if out.as_json:
-            out.data(told)
-        where = f" on {told.host}" if told.host != "local" else ""
-        process = f", process {told.pid}" if told.pid else ""
-        took = f" after {told.took_s:.1f} s" if told.took_s >= 0.05 else ""
-        out.say(f"{escape(told.container)}{escape(where)}: [bold]{escape(told.state)}[/]{took}{process}")
+            out.data(one)
+        where = f" on {one.host}" if one.host != "local" else ""
+        process = f", process {one.pid}" if one.pid else ""
+        took = f" after {one.took_s:.1f} s" if one.took_s >= 0.05 else ""
+        out.say(f"{escape(one.container)}{escape(where)}: [bold]{escape(one.state)}[/]{took}{process}")
 
-    return tell
+    return report
 
 
 def _say_order(out: Output, plan: SystemPlan) -> None:

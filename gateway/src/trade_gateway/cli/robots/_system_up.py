@@ -1,4 +1,4 @@
-"""Bringing the containers of a system file up, looking at them, taking them down."""
+"""Starts, inspects and ends the containers of a system file."""
 
 import contextlib
 import os
@@ -22,24 +22,24 @@ from trade_gateway.process._signals import SignalEvent
 from trade_gateway.supervisor._objects import GROUP, lacking, make
 
 _LEFT_S: Final = 20.0
-"""How long a container may take to leave once it was told to: a robot is brought to rest before."""
+"""How long a container may take to shut down, in seconds: a robot is brought to rest first."""
 _LOOK_EVERY_S: Final = 0.05
 
 
-class Told(Struct, frozen=True, kw_only=True):
-    """What became of one container."""
+class Report(Struct, frozen=True, kw_only=True):
+    """The result for one container."""
 
     container: str
     host: str
-    """As the file has it."""
+    """The host as the file names it."""
     state: str
-    """``started``, ``was up``, ``up``, ``down``, ``ended``, ``was down``, or what is missing in it."""
+    """``started``, ``was up``, ``up``, ``down``, ``ended``, ``was down``, or what the container lacks."""
     pid: int = 0
     took_s: float = 0.0
     services: int = 0
 
 
-Tell = Callable[[Told], None]
+Reporter = Callable[[Report], None]
 
 
 class _Began(NamedTuple):
@@ -48,36 +48,36 @@ class _Began(NamedTuple):
 
 
 class Bringing:
-    """The containers of one file, seen from a container of the command's own.
+    """The containers of one file, as a container of this command sees them.
 
     Args:
-        plan: the file, checked.
-        member: in the system of the file.
-        ssh_config: instead of the user's own.
-        wait_s: how long a container may take to be seen once it is up, and an object to be made.
-        tell: told of each container.
+        plan: the checked file.
+        member: this command's container in the system of the file.
+        ssh_config: a configuration instead of the user's.
+        wait_s: how long a started container may take to become visible, and an object to be created.
+        report: called with the result of each container.
     """
 
     def __init__(
-        self, plan: SystemPlan, member: Container, *, ssh_config: Path | None, wait_s: float, tell: Tell
+        self, plan: SystemPlan, member: Container, *, ssh_config: Path | None, wait_s: float, report: Reporter
     ) -> None:
         self._plan = plan
         self._member = member
         self._ssh_config = ssh_config
         self._wait_s = wait_s
-        self._tell = tell
+        self._report = report
 
     def up(self, *, keep: bool, interrupted: threading.Event | SignalEvent) -> None:
-        """Start what is not up, in order; leave what is. What fails has what this began taken down again.
+        """Starts the containers that are not up, in order; a failure ends those that it started.
 
         Args:
-            keep: leave what was begun as it is.
-            interrupted: ends it likewise, once the container that is being started is up and known by its process.
+            keep: after a failure, keep the containers that were started.
+            interrupted: ends the start like a failure, once the current container is up and its process known.
 
         Raises:
-            KeyboardInterrupt: it was interrupted.
-            CannotStart, ConfigurationError: with the reason; before anything is started if a host is out of reach.
-            TradeError: an object could not be made.
+            KeyboardInterrupt: the start was interrupted.
+            CannotStart, ConfigurationError: with the reason; before any start if a host is unreachable.
+            TradeError: an object could not be created.
         """
         check_hosts(self._plan, [part for part in self._plan.parts if self._seen(part) is None], self._ssh_config)
         began: list[_Began] = []
@@ -100,7 +100,7 @@ class Bringing:
         made = [make(self._own(part, "instantiate"), one, wait_s=self._wait_s) for one in lacking(self._member, part)]
         state = "was up" if was_up and not made else "started"
         took_s = time.monotonic() - at
-        self._tell(Told(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
+        self._report(Report(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
 
     def _start(self, part: ContainerSpec) -> Started:
         entry = part.entry
@@ -118,12 +118,12 @@ class Bringing:
 
     def _await(self, began: _Began) -> ContainerInfo:
         part, started = began
-        with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
+        with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
             self._member.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
         info = next((one for one in self._member.containers() if one.epoch == started.epoch), None)
         if info is None:
-            said = f"it is up there as process {started.pid}, and not seen here within {self._wait_s:g} s"
-            remedy = f"tell it whom to dial ({self._plan.at(part.name, 'connect')}), and give it the certificate"
+            said = f"it is up there as process {started.pid}, but was not visible here within {self._wait_s:g} s"
+            remedy = f"set its endpoints ({self._plan.at(part.name, 'connect')}), and give it the certificate"
             raise CannotStart(host=part.entry.host, container=part.name, reason="not seen", said=said, remedy=remedy)
         return info
 
@@ -131,7 +131,7 @@ class Bringing:
         return self._member.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
 
     def _seen(self, part: ContainerSpec) -> ContainerInfo | None:
-        """The container of that name. Raises ConfigurationError if there are two."""
+        """Returns the container of that name. Raises ConfigurationError if there are two."""
         found = [info for info in self._member.containers() if info.name == part.name]
         if len(found) > 1:
             problem = f"there are {len(found)} of that name: {', '.join(f'{one.pid} on {one.host}' for one in found)}"
@@ -139,7 +139,7 @@ class Bringing:
         return found[0] if found else None
 
     def _undo(self, began: Sequence[_Began]) -> None:
-        """Take down what was begun, last first; what does not go is told, and left."""
+        """Ends the containers that were started, in reverse order; one that cannot be ended is reported and kept."""
         for part, started in reversed(began):
             try:
                 if any(info.epoch == started.epoch for info in self._member.containers()):
@@ -147,7 +147,9 @@ class Bringing:
                 else:
                     self._end_unseen(part, started)
             except TradeError as left:
-                self._tell(Told(container=part.name, host=part.entry.host, state=f"left up: {left}", pid=started.pid))
+                self._report(
+                    Report(container=part.name, host=part.entry.host, state=f"left up: {left}", pid=started.pid)
+                )
 
     def _end_unseen(self, part: ContainerSpec, started: Started) -> None:
         if part.entry.is_local:
@@ -155,18 +157,18 @@ class Bringing:
                 os.kill(started.pid, signal.SIGTERM)
         else:
             end_there(part.entry.host, part.name, started.pid, self._ssh_config)
-        self._tell(Told(container=part.name, host=part.entry.host, state="ended", pid=started.pid))
+        self._report(Report(container=part.name, host=part.entry.host, state="ended", pid=started.pid))
 
     def down(self, *, only_at_rest: bool) -> None:
-        """End the containers, those first that were started last; stops at the first that does not go.
+        """Ends the containers in reverse order; stops at the first that cannot be ended.
 
         Raises:
-            InUse: something of it is locked or moves, and it was to end ``only_at_rest``.
-            TradeError: it could not be told to.
+            InUse: the container is locked or moves, and may end ``only_at_rest``.
+            TradeError: the call to end it failed.
         """
         for part in reversed(self._plan.parts):
             if self._seen(part) is None:
-                self._tell(Told(container=part.name, host=part.entry.host, state="was down"))
+                self._report(Report(container=part.name, host=part.entry.host, state="was down"))
             else:
                 self._end(part, only_at_rest=only_at_rest)
 
@@ -177,31 +179,31 @@ class Bringing:
         until, pause = at + _LEFT_S, threading.Event()
         while info is not None and any(one.epoch == info.epoch for one in self._member.containers()):
             if time.monotonic() > until:
-                problem = f"was told to end and is still there after {_LEFT_S:g} s; see trade logs"
+                problem = f"did not end within {_LEFT_S:g} s; see `trade logs`"
                 raise ConfigurationError(where=self._plan.at(part.name), problem=problem)
             pause.wait(_LOOK_EVERY_S)
         state = f"ended, but: {'; '.join(problems)}" if problems else "ended"
         took_s = time.monotonic() - at
-        self._tell(Told(container=part.name, host=part.entry.host, state=state, took_s=took_s))
+        self._report(Report(container=part.name, host=part.entry.host, state=state, took_s=took_s))
 
-    def status(self) -> Iterator[Told]:
-        """How each container of the file fares, in order."""
+    def status(self) -> Iterator[Report]:
+        """Returns the state of each container of the file, in order."""
         for part in self._plan.parts:
             info, host = self._seen(part), part.entry.host
             if info is None:
-                yield Told(container=part.name, host=host, state="down")
+                yield Report(container=part.name, host=host, state="down")
                 continue
             lacks = ", ".join(one.class_ for one in lacking(self._member, part))
             state = f"lacks {lacks}" if lacks else "up"
-            yield Told(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
+            yield Report(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
 
 
 def check_hosts(plan: SystemPlan, parts: Sequence[ContainerSpec], ssh_config: Path | None) -> None:
-    """Ask all other hosts at once whether they are there, and have ``trade`` and the files that are named.
+    """Checks in parallel that all other hosts are reachable, and have ``trade`` and the named files.
 
     Raises:
-        CannotStart: one is out of reach, or has no ``trade``.
-        ConfigurationError: a file is missing there; names the line.
+        CannotStart: a host is unreachable, or has no ``trade``.
+        ConfigurationError: a file is missing there; with its line.
     """
     asked = [part for part in parts if not part.entry.is_local]
     wrong: dict[str, TradeError] = {}
@@ -210,7 +212,7 @@ def check_hosts(plan: SystemPlan, parts: Sequence[ContainerSpec], ssh_config: Pa
         try:
             missing = missing_there(part.entry.host, part.name, (part.entry.command,), part.files, ssh_config)
             if missing:
-                problem = f"{part.entry.host} has no {', '.join(missing)} that can be read"
+                problem = f"{part.entry.host} has no readable {', '.join(missing)}"
                 raise ConfigurationError(where=plan.at(part.name, part.entry.kind), problem=problem)
         except TradeError as error:
             wrong[part.name] = error
@@ -219,7 +221,7 @@ def check_hosts(plan: SystemPlan, parts: Sequence[ContainerSpec], ssh_config: Pa
     for asker in askers:
         asker.start()
     for asker in askers:
-        asker.join(LONGEST_S + 1)  # ssh is ended before
+        asker.join(LONGEST_S + 1)  # ssh has its own, shorter limit
     for part in asked:
         if part.name in wrong:
             raise wrong[part.name]

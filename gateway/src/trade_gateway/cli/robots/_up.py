@@ -1,4 +1,4 @@
-"""``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
+"""``trade up ROBOT.toml``: attaches a robot's devices and offers them as services until it is ended."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -24,30 +24,31 @@ from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.process._signals import leaving, refuse_twice, settle
 
 _CALLS: Final = ((Motor, "enable"), (Gripper, "activate"))
-"""What helps once the cause is gone."""
+"""The service that clears a fault once its cause is gone."""
+_SIMULATION: Final = "Simulation"
 
 
 class FaultWatch:
-    """Compares what a robot's log of faults says is wrong now with what it said before.
+    """Reports changes in a robot's fault log.
 
     Args:
-        log: of the robot.
-        providers: its devices by name.
+        log: the robot's fault log.
+        providers: the robot's devices by name.
     """
 
     def __init__(self, log: FaultLog, providers: Mapping[str, object]) -> None:
         self._log = log
         self._providers = providers
         self._known: dict[str, FaultInfo] = {}
-        """By device, what was told of it."""
+        """By device, the fault that was reported."""
 
     def begin(self, out: Output) -> None:
-        """Say what is wrong, or that nothing is."""
-        if not self.tell(out):
+        """Reports the open faults, or that there are none."""
+        if not self.report(out):
             out.say(f"{_now():%H:%M:%S} no joint has a fault")
 
-    def tell(self, out: Output) -> bool:
-        """Say what has changed since the last time; returns whether anything has. Of several faults the newest."""
+    def report(self, out: Output) -> bool:
+        """Reports what has changed since the last time, the newest fault of each device; returns whether any has."""
         found = reversed(self._log.faults(open_only=True))
         now = {info.device: info for info in found}
         before, self._known = self._known, now
@@ -61,7 +62,7 @@ class FaultWatch:
         if out.as_json:
             out.data({"at": _now().isoformat(timespec="milliseconds"), "joint": device, "fault": text})
         elif info is None:
-            out.say(f"{_now():%H:%M:%S} [green]{device}: well again[/]")
+            out.say(f"{_now():%H:%M:%S} [green]{device}: healthy again[/]")
         else:
             out.say(f"{_now():%H:%M:%S} [bold red]{escape(text)}[/]")
 
@@ -88,34 +89,39 @@ _LOOK_EVERY_S = 0.5
 def up(
     context: typer.Context,
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
-    sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
-    sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
+    sim: Annotated[
+        bool,
+        typer.Option("--sim", rich_help_panel=_SIMULATION, help="Simulate the devices: the same bytes, no hardware."),
+    ] = False,
+    sim_log: Annotated[
+        Path | None, typer.Option(rich_help_panel=_SIMULATION, help="File for the simulator's log of all bytes.")
+    ] = None,
     port: Annotated[
         list[str] | None,
-        typer.Option(metavar="PART=PORT", help="A port instead of the file's, such as neck=/dev/ttyUSB1; repeatable."),
+        typer.Option(metavar="PART=PORT", help="Port instead of the file's: neck=/dev/ttyUSB1. Repeatable."),
     ] = None,
     leave_out: Annotated[
         list[str] | None,
-        typer.Option("--without", metavar="PART", help="A bus, camera or sensor to leave out; again for another."),
+        typer.Option("--without", metavar="PART", help="Bus, camera or sensor to leave out. Repeatable."),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only say whether its drivers take the file.")] = False,
+    name: Annotated[str | None, typer.Option(help="Name of the container. Default: the robot's.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Check the file with its drivers, and exit.")] = False,
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
+    """Start a robot and keep it up. Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
 
-    Attaching moves nothing and resets nothing. A line tells when a joint has a fault, and when it has none any more.
+    Attaching moves nothing and resets nothing. A line reports each fault of a joint, and its end.
 
     For example: trade up examples/rosie.toml --sim
     """
     if sim_log is not None and not sim:
-        raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
+        raise UsageError(where="--sim-log", problem="needs --sim: it is the simulator's log")
     if sim and port:
-        raise UsageError(where="--port", problem="names hardware, and --sim simulates it; leave one of them out")
+        raise UsageError(where="--port", problem="names hardware, which --sim simulates; leave one of them out")
     out = Output(as_json=as_json)
     robot, left_out = without(load(robot_file), leave_out or [])
-    told = ports_told(port or [])
+    named_ports = ports_named(port or [])
     if check:
         drivers_check(robot)
         out.say(f"{robot_file} is right")
@@ -126,7 +132,7 @@ def up(
     with Notifier() as notifier, ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
-        ports: dict[str, str] = simulation.ports if simulation else told
+        ports: dict[str, str] = simulation.ports if simulation else named_ports
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
@@ -143,7 +149,7 @@ def up(
             healthy=container.healthy,
             state_dir=state_dir and state_dir / container.settings.system,
         )
-        logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch tells of them, once and with the time
+        logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch reports them once, with the time
         stack.callback(_say_left, attached)
         stack.enter_context(attached)
         container.measured_by(attached.measures)
@@ -154,7 +160,7 @@ def up(
         stack.callback(notifier.leaving)
         notifier.ready(f"{robot.name} is up in container {container.name}")
         while not asked_to_leave.wait(_LOOK_EVERY_S):
-            faults.tell(out)
+            faults.report(out)
             if container.healthy():
                 notifier.alive()
             if simulation is not None and not simulation.running:
@@ -162,8 +168,8 @@ def up(
         out.say("leaving")
 
 
-def ports_told(words: Sequence[str]) -> dict[str, str]:
-    """By part of the robot: the port that the command line names instead of the file's.
+def ports_named(words: Sequence[str]) -> dict[str, str]:
+    """Returns the ports that the command line names instead of the file's, by part of the robot.
 
     Raises:
         UsageError: a word is no PART=PORT, or names a part a second time.
@@ -172,7 +178,7 @@ def ports_told(words: Sequence[str]) -> dict[str, str]:
     for word in words:
         part, _, port = word.partition("=")
         if not (part and port):
-            raise UsageError(where=f"--port {word}", problem="is no PART=PORT; write neck=/dev/ttyUSB1")
+            raise UsageError(where=f"--port {word}", problem="is not PART=PORT, such as neck=/dev/ttyUSB1")
         if part in ports:
             raise UsageError(where=f"--port {word}", problem=f"{part} has {ports[part]} already")
         ports[part] = port
@@ -194,7 +200,7 @@ def _simulation(robot: Robot, log: Path | None) -> Any:
 
 def _say_left(attached: AttachedRobot) -> None:
     if unseen := attached.unseen():
-        complain(f"left without being seen at rest: {', '.join(unseen)}")
+        complain(f"shut down without confirmation that these are at rest: {', '.join(unseen)}")
 
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
@@ -206,8 +212,8 @@ def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
                 *(f"{arm.name} ({arm.model})" for arm in robot.arms_on(bus.name)),
             ]
         )
-        told = named or f'no device; one that is on it says bus = "{bus.name}"'
-        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {told}")
+        attached = named or f'no device; a device on it has bus = "{bus.name}"'
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {attached}")
     for sense in (*robot.cameras, *robot.sensors):
         place = f" on {ports[sense.name]}" if sense.name in ports else ""
         out.say(f"[bold]{robot.name}[/]: attaching {type(sense).__name__.lower()} {sense.name} ({sense.driver}){place}")
@@ -218,8 +224,8 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     if out.as_json:
         extra = {"control": str(simulation.control_path)} if simulation else {}
         open_ones = [estop.id for estop in container.estops()]
-        told = {**ready(container), "robot": robot.name, "estops": open_ones, **extra}
-        out.data({**told, "services": [handle.label for handle in mine]})
+        up_now = {**ready(container), "robot": robot.name, "estops": open_ones, **extra}
+        out.data({**up_now, "services": [handle.label for handle in mine]})
         return
     out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
     example = next((handle.label for handle in mine if handle.name in {"state", "read"}), None)
@@ -227,7 +233,7 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
         out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
     if simulation:
         out.say(
-            f"to strike the simulator with faults: trade-hil-sim --do {simulation.control_path} FAULT (--help has them)"
+            f"to inject faults into the simulator: trade-hil-sim --do {simulation.control_path} FAULT (--help has them)"
         )
     out.say("Ctrl-C leaves")
     for estop in container.estops():
