@@ -107,7 +107,7 @@ def test_the_commands_show_the_tree_and_the_lines_in_it(looked: Container) -> No
     assert f"looking at 0.3  (call {call_id})" in _says("logs", "--container", "mind")
     assert _says("logs", "--container", "mind", "--level", "error") == ""
     assert json.loads(_says("tracing", "off", "--container", "mind", "--json")) == ["mind"]
-    assert "there is no such container" in str(
+    assert "no such container is in this system" in str(
         CliRunner().invoke(app, ["tracing", "on", "--container", "moon"]).exception
     )
 
@@ -117,7 +117,7 @@ def test_what_is_not_as_it_was_learned_is_told(looked: Container, tmp_path: Path
     assert (look["calls"], look["errors"]) == (1, 0)
     learned = tmp_path / "usual.json"
     _says("profile", "--learn", learned)
-    assert "nothing deviates" in _says("profile", "--against", learned)
+    assert "no call deviates" in _says("profile", "--against", learned)
     looked.call(where(name="state", group="rosie.neck.pan"))
     odd = json.loads(_says("profile", "--against", learned, "--json", code=1))
     assert [(one["kind"], one["before"], one["after"]) for one in odd] == [("new", "mind.look", "rosie.neck.pan.state")]

@@ -121,7 +121,7 @@ def test_a_changed_file_counts_and_a_wrong_one_does_not(run: Callable[..., Any],
     file.write_text("[rule.x]\n")
     assert running.stderr is not None
     wrong = next(line for line in running.stderr if "warning" in line)  # before it: what failed in the first firing
-    assert "was changed and is wrong; going on as before" in wrong
+    assert "was changed and has an error; continuing as before" in wrong
     file.write_text(FILE.replace("greet", "welcome"))
     assert message(running) == {"reloaded": str(file)}
     assert {info["name"] for info in json.loads(trade("rules", "list", "--json").stdout)} == {"alone", "welcome"}
@@ -156,7 +156,7 @@ def test_a_wrong_file_is_said_before_anything_is_done(file: Path, system: str) -
 
 
 def test_nothing_standing_is_said(desk: Desk) -> None:
-    assert "no rules stand" in trade("rules", "list").stdout
+    assert "no rules run" in trade("rules", "list").stdout
     assert json.loads(trade("rules", "list", "--json").stdout) == []
 
 

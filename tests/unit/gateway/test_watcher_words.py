@@ -48,7 +48,7 @@ def test_notifications_are_listed_and_cancelled(base: Container) -> None:
     assert all(text in table for text in ("OCCASION", noted.id, "every 60 s", "rosie.base.dock(0.3)", base.session))
     assert f"cancelled: {noted.id}" in trade("notifications", "--cancel", noted.id).stdout
     assert not noted.active
-    assert "no notification stands" in trade("notifications").stdout
+    assert "there is no notification" in trade("notifications").stdout
     assert json.loads(trade("notifications", "--json").stdout) == []
 
 

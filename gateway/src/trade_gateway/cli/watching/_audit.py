@@ -1,4 +1,4 @@
-"""``trade audit``: who called, locked, stopped, was refused, changed the set-up, from the records of this host."""
+"""``trade audit``: shows and verifies the audit records of this host."""
 
 import fnmatch
 import heapq
@@ -24,21 +24,22 @@ from trade_gateway.cli._output import Output, complain
 
 _EVERY_S: Final = 0.5
 _UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_FILTERS: Final = "Filters"
 _AGO: Final = re.compile(r"(\d+)([smhd])")
 
 Folder = Annotated[
-    Path, typer.Argument(metavar="FOLDER", envvar="TRADE_AUDIT", help="Where the containers keep their records.")
+    Path, typer.Argument(metavar="FOLDER", envvar="TRADE_AUDIT", help="Folder of the containers' records.")
 ]
 
 
 app = typer.Typer(
     cls=FirstByDefault,
-    help="Who called, locked, stopped, was refused, changed the configuration. Without one of the commands: show.",
+    help="Show and verify the audit record: calls, locks, stops, refusals, configuration changes. Default: show.",
 )
 
 
-class Told(NamedTuple):
-    """A row, and the container whose record it is in."""
+class Entry(NamedTuple):
+    """A row of the audit record of a container."""
 
     container: str
     row: AuditRow
@@ -47,20 +48,23 @@ class Told(NamedTuple):
 @app.command()
 def show(
     folder: Folder,
-    since: Annotated[str, typer.Option(help="30m, 12h or 7d ago, or a moment: 2026-11-21T08:00.")] = "",
-    who: Annotated[str, typer.Option(help="Only of this identity, or a door's client; * and ? are anything.")] = "*",
-    service: Annotated[str, typer.Option(help="Only this service; likewise.")] = "*",
-    container: Annotated[str, typer.Option(help="Only from the record of this container; likewise.")] = "*",
+    since: Annotated[str, typer.Option(rich_help_panel=_FILTERS, help="Age (30m, 12h, 7d) or 2026-11-21T08:00.")] = "",
+    who: Annotated[
+        str, typer.Option(rich_help_panel=_FILTERS, help="Identity or client; * and ? are wildcards.")
+    ] = "*",
+    service: Annotated[str, typer.Option(rich_help_panel=_FILTERS, help="Service; * and ? are wildcards.")] = "*",
+    container: Annotated[str, typer.Option(rich_help_panel=_FILTERS, help="Container; * and ? are wildcards.")] = "*",
     kind: Annotated[
-        Literal["call", "read", "stop", "lock", "configure", "refused", "audit"] | None, typer.Option(help="Only this.")
+        Literal["call", "read", "stop", "lock", "configure", "refused", "audit"] | None,
+        typer.Option(rich_help_panel=_FILTERS, help="Kind of row."),
     ] = None,
     call: Annotated[
-        int | None, typer.Option(help="Only what belongs to this call: it, and all that came of it.")
+        int | None, typer.Option(rich_help_panel=_FILTERS, help="Id of a call; also shows the calls that it led to.")
     ] = None,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes, until Ctrl-C.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Keep printing new rows until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what is in the records of a folder, in order of time.
+    """Show the audit rows of a folder in order of time.
 
     For example: trade audit /var/lib/trade/audit --since 1h --kind refused
     """
@@ -68,13 +72,13 @@ def show(
     seen: dict[Path, int] = {}
     while True:
         found = [_rows(path, seen) for path in _records(folder, missing_is_wrong=not follow)]
-        for told in heapq.merge(*found, key=lambda told: told.row.at_ns):
-            row = told.row
+        for entry in heapq.merge(*found, key=lambda entry: entry.row.at_ns):
+            row = entry.row
             meant = row.at_ns >= after_ns and kind in (None, row.kind) and call in (None, row.call_id, row.outer_id)
-            patterns = ((row.what, service), (told.container, container))
+            patterns = ((row.what, service), (entry.container, container))
             meant = meant and any(fnmatch.fnmatchcase(name, who) for name in (row.who, client_of(row.session)))
             if meant and all(fnmatch.fnmatchcase(text, pattern) for text, pattern in patterns):
-                _say(out, told)
+                _say(out, entry)
         if not follow:
             return
         pause.wait(_EVERY_S)
@@ -84,46 +88,47 @@ def show(
 def verify_command(
     folder: Folder,
     against: Annotated[
-        Path | None, typer.Option(help="What `trade audit head --json` said once, kept where nobody here can write.")
+        Path | None, typer.Option(help="Earlier output of `trade audit head --json`, kept out of reach of this host.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check that no row was changed, removed, added or put elsewhere; exit code 1, and the first such row, if one was.
+    """Check that no row was changed, removed, added or moved. The exit code is 1, with the first bad row, if one was.
 
-    With --against, exit code 3 if of no row that was noted of a record it can be told whether it was that one: all were
-    dropped since.
+    With --against, the exit code is 3 if a record cannot be compared because all noted rows were dropped since.
 
     For example: trade audit verify /var/lib/trade/audit --against /media/stick/heads
     """
     out, noted = Output(as_json=as_json), {} if against is None else _noted(against)
-    bad = untold = 0
+    bad = unproven = 0
     for path in _records(folder):
         verdict = _verified(path, noted.pop(path.stem, {}))
         bad += bool(verdict.problem)
-        untold += bool(verdict.untold and not verdict.proven)
+        unproven += bool(verdict.untold and not verdict.proven)
         if as_json:
-            out.data({"container": path.stem, "ok": not verdict.problem, **_told(verdict)})
+            out.data({"container": path.stem, "ok": not verdict.problem, **_verdict_data(verdict)})
         out.say(_sentence(path, verdict))
         for seq in verdict.untold:
-            dropped = f"row {seq} was noted elsewhere and is dropped: whether it was that one cannot be told"
+            dropped = f"row {seq} was noted elsewhere and dropped since, so it cannot be compared"
             out.say(f"[bold yellow]{escape(path.stem)}[/]: {dropped}")
     for name in noted:
         bad += 1
-        out.say(f"[bold red]{escape(name)}[/]: noted elsewhere, and there is no record of it")
+        out.say(f"[bold red]{escape(name)}[/]: noted elsewhere, but it has no record here")
         if as_json:
-            out.data({"container": name, "ok": False, "problem": "there is no record of it"})
+            out.data({"container": name, "ok": False, "problem": "it has no record here"})
     for path in moved_aside_in(folder):
         bad += 1
-        out.say(f"[bold red]{escape(path.name)}[/]: was found broken and moved aside")
+        out.say(f"[bold red]{escape(path.name)}[/]: was found damaged and moved aside")
         if as_json:
-            out.data({"container": path.stem, "ok": False, "problem": f"{path.name} was found broken and moved aside"})
-    if bad or untold:
+            out.data({"container": path.stem, "ok": False, "problem": f"{path.name} was found damaged and moved aside"})
+    if bad or unproven:
         raise typer.Exit(1 if bad else 3)
 
 
 @app.command()
 def head(folder: Folder, as_json: Json = False) -> None:
-    """Say where each record ends: note it elsewhere, and no row up to there can be changed without being found out.
+    """Print the last row and hash of each record.
+
+    Keep them on another host: then `trade audit verify --against` detects changes of any row up to there.
 
     For example: trade audit head --json > /media/stick/heads
     """
@@ -146,20 +151,20 @@ def _records(folder: Path, *, missing_is_wrong: bool = True) -> list[Path]:
     found = records_in(folder) if folder.is_dir() else []
     if not found and missing_is_wrong:
         raise ConfigurationError(
-            where=str(folder), problem=f"there is no audit record; containers keep one there with TRADE_AUDIT={folder}"
+            where=str(folder), problem=f"has no audit record; containers write one with TRADE_AUDIT={folder}"
         )
     return found
 
 
-def _rows(path: Path, seen: dict[Path, int]) -> Iterator[Told]:
-    """What was not seen yet."""
+def _rows(path: Path, seen: dict[Path, int]) -> Iterator[Entry]:
+    """Returns the rows that were not seen yet."""
     try:
         with reading(path, seen.get(path, 0)) as (end, links):
-            if end.seq < seen.get(path, 0):  # it was begun anew
+            if end.seq < seen.get(path, 0):  # the record was started again
                 seen[path] = 0
             for link in links:
                 seen[path] = link.row.seq
-                yield Told(path.stem, link.row)
+                yield Entry(path.stem, link.row)
     except (sqlite3.Error, msgspec.ValidationError) as bad:
         complain(f"{path} cannot be read: {bad}")
 
@@ -179,7 +184,7 @@ class _Noted(msgspec.Struct):
 
 
 def _noted(file: Path) -> dict[str, dict[int, bytes]]:
-    """Hashes of rows by container and number."""
+    """Returns hashes of rows by container and number."""
     found: dict[str, dict[int, bytes]] = {}
     try:
         for line in file.read_bytes().splitlines():
@@ -191,7 +196,7 @@ def _noted(file: Path) -> dict[str, dict[int, bytes]]:
 
 
 def _moment(since: str) -> int:
-    """In nanoseconds since the epoch."""
+    """Returns the time in nanoseconds since the Unix epoch."""
     if not since:
         return 0
     if ago := _AGO.fullmatch(since):
@@ -202,13 +207,13 @@ def _moment(since: str) -> int:
         raise UsageError(where=f"--since {since}", problem="is neither 30m, 12h, 7d nor 2026-11-21T08:00") from None
 
 
-# --- telling
+# --- output
 
 
-def _say(out: Output, told: Told) -> None:
-    row = told.row
+def _say(out: Output, entry: Entry) -> None:
+    row = entry.row
     if out.as_json:
-        out.data({"container": told.container, **msgspec.structs.asdict(row)})
+        out.data({"container": entry.container, **msgspec.structs.asdict(row)})
         return
     at = datetime.fromtimestamp(row.at_ns / 1e9).astimezone().isoformat(" ", "milliseconds")[:23]
     end = "" if row.outcome == "ok" else f" {row.outcome}"
@@ -218,10 +223,10 @@ def _say(out: Output, told: Told) -> None:
     call = f"  (call {row.call_id}{began})" if row.call_id else ""
     client = client_of(row.session)
     who = f"{row.who} for {client}" if client else row.who or "-"
-    out.say(escape(f"{at} {row.kind:9} {told.container}: {who} {row.what}{about}{end}{why}{call}"))
+    out.say(escape(f"{at} {row.kind:9} {entry.container}: {who} {row.what}{about}{end}{why}{call}"))
 
 
-def _told(verdict: ChainCheck) -> dict[str, object]:
+def _verdict_data(verdict: ChainCheck) -> dict[str, object]:
     return {
         "rows": verdict.rows,
         "first": verdict.first,
@@ -238,6 +243,6 @@ def _sentence(path: Path, verdict: ChainCheck) -> str:
     name = escape(path.stem)
     if verdict.problem:
         return f"[bold red]{name}[/]: row {verdict.broken_at}: {escape(verdict.problem)}"
-    dropped = "" if verdict.first <= 1 else f"; those before row {verdict.first} were dropped in order"
+    dropped = "" if verdict.first <= 1 else f"; rows before {verdict.first} were dropped in order"
     end = f"row {verdict.head.seq} is {verdict.head.hash.hex()}"
     return f"[bold green]{name}[/]: {verdict.rows} rows, each follows from the one before{dropped}; {end}"

@@ -1,4 +1,4 @@
-"""``trade faults``: what is or was wrong with devices, what they measured then, and that somebody has seen it."""
+"""``trade faults``: lists and shows the faults of devices with their measurements, and acknowledges them."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Final
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 
 _WAIT_S: Final = 5.0
 _SHOWN: Final = 20
-"""Samples; with ``--json`` all of them."""
+"""How many samples are shown; with ``--json`` all."""
 
-Id = Annotated[str, typer.Argument(metavar="ID", help="As trade faults tells it: rosie-3f2a.")]
+Id = Annotated[str, typer.Argument(metavar="ID", help="Id of a fault, from trade faults: rosie-3f2a.")]
 
 app = typer.Typer(
     cls=FirstByDefault,
-    help="What is or was wrong with devices. Without one of the commands: list.",
+    help="List, show and acknowledge faults of devices. Default: list.",
 )
 
 
 @app.command("list")
 def list_faults(
     context: typer.Context,
-    robot: Annotated[str | None, typer.Argument(metavar="ROBOT", help="Only of this robot.")] = None,
-    open_only: Annotated[bool, typer.Option("--open", help="Only what is wrong now.")] = False,
+    robot: Annotated[str | None, typer.Argument(metavar="ROBOT", help="List only the faults of this robot.")] = None,
+    open_only: Annotated[bool, typer.Option("--open", help="List only open faults.")] = False,
     as_json: Json = False,
 ) -> None:
-    """List the faults of devices, those that began last first.
+    """List the faults of devices, the latest first.
 
     For example: trade faults rosie --open
     """
@@ -66,10 +66,10 @@ def list_faults(
 def show(
     context: typer.Context,
     fault_id: Id,
-    first: Annotated[bool, typer.Option("--first", help="What was measured the first time, not the latest.")] = False,
+    first: Annotated[bool, typer.Option("--first", help="Show the measurements of its first occurrence.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Show one fault, and what its device measured before it began.
+    """Show a fault, and what its device measured before it.
 
     For example: trade faults show rosie-3f2a
     """
@@ -81,7 +81,7 @@ def show(
         return
     remedy = as_commands(fault.device, fault.remedy)
     out.say(f"[bold]{escape(fault.text)}[/]" + (f"; {escape(remedy)}" if remedy else ""))
-    out.say(f"{_state(fault)}; began {_times(fault)}, was there for {fault.lasted_s:.1f} s in all")
+    out.say(f"{_state(fault)}; began {_times(fault)}, lasted {fault.lasted_s:.1f} s in all")
     if fault.acknowledged_at is not None:
         out.say(f"seen by {escape(fault.acknowledged_by)} at {day_and_clock(fault.acknowledged_at)}")
     for note in fault.evidence:
@@ -95,7 +95,7 @@ def show(
 
 @app.command()
 def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
-    """Say that you have seen a fault. It clears nothing in the device and moves nothing.
+    """Acknowledge a fault. This clears nothing in the device and moves nothing.
 
     For example: trade faults ack rosie-3f2a
     """
@@ -119,12 +119,12 @@ def _logs(container: Container, robot: str | None) -> "Sequence[Handle]":
 def _service(container: Container, fault_id: str, name: str) -> "Handle":
     robot = fault_id.rpartition("-")[0]
     if not robot:
-        raise UsageError(where=fault_id, problem="is no id of a fault; `trade faults` lists them: rosie-3f2a")
+        raise UsageError(where=fault_id, problem="is no id of a fault, such as rosie-3f2a; `trade faults` lists them")
     return container.find(asked_for(f"id {fault_id!r}", name=name, group=f"{robot}.faults"), wait_s=_WAIT_S)
 
 
 def _said(info: "FaultInfo") -> str:
-    """`FaultInfo.said`, of what came from a driver: here it has the fields alone."""
+    """Returns what `FaultInfo.said` does in the driver's process; here only the fields are known."""
     begin = f"{info.device}: "
     return info.text.removeprefix(begin) if info.text.startswith(begin) else info.kind
 

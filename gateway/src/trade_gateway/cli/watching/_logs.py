@@ -1,4 +1,4 @@
-"""``trade logs``: what the processes of a system log, in one place."""
+"""``trade logs``: shows the logs of all processes of a system."""
 
 import logging
 import threading
@@ -20,19 +20,20 @@ Level = Literal["debug", "info", "warning", "error", "critical"]
 
 def logs(
     context: typer.Context,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes, until Ctrl-C.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Keep printing new lines until Ctrl-C.")] = False,
     level: Annotated[
-        Literal["debug", "info", "warning", "error", "critical"], typer.Option(help="The least.")
+        Literal["debug", "info", "warning", "error", "critical"], typer.Option(help="Lowest level to show.")
     ] = "debug",
     container: Name = "*",
     call: Annotated[
-        int | None, typer.Option(help="Only what was logged in this call, and in those that it led to, anywhere.")
+        int | None, typer.Option(help="Id of a call: show only its lines and those of calls it led to.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Show what all processes log to the logger "trade", in order of time by the clocks of their hosts.
+    """Show what all processes log to the logger "trade", in order of time.
 
-    Each keeps its latest 2,000 lines, of those that its own level lets pass. With --json, each line is an object.
+    Times are those of the hosts' clocks. Each process keeps its latest 2,000 lines that pass its own level.
+    With --json, each line is an object.
 
     For example: trade logs -f --level warning
     """

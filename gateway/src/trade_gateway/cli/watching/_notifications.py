@@ -1,4 +1,4 @@
-"""``trade notifications`` and ``trade hooks``: what was asked to happen by itself, and ending it."""
+"""``trade notifications`` and ``trade hooks``: list the notifications and hooks of a system, and end them."""
 
 from typing import Annotated
 
@@ -13,10 +13,10 @@ from trade_gateway.cli._system_choice import visitor_among_others
 
 def notifications(
     context: typer.Context,
-    cancel: Annotated[str | None, typer.Option(metavar="ID", help="End this one instead, wherever it lives.")] = None,
+    cancel: Annotated[str | None, typer.Option(metavar="ID", help="Cancel this one, in any container.")] = None,
     as_json: Json = False,
 ) -> None:
-    """List the notifications of the whole system: on which occasion what is called, for whom, how often it was.
+    """List the notifications of the system: event, call, owner and counts.
 
     For example: trade notifications --cancel 5c1f09ae37b2.1
     """
@@ -30,7 +30,7 @@ def notifications(
     if as_json:
         out.data(found)
     elif not found:
-        out.say("no notification stands")
+        out.say("there is no notification")
     else:
         columns = (
             "ID",
@@ -64,10 +64,10 @@ def _notification(info: NotificationInfo) -> tuple[str, ...]:
 
 def hooks(
     context: typer.Context,
-    detach: Annotated[str | None, typer.Option(metavar="ID", help="End this one instead, wherever it runs.")] = None,
+    detach: Annotated[str | None, typer.Option(metavar="ID", help="Detach this one, in any container.")] = None,
     as_json: Json = False,
 ) -> None:
-    """List the hooks of the whole system: what is called before or after which services, for whom, how it fares.
+    """List the hooks of the system: target, call, owner, state and counts.
 
     For example: trade hooks --detach 5c1f09ae37b2.h1
     """

@@ -1,4 +1,4 @@
-"""``trade profile``: which services are called how often and how long they take; what is not as usual."""
+"""``trade profile``: shows counts and durations of calls, and deviations from a learned model."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -21,44 +21,44 @@ from trade_gateway.cli.watching._trace import Name
 from trade_gateway.process._atomic_file import replace
 
 _ENOUGH: Final = 20
-"""So often something must have happened before its being rare means anything."""
+"""The least count of an event before its rarity means anything."""
 _RARER: Final = 4.0
-"""So many times rarer than usual deviates."""
+"""How many times rarer than usual counts as a deviation."""
 
 Pair = tuple[str, str]
 
 
 class Model(Struct, forbid_unknown_fields=True):
-    """How often each service was called after each other one."""
+    """A model of call sequences: how often each service was called after each other one."""
 
     v: Literal[1]
     after: dict[str, dict[str, int]]
 
     def share(self, before: str, after: str) -> float:
-        """How much of what came after the one was the other."""
+        """Returns the share of one service among all calls after another."""
         following = self.after.get(before, {})
         return following.get(after, 0) / (sum(following.values()) or 1)
 
     def count(self, before: str) -> int:
-        """How often anything came after it."""
+        """Returns how often any call came after a service."""
         return sum(self.after.get(before, {}).values())
 
 
 class Deviation(Struct, frozen=True, kw_only=True):
-    """A sequence that is not as usual."""
+    """A sequence of two calls that deviates from the model."""
 
     kind: Literal["new", "rarer"]
     before: str
     after: str
     usual: float
-    """Its share in what came after ``before``, from 0 to 1, when that was learned."""
+    """The learned share of ``after`` among the calls after ``before``, from 0 to 1."""
     now: float
     call_id: int
-    """An example: a call of ``after``, or of what came in its place."""
+    """An example: a call of ``after``, or of the service called instead."""
 
 
 def sequences(spans: Iterable[Span]) -> list[list[Span]]:
-    """Calls in order: those of one session that nothing led to, and those that one call made."""
+    """Returns sequences of calls: the top-level calls of each session, and the calls inside each call."""
     known: dict[int, Span] = {}
     for span in spans:
         if span.call_id not in known or span.side == "served":
@@ -76,7 +76,7 @@ def _pairs(spans: Iterable[Span]) -> Iterable[tuple[Pair, int]]:
 
 
 def learn(spans: Iterable[Span]) -> Model:
-    """What was usual."""
+    """Learns a model from calls."""
     return _counted(_pairs(spans))
 
 
@@ -89,7 +89,7 @@ def _counted(pairs: Iterable[tuple[Pair, int]]) -> Model:
 
 
 def deviations(spans: Iterable[Span], usual: Model) -> list[Deviation]:
-    """What never came before, and what comes at most a quarter as often as it did, if both are counted enough."""
+    """Returns sequences that are new, and frequent ones that are now at most a quarter as frequent as usual."""
     pairs = list(_pairs(spans))
     now, example = _counted(pairs), dict(pairs)
     latest = {before: call_id for (before, _), call_id in pairs}
@@ -115,13 +115,13 @@ def deviations(spans: Iterable[Span], usual: Model) -> list[Deviation]:
 
 
 def _much_rarer(usual: Model, now: Model, pair: Pair) -> bool:
-    """If it were as usual, it would have been seen several times by now."""
+    """Whether a sequence is much rarer than usual, with enough calls to tell."""
     was = usual.share(*pair)
     return was * now.count(pair[0]) >= _RARER and now.share(*pair) * _RARER <= was
 
 
 def write(path: Path, model: Model) -> None:
-    """Raises ConfigurationError: it cannot be written."""
+    """Writes a model. Raises ConfigurationError."""
     try:
         replace(path.resolve(), msgspec.json.format(msgspec.json.encode(model), indent=2) + b"\n", 0o644)
     except OSError as problem:
@@ -129,7 +129,7 @@ def write(path: Path, model: Model) -> None:
 
 
 def read(path: Path) -> Model:
-    """Raises ConfigurationError: it cannot be read, or is no such file."""
+    """Reads a model. Raises ConfigurationError."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=Model)
     except (OSError, msgspec.DecodeError) as problem:
@@ -137,7 +137,7 @@ def read(path: Path) -> Model:
 
 
 class Statistics(Struct, frozen=True, kw_only=True):
-    """The calls of one service."""
+    """Statistics of the calls of one service."""
 
     service: str
     calls: int
@@ -150,19 +150,19 @@ class Statistics(Struct, frozen=True, kw_only=True):
 
 def profile(
     context: typer.Context,
-    learn_file: Annotated[Path | None, typer.Option("--learn", help="Write down which call comes after which.")] = None,
-    against: Annotated[Path | None, typer.Option(help="Compare with that; exit code 1: it deviates.")] = None,
+    learn_file: Annotated[Path | None, typer.Option("--learn", help="File to write what is usual to.")] = None,
+    against: Annotated[Path | None, typer.Option(help="File to compare with; exit code 1 if calls deviate.")] = None,
     container: Name = "*",
     as_json: Json = False,
 ) -> None:
-    """Show how often services were called and how long they took, from what was noted since they are traced.
+    """Show how often services were called and how long they took, from traced calls.
 
-    What is learned is, for each service, what the same caller called next. First: trade tracing on
+    --learn records, for each service, what the same caller called next. Run `trade tracing on` first.
 
     For example: trade profile --learn usual.json, and later trade profile --against usual.json
     """
     if learn_file is not None and against is not None:
-        raise UsageError(where="trade profile", problem="either --learn or --against")
+        raise UsageError(where="trade profile", problem="takes only one of --learn and --against")
     usual = None if against is None else read(against)
     out = Output(as_json=as_json)
     with visitor_among_others(context) as member:
@@ -173,9 +173,7 @@ def profile(
     if learn_file is not None:
         model = learn(spans)
         write(learn_file, model)
-        out.say(
-            f"learned what comes after {len(model.after)} services from {len(spans)} notes: {escape(str(learn_file))}"
-        )
+        out.say(f"learned what follows {len(model.after)} services from {len(spans)} spans: {escape(str(learn_file))}")
         if as_json:
             out.data(model)
         return
@@ -186,7 +184,7 @@ def _compare(out: Output, found: Sequence[Deviation]) -> None:
     if out.as_json:
         out.data(found)
     elif not found:
-        out.say("nothing deviates from what was learned")
+        out.say("no call deviates from what was learned")
     else:
         rows = [
             (one.kind, one.before, one.after, f"{one.usual:.1%}", f"{one.now:.1%}", str(one.call_id)) for one in found
@@ -200,7 +198,7 @@ def _show(out: Output, found: Sequence[Statistics]) -> None:
     if out.as_json:
         out.data(found)
     elif not found:
-        out.say("no call has been noted; [bold]trade tracing on[/] has calls noted from now on")
+        out.say("no call was traced; [bold]trade tracing on[/] traces calls from now on")
     else:
         rows = [
             (
@@ -216,7 +214,7 @@ def _show(out: Output, found: Sequence[Statistics]) -> None:
 
 
 def statistics(spans: Iterable[Span]) -> list[Statistics]:
-    """By service, those called most first; of a call that both sides noted, what the serving one did."""
+    """Returns statistics by service, the most called first; spans of the serving side take precedence."""
     calls: dict[int, Span] = {}
     for span in spans:
         if span.call_id not in calls or span.side == "served":
@@ -242,5 +240,5 @@ def _statistics(service: str, noted: Sequence[Span]) -> Statistics:
 
 
 def _rank(ordered: Sequence[float], part: float) -> float:
-    """The least of them that this part of them does not exceed."""
+    """Returns a percentile by the nearest-rank method."""
     return ordered[math.ceil(part * len(ordered)) - 1]

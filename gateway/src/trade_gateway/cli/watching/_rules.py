@@ -1,4 +1,4 @@
-"""``trade rules``: have a system configure itself by a rules file, try one out, see what stands."""
+"""``trade rules``: runs, tests and lists rules, by which a system configures itself."""
 
 import queue
 from pathlib import Path
@@ -19,7 +19,7 @@ from trade_gateway.process._signals import hangups, leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
 
-app = typer.Typer(no_args_is_help=True, help="Rules by which the system configures itself.")
+app = typer.Typer(no_args_is_help=True, help="Run, test and list the rules by which the system configures itself.")
 
 File = Annotated[Path, typer.Argument(metavar="RULES.toml", help="The rules file.")]
 
@@ -28,23 +28,22 @@ File = Annotated[Path, typer.Argument(metavar="RULES.toml", help="The rules file
 def run(
     context: typer.Context,
     file: File,
-    audit: Annotated[Path | None, typer.Option(help="A file that gets a line of JSON for every firing.")] = None,
+    audit: Annotated[Path | None, typer.Option(help="File to write a line of JSON to for every firing.")] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say on each occasion what would be called, and call nothing.")
+        bool, typer.Option("--dry-run", help="Print what each rule would call, and call nothing.")
     ] = False,
-    name: Annotated[str, typer.Option(help="Name of the container; its identity's rights are those of the rules.")] = (
-        "rules"
-    ),
+    name: Annotated[str, typer.Option(help="Name of the container; the rules have its rights.")] = ("rules"),
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Run the rules of a file until told to leave; a line tells of every firing.
+    """Run the rules of a file until Ctrl-C or SIGTERM; print a line for every firing.
 
-    The file is read again when it changes, and on SIGHUP. What is wrong with it is said, and the rules go on as before.
+    The file is read again when it changes, and on SIGHUP.
+    If the new file has an error, it is reported and the rules continue as before.
 
     For example: trade rules run examples/rules.toml --audit rules.jsonl
     """
-    out, told, settings = Output(as_json=as_json), queue.SimpleQueue[Firing](), choice_of(context).settings(name)
+    out, firings, settings = Output(as_json=as_json), queue.SimpleQueue[Firing](), choice_of(context).settings(name)
     if detach:
         detach_now(out, settings)
         return
@@ -52,27 +51,27 @@ def run(
         leaving() as asked_to_leave,
         hangups() as hangup,
         Container(settings) as container,
-        Rules(container, file, audit=audit, dry_run=dry_run, tell=told.put) as rules,
+        Rules(container, file, audit=audit, dry_run=dry_run, tell=firings.put) as rules,
     ):
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade rules run")
         seen = _contents(file)
         _say_ready(out, container, rules)
         while not asked_to_leave.wait(_LOOK_EVERY_S):
-            _say_firings(out, told)
+            _say_firings(out, firings)
             now = _contents(file)
             if now != seen or hangup.is_set():
                 seen = now
                 hangup.clear()
                 _reload(out, rules, file)
-    _say_firings(out, told)
+    _say_firings(out, firings)
     out.say("leaving")
 
 
 def _contents(file: Path) -> bytes | None:
     try:
         return file.read_bytes()
-    except OSError:  # what is wrong with it is said by who reads it
+    except OSError:  # the reload reports the error
         return None
 
 
@@ -84,9 +83,9 @@ def _say_ready(out: Output, container: Container, rules: Rules) -> None:
     out.say("Ctrl-C leaves; the file is read again when it changes")
 
 
-def _say_firings(out: Output, told: "queue.SimpleQueue[Firing]") -> None:
-    while not told.empty():
-        firing = told.get()
+def _say_firings(out: Output, firings: "queue.SimpleQueue[Firing]") -> None:
+    while not firings.empty():
+        firing = firings.get()
         if out.as_json:
             out.data(firing)
             continue
@@ -109,7 +108,7 @@ def _reload(out: Output, rules: Rules, file: Path) -> None:
     try:
         rules.load(file)
     except TradeError as wrong:
-        complain(f"{file} was changed and is wrong; going on as before: {wrong}")
+        complain(f"{file} was changed and has an error; continuing as before: {wrong}")
         return
     out.say(f"read {escape(str(file))} again")
     if out.as_json:
@@ -118,33 +117,33 @@ def _reload(out: Output, rules: Rules, file: Path) -> None:
 
 @app.command("test")
 def test(context: typer.Context, file: File, as_json: Json = False) -> None:
-    """Check a file, and say of each rule when it fires, whether it would now, and what it would call.
+    """Check a rules file, and show when each rule fires and what it would call now.
 
-    Conditions are asked; nothing else is called. Rights are those of who runs this.
+    Only the services of conditions are called, with your own rights.
 
     For example: trade rules test examples/rules.toml
     """
     out, rules = Output(as_json=as_json), read_rules(file)
     with visitor_among_others(context) as container:
-        told = rehearse(container, rules)
+        rehearsals = rehearse(container, rules)
     if as_json:
-        out.data(told)
-    for rehearsal in told:
+        out.data(rehearsals)
+    for rehearsal in rehearsals:
         _say_rehearsal(out, rehearsal)
 
 
-def _say_rehearsal(out: Output, told: DryRun) -> None:
-    fires = "[bold]would fire now[/]" if told.fires else "would not fire now"
-    occasion = f"{told.occasion}, {told.condition}" if told.condition else told.occasion
-    now = f" ({told.now})" if told.now else ""
-    out.say(f"[bold]{told.rule}[/]: {escape(occasion)}: {fires}{escape(now)}")
-    for did in told.steps:
+def _say_rehearsal(out: Output, tried: DryRun) -> None:
+    fires = "[bold]would fire now[/]" if tried.fires else "would not fire now"
+    occasion = f"{tried.occasion}, {tried.condition}" if tried.condition else tried.occasion
+    now = f" ({tried.now})" if tried.now else ""
+    out.say(f"[bold]{tried.rule}[/]: {escape(occasion)}: {fires}{escape(now)}")
+    for did in tried.steps:
         _say_step(out, did)
 
 
 @app.command("list")
 def list_(context: typer.Context, as_json: Json = False) -> None:
-    """List the rules that stand anywhere in the system, and how they fare.
+    """List the rules that run in the system, with their state and counts.
 
     For example: trade rules list --json
     """
@@ -156,11 +155,11 @@ def list_(context: typer.Context, as_json: Json = False) -> None:
         if outcome.ok:
             found += outcome.result
         else:
-            complain(f"{outcome.handle.container} did not tell: {outcome.error}")
+            complain(f"{outcome.handle.container} did not answer: {outcome.error}")
     if as_json:
         out.data(found)
     elif not found:
-        out.say("no rules stand; [bold]trade rules run examples/rules.toml[/] starts some")
+        out.say("no rules run; [bold]trade rules run examples/rules.toml[/] starts some")
     else:
         columns = (
             "RULE",

@@ -1,4 +1,4 @@
-"""``trade top``: how busy a system is now, what is locked in it and what is not well, again and again."""
+"""``trade top``: shows load, locks and unhealthy providers of a system, refreshed periodically."""
 
 import shutil
 import sys
@@ -26,7 +26,7 @@ _ANSWERS_WITHIN_S: Final = 1.0
 
 
 class Unwell(Struct, frozen=True):
-    """A provider that is not well."""
+    """A provider that is not healthy."""
 
     group: str
     container: str
@@ -34,7 +34,7 @@ class Unwell(Struct, frozen=True):
 
 
 class Locked(Struct, frozen=True):
-    """What somebody has for himself."""
+    """A lock, with its owner and purpose."""
 
     resources: tuple[str, ...]
     owner: str
@@ -44,36 +44,36 @@ class Locked(Struct, frozen=True):
 
 
 class Shown(Struct, frozen=True):
-    """A system at one moment; with ``--json`` a line."""
+    """A snapshot of a system; with ``--json`` one line."""
 
     at: float
     system: str
     services: int
     containers: Sequence[LoadInfo]
-    """The busiest first."""
+    """The containers, the busiest first."""
     silent: Sequence[str]
-    """Containers that did not tell within a second."""
+    """Containers that did not answer within 1 s."""
     unwell: Sequence[Unwell]
     locks: Sequence[Locked]
     estops: Sequence[str]
-    """Those that are open: who gave it, and why."""
+    """The open e-stops, each with its giver and reason."""
 
 
 def top(
     context: typer.Context,
-    every: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Seconds between two looks.")] = 2.0,
-    count: Annotated[int | None, typer.Option(min=1, help="End after so many looks; else with Ctrl-C.")] = None,
+    every: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Interval, in seconds.")] = 2.0,
+    count: Annotated[int | None, typer.Option(min=1, help="Number of refreshes; by default until Ctrl-C.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show how busy each container is, what is locked, what is not well, again and again.
+    """Show the load of each container, locks and unhealthy providers, refreshed periodically.
 
-    Rates are means since the look before. In a pipe one look follows the other; with --json each is an object.
+    Rates are averages since the last refresh. With --json, each refresh is an object.
 
     For example: trade top --every 5
     """
     out, looks = Output(as_json=as_json), 0
     with visitor(context) as container, _screen(out) as show:
-        _ask(container)  # rates are told from here on
+        _ask(container)  # rates count from here on
         while count is None or looks < count:
             threading.Event().wait(every)
             show(look(container))
@@ -81,14 +81,14 @@ def top(
 
 
 def look(container: Container) -> Shown:
-    """How the system is now, as this container sees it."""
-    told, silent = _ask(container)
+    """Takes a snapshot of the system, as this container sees it."""
+    loads, silent = _ask(container)
     services = container.services(~where(group="trade") & ~where.local)
     return Shown(
         at=time.time(),
         system=container.settings.system,
         services=len(services),
-        containers=sorted(told, key=lambda info: -info.cpu_percent),
+        containers=sorted(loads, key=lambda info: -info.cpu_percent),
         silent=silent,
         unwell=_unwell(services),
         locks=[
@@ -132,7 +132,7 @@ def _screen(out: Output) -> Generator[Callable[[Shown], None]]:
 
 
 def _lines(shown: Shown, width: int | None) -> list[str]:
-    """The whole screen."""
+    """Returns the lines of the whole screen."""
     counts = [f"{len(shown.containers) + len(shown.silent)} containers", f"{shown.services} services"]
     counts += [f"{len(items)} {word}" for items, word in ((shown.unwell, "not well"), (shown.locks, "locked")) if items]
     lines = [

@@ -1,4 +1,4 @@
-"""``trade tracing`` and ``trade trace``: have calls noted, and see the tree that one belongs to."""
+"""``trade tracing`` and ``trade trace``: switch tracing of calls, and show the tree of a call."""
 
 from collections.abc import Iterator
 from typing import Annotated, Final, Literal
@@ -14,17 +14,17 @@ from trade_gateway.cli._system_choice import visitor_among_others
 
 _LATEST: Final = 20
 
-Name = Annotated[str, typer.Option(help="Only of this container; * and ? stand for anything.")]
+Name = Annotated[str, typer.Option(help="Only this container; * and ? are wildcards.")]
 _Row = tuple[str, str, str, str, str, str]
 
 
 def tracing(
     context: typer.Context,
-    switch: Annotated[Literal["on", "off"], typer.Argument(help="Whether calls are to be noted.")],
+    switch: Annotated[Literal["on", "off"], typer.Argument(help="Whether to trace calls.")],
     container: Name = "*",
     as_json: Json = False,
 ) -> None:
-    """Have containers note the calls they make and serve, or no more. Those that start later: TRADE_TRACE=1.
+    """Switch tracing of calls on or off. For containers that start later, set TRADE_TRACE=1.
 
     For example: trade tracing on
     """
@@ -33,21 +33,21 @@ def tracing(
         own = member.name
         names = [name for name in member.set_tracing(switch == "on", container=container) if name != own]
     if not names:
-        raise UsageError(where=f"--container {container}", problem="there is no such container in this system")
+        raise UsageError(where=f"--container {container}", problem="no such container is in this system")
     if as_json:
         out.data(names)
     for name in names:
-        out.say(f"{'traced' if switch == 'on' else 'not traced any more'}: {name}")
+        out.say(f"{'traced' if switch == 'on' else 'no longer traced'}: {name}")
 
 
 def trace(
     context: typer.Context,
-    call_id: Annotated[int | None, typer.Argument(help="A call; without one, the latest are listed.")] = None,
+    call_id: Annotated[int | None, typer.Argument(help="Id of a call; by default the latest calls are listed.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show the tree of calls that a call belongs to: when, how long, where, for whom, what was noted and logged.
+    """Show the tree of a traced call with times, containers, callers, events and logs.
 
-    Times are by the clocks of the hosts: between hosts they are as good as these agree. First: trade tracing on
+    Times are those of the hosts' clocks, and only as accurate as these agree. Run `trade tracing on` first.
 
     For example: trade trace 2873421361915625477
     """
@@ -65,12 +65,12 @@ def trace(
 
 
 def _list(out: Output, spans: list[Span]) -> None:
-    """The latest that nothing known led to."""
+    """Lists the latest top-level calls."""
     latest = list({span.call_id: span for span in spans if not span.calls}.values())[-_LATEST:]
     if out.as_json:
         out.data(latest)
     elif not latest:
-        out.say("no call has been noted; [bold]trade tracing on[/] has calls noted from now on")
+        out.say("no call was traced; [bold]trade tracing on[/] traces calls from now on")
     else:
         rows = [
             (str(span.call_id), span.service, clock(span.began, ms=True), _ms(span.took_s), span.outcome, span.caller)
@@ -80,7 +80,7 @@ def _list(out: Output, spans: list[Span]) -> None:
 
 
 def _rows(node: Trace, start: float, depth: int) -> Iterator[_Row]:
-    """A line for a call and each thing that happened in it, in the order of time; those of calls within it indented."""
+    """Returns the lines of a call and its events in order of time; inner calls are indented."""
     first = node.spans[0] if node.spans else None
     took = "" if first is None else _ms(first.took_s)
     where = " > ".join(dict.fromkeys(span.container for span in node.spans))
@@ -89,18 +89,18 @@ def _rows(node: Trace, start: float, depth: int) -> Iterator[_Row]:
     yield f"{indent}{node.service}", _ms(node.began - start), took, outcome, where, str(node.call_id)
     inner: list[tuple[float, list[_Row]]] = [(call.began, list(_rows(call, start, depth + 1))) for call in node.calls]
 
-    def told(at: float, text: str) -> None:
+    def add(at: float, text: str) -> None:
         inner.append((at, [(f"{indent}  - {text}", _ms(at - start), "", "", "", "")]))
 
     if (served := node.served) is not None:
         if served.waited_s:
-            told(served.began, f"had waited {_ms(served.waited_s)} for its turn")
+            add(served.began, f"had waited {_ms(served.waited_s)} for its turn")
         for lock in served.locks:
-            told(served.began, f"under the lock: {lock}")
+            add(served.began, f"under the lock: {lock}")
         for after_s, text in served.events:
-            told(served.began + after_s, text)
+            add(served.began + after_s, text)
     for line in node.lines:
-        told(line.at, f"{line.level_name}: {line.text.splitlines()[0]}")
+        add(line.at, f"{line.level_name}: {line.text.splitlines()[0]}")
     for _, rows in sorted(inner, key=lambda one: one[0]):
         yield from rows
 

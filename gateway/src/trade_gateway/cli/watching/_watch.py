@@ -1,4 +1,4 @@
-"""``trade watch``: what becomes of a system: who comes, goes, is not well, locks, stops everything."""
+"""``trade watch``: prints the events of a system: services, health, locks, e-stops."""
 
 import queue
 import threading
@@ -22,9 +22,9 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 
 _EVERY_S: Final = 0.3
-"""What happens to many services of a container within that is one line."""
+"""Events of one container within this time share a line."""
 _ASKED_EVERY_S: Final = 1.0
-"""How often every container is asked for its locks."""
+"""How often every container is asked for its locks, in seconds."""
 _NAMED: Final = 3
 _COLOURS: Final = {"is well": "green", "is not well": "bold red", "e-stop": "bold red", "cleared": "green"}
 
@@ -34,7 +34,7 @@ What = Literal["came", "went", "changed", "is well", "is not well", "locked", "r
 
 
 class Event(Struct, frozen=True):
-    """Something that has become otherwise; with ``--json`` a line."""
+    """A change in the system; with ``--json`` one line."""
 
     at: float
     """``time.time()`` here."""
@@ -43,11 +43,11 @@ class Event(Struct, frozen=True):
     """A service, resources, or an e-stop's id."""
     container: str = ""
     text: str = ""
-    """What is wrong, who has locked it and what for, who gave the e-stop and why."""
+    """The problem, the lock's owner and purpose, or the e-stop's giver and reason."""
 
 
 class _Kind(NamedTuple):
-    """Happenings of one kind make one line."""
+    """Events of one kind, which share a line."""
 
     what: What
     container: str
@@ -56,13 +56,13 @@ class _Kind(NamedTuple):
 
 def watch(
     context: typer.Context,
-    group: Annotated[str | None, typer.Option(help="Only this group and what is beneath it: rosie.head.")] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Also the middleware's own services.")] = False,
+    group: Annotated[str | None, typer.Option(help="Watch only this group and those beneath it: rosie.head.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also watch the middleware's own services.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Tell what happens until Ctrl-C: services come, go, are not well; locks; e-stops.
+    """Print events until Ctrl-C: services that come, go or fail, locks, e-stops.
 
-    Locks and e-stops are looked at every second: one that is shorter may go unseen. With --json each line is an object.
+    Locks and e-stops are polled every second, so shorter ones may be missed. With --json, each line is an object.
 
     For example: trade watch --group rosie
     """
@@ -80,36 +80,36 @@ def watch(
 
 
 class Watched:
-    """What has been seen of a system so far."""
+    """The known state of a system, and its changes."""
 
     def __init__(self, container: Container, meant: Constraint) -> None:
         self._container = container
-        self._told: queue.SimpleQueue[tuple[What, Handle]] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[tuple[What, Handle]] = queue.SimpleQueue()
         here = meant & ~where.local
-        container.joined(here, partial(self._tell, "came"))
-        container.left(here, partial(self._tell, "went"))
-        container.changed(here, partial(self._tell, "changed"))
+        container.joined(here, partial(self._put, "came"))
+        container.left(here, partial(self._put, "went"))
+        container.changed(here, partial(self._put, "changed"))
         known = container.services(here)
         self.services: Final = len(known)
-        """How many there were at the beginning."""
+        """The number of services at the start."""
         self._health = {handle.key: handle.health for handle in known if handle.health != HEALTHY}
         self._meant = meant
         self._locks: dict[tuple[str, str], LockInfo] = {}
         self._estops: dict[str, Estop] = {}
         self._asked_at = -_ASKED_EVERY_S
 
-    def _tell(self, what: What, handle: Handle) -> None:
-        self._told.put((what, handle))
+    def _put(self, what: What, handle: Handle) -> None:
+        self._events.put((what, handle))
 
     def news(self) -> Iterator[Event]:
-        """What has happened since it was asked last. What stands locked or stopped at first is news, too."""
+        """Returns the events since the last call; the first includes existing locks and e-stops."""
         now = time.time()
         with suppress(queue.Empty):
             while True:
-                yield self._of_service(now, *self._told.get_nowait())
+                yield self._of_service(now, *self._events.get_nowait())
         if time.monotonic() - self._asked_at >= _ASKED_EVERY_S:
             self._asked_at = time.monotonic()
-            with suppress(TradeError):  # somebody leaves, or may not tell: the next second will show
+            with suppress(TradeError):  # a container shuts down or refuses; the next poll will show
                 yield from self._of_locks(now)
             yield from self._of_estops(now)
 
@@ -175,5 +175,5 @@ def _some(names: list[str]) -> str:
 
 
 def _new(now: Mapping[_Key, _Value], before: Mapping[_Key, object]) -> list[_Value]:
-    """What was not there before."""
+    """Returns the values with new keys."""
     return [value for key, value in now.items() if key not in before]
