@@ -254,4 +254,4 @@ def test_beyond_this_host_the_live_view_warns_that_everybody_can_look_on(
     showing.json()
     showing.signal(signal.SIGINT)
     assert showing.wait() == 0
-    assert "warning: whoever reaches ws://127.1:" in "".join(showing.errors)
+    assert "warning: every host that reaches ws://127.1:" in "".join(showing.errors)

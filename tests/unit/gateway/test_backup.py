@@ -226,7 +226,7 @@ def test_a_damaged_database_is_kept_as_it_is_and_said(config: Path, state: Path,
 
 def test_a_backup_that_is_there_is_not_overwritten(config: Path, state: Path, out: Path) -> None:
     out.write_text("the last one")
-    with pytest.raises(ConfigurationError, match="is there already"):
+    with pytest.raises(ConfigurationError, match="exists already"):
         back_up(config, out, state)
     assert out.read_text() == "the last one"
     assert back_up(config, out, state, "--force").files
@@ -235,8 +235,11 @@ def test_a_backup_that_is_there_is_not_overwritten(config: Path, state: Path, ou
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda text: text.replace('"policy.toml"', '"../policy.toml"'), r"policy.toml: is not in .*have it there"),
-        (lambda text: text.replace('"pki/issued/door"', '"pki/issued/dor"'), r"dor/ca.pem: is named, and is not there"),
+        (lambda text: text.replace('"policy.toml"', '"../policy.toml"'), r"policy.toml: is not in .*move it there"),
+        (
+            lambda text: text.replace('"pki/issued/door"', '"pki/issued/dor"'),
+            r"dor/ca.pem: is named, but does not exist",
+        ),
         (lambda text: text.replace("system =", "system"), r"gateway.toml: cannot be read"),
         (lambda text: text.replace('"lab"', "3"), r"gateway.toml: cannot be read: .*system"),
     ],

@@ -100,10 +100,10 @@ def test_again_it_writes_only_what_has_become_different(file: Path, root: Path) 
     assert rules(root).stat().st_ino == before[1]
 
 
-@pytest.mark.parametrize("kind", ["changed", "written by somebody else"])
+@pytest.mark.parametrize("kind", ["changed since", "not written by"])
 def test_what_somebody_else_wrote_or_changed_is_overwritten_only_by_force(file: Path, root: Path, kind: str) -> None:
     install(file, root)
-    theirs = rules(root).read_text() + "# mine\n" if kind == "changed" else "# mine\n"
+    theirs = rules(root).read_text() + "# mine\n" if kind == "changed since" else "# mine\n"
     rules(root).write_text(theirs)
     unit(root).unlink()
     with pytest.raises(ConfigurationError, match=rf"60-trade.rules: was {kind}.*--force\. Nothing was written"):
@@ -182,7 +182,7 @@ def test_without_rights_it_says_how_to_get_them(file: Path, root: Path, monkeypa
 
 @pytest.mark.parametrize("words", [("--name", "a/b"), ("--user", "Robot One")], ids=" ".join)
 def test_names_that_systemd_would_not_take_are_refused(file: Path, root: Path, words: tuple[str, str]) -> None:
-    with pytest.raises(ConfigurationError, match="is no such name"):
+    with pytest.raises(ConfigurationError, match="is no valid name"):
         install(file, root, *words)
 
 

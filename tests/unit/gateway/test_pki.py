@@ -344,7 +344,7 @@ def test_of_the_next_certificate_only_what_to_copy_is_told(folder: Path) -> None
 
 def test_the_commands_list_who_there_is(folder: Path) -> None:
     said("init", folder)
-    assert "nobody has an identity yet" in said("list", "--ca", folder).stdout
+    assert "no identity was issued yet" in said("list", "--ca", folder).stdout
     said("issue", "door", "--for", "gateway", "--ca", folder)
     Authority(folder).issue("old", lasts=timedelta(minutes=-1))
     said("issue", "bad", "--host", "bad.example", "--ca", folder)
@@ -365,7 +365,7 @@ def test_the_commands_say_what_is_wrong(folder: Path) -> None:
     said("init", folder)
     said("issue", "door", "--for", "gateway", "--ca", folder)
     assert isinstance(refused("issue", "door", "--for", "container", "--ca", folder), NameTaken)
-    assert "there is container and gateway" in str(refused("issue", "x", "--for", "robot", "--ca", folder))
+    assert "use container or gateway" in str(refused("issue", "x", "--for", "robot", "--ca", folder))
     revoked = said("revoke", "door", "--ca", folder).stdout
     assert str(folder / "revoked.toml") in revoked and "every host" in revoked
     assert isinstance(refused("issue", "door", "--ca", folder), NameRevoked)

@@ -1,7 +1,7 @@
-"""A backup as a file: written in one step, found whole before anything of it counts, put back file by file.
+"""The archive of a backup: written atomically, verified as a whole before use, restored file by file.
 
-It is a compressed tar archive. ``manifest.json`` comes first; then the files, ``config/...`` beside the gateway file
-and ``state/...`` in the folder for state.
+It is a compressed tar archive. Its first member is ``manifest.json``; then follow the files: ``config/...`` for the
+folder of the gateway file and ``state/...`` for the folder for state.
 """
 
 import grp
@@ -30,7 +30,7 @@ __all__ = ["CONFIG", "SQLITE_BESIDE", "STATE", "Entry", "Manifest", "Source", "r
 CONFIG: Final = "config"
 STATE: Final = "state"
 SQLITE_BESIDE: Final = ("-wal", "-shm", "-journal")
-"""The ends of the names of what belongs to a database; with another one's it would be damaged."""
+"""Suffixes of the files of an SQLite database, which would damage another database."""
 _MANIFEST: Final = "manifest.json"
 _LONGEST_MANIFEST: Final = 16 * 1024 * 1024
 _PIECE: Final = 1024 * 1024
@@ -38,17 +38,17 @@ _FOLDER_MODES: Final = {CONFIG: 0o755, STATE: 0o700}
 
 
 class Entry(Struct, frozen=True):
-    """One file."""
+    """One file of the archive."""
 
     path: str
-    """In the archive: ``config/policy.toml``."""
+    """The path in the archive: ``config/policy.toml``."""
     size: int
     sha256: str
     mode: Annotated[int, Meta(ge=0, le=0o777)]
     owner: str
     group: str
     database: bool = False
-    """Whether it is one of SQLite."""
+    """Whether it is an SQLite database."""
 
     @property
     def part(self) -> str:
@@ -56,45 +56,45 @@ class Entry(Struct, frozen=True):
         return self.path.partition("/")[0]
 
     def below(self, folder: Path) -> Path:
-        """Where it belongs, if that is the folder of its part."""
+        """Returns its path below the folder of its part."""
         return folder / self.path.partition("/")[2]
 
 
 class Manifest(Struct, frozen=True):
-    """What a backup says of itself."""
+    """The manifest of a backup."""
 
     format: Annotated[int, Meta(ge=1, le=1)]
     version: str
-    """Of TRADE."""
+    """The version of TRADE."""
     host: str
     made_at: str
     file: str
-    """The gateway file, as its entry has it."""
+    """The path of the gateway file in the archive."""
     files: list[Entry]
 
 
 class Source(NamedTuple):
-    """A file to be backed up."""
+    """A file to back up."""
 
     path: str
-    """In the archive."""
+    """The path in the archive."""
     content: Path
-    """What is to be kept."""
+    """The file with the content to store."""
     status: os.stat_result
-    """Of the file itself: its owner and mode are kept, too."""
+    """The status of the original, whose owner and mode are stored, too."""
     database: bool = False
 
 
 def write_archive(out: Path, sources: Sequence[Source], about: Manifest) -> Manifest:
-    """Write a backup that only this user can read, in one step; returns its manifest.
+    """Writes a backup that only this user can read, atomically; returns its manifest.
 
     Args:
-        out: the file; another one of that name is replaced.
-        sources: its files, which nobody changes meanwhile.
-        about: its manifest, but for the files.
+        out: the file, which is replaced if it exists.
+        sources: the files, which must not change meanwhile.
+        about: the manifest without the files.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the backup cannot be written.
     """
     manifest = msgspec.structs.replace(about, files=[_entry(source) for source in sources])
     text = msgspec.json.format(msgspec.json.encode(manifest))
@@ -115,10 +115,10 @@ def write_archive(out: Path, sources: Sequence[Source], about: Manifest) -> Mani
 
 
 def read_archive(path: Path) -> Manifest:
-    """Look through a whole backup.
+    """Verifies a whole backup.
 
     Raises:
-        ConfigurationError: it is damaged or incomplete, or would put something where it does not belong.
+        ConfigurationError: the backup is damaged or incomplete, or has paths outside its folders.
     """
     with _opened(path) as (archive, manifest):
         names = {entry.path for entry in manifest.files}
@@ -137,22 +137,22 @@ def unpack(
     folders: Mapping[str, Path],
     before: Callable[[Path, Path], None] = lambda _there, _fresh: None,
 ) -> list[str]:
-    """Put the files of a backup in place, each in one step; returns owners that this host does not know.
+    """Restores the files of a backup, each atomically; returns owners that this host does not know.
 
     Args:
-        path: of the backup.
-        manifest: its own, as `read_archive` found it.
-        folders: where to, by part.
-        before: told of each file that is there, and of the one that is about to take its place.
+        path: the backup.
+        manifest: its manifest, from `read_archive`.
+        folders: the target folders by part.
+        before: called with each existing file and its replacement.
 
     Raises:
-        ConfigurationError: it has been changed since it was read.
+        ConfigurationError: the backup has changed since it was read.
         OSError: a file cannot be written.
     """
     unknown = set[str]()
     with _opened(path) as (archive, again):
         if again != manifest:
-            raise _refused(path, "it was changed a moment ago")
+            raise _refused(path, "it was changed while it was read")
         for member, entry in _files(path, archive, manifest):
             target = entry.below(folders[entry.part])
             _make_folder(target.parent, entry, unknown)
@@ -182,7 +182,7 @@ def _make_folder(folder: Path, entry: Entry, unknown: set[str]) -> None:
 
 
 def _give(path: Path, entry: Entry, unknown: set[str]) -> None:
-    """To its owner, which root alone can do."""
+    """Changes the owner, if this process is root."""
     if os.geteuid() == 0:
         try:
             shutil.chown(path, entry.owner, entry.group)
@@ -220,7 +220,7 @@ def _member(path: str, size: int, mode: int) -> tarfile.TarInfo:
 
 @contextmanager
 def _opened(path: Path) -> "Generator[tuple[tarfile.TarFile, Manifest]]":
-    """The archive behind its manifest. What comes up inside of it as damaged is refused as such."""
+    """Opens the archive after its manifest; damage found while it is read raises ConfigurationError."""
     try:
         with tarfile.open(path, "r:gz") as archive:
             first = archive.next()
@@ -243,29 +243,29 @@ def _opened(path: Path) -> "Generator[tuple[tarfile.TarFile, Manifest]]":
 
 
 def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator[tuple[tarfile.TarInfo, Entry]]:
-    """What is behind the manifest. Raises ConfigurationError: it is not what that names."""
+    """Returns the files after the manifest. Raises ConfigurationError if they differ from it."""
     missing = {entry.path: entry for entry in manifest.files}
     for member in itertools.islice(archive, 1, None):
         entry = missing.pop(member.name, None)
         if entry is None:
-            raise _refused(path, f"its manifest does not name {member.name!r}, or only once")
+            raise _refused(path, f"{member.name!r} is not in its manifest, or occurs twice")
         yield member, entry
     if missing:
-        raise _refused(path, f"it lacks {', '.join(missing)}")
+        raise _refused(path, f"{', '.join(missing)} is missing")
 
 
 def _copy(
     path: Path, archive: tarfile.TarFile, member: tarfile.TarInfo, entry: Entry, to: Callable[[bytes], object]
 ) -> None:
-    """Read a file of the archive. Raises ConfigurationError: it is not what the manifest says."""
+    """Reads a file of the archive. Raises ConfigurationError if it differs from the manifest."""
     if not member.isreg() or member.size != entry.size:
-        raise _refused(path, f"{entry.path} is no file of {entry.size} bytes")
+        raise _refused(path, f"{entry.path} is not a file of {entry.size} bytes")
     content, seen = archive.extractfile(member), hashlib.sha256()
     assert content is not None  # noqa: S101 - a regular file
     for piece in _pieces(content, seen.update):
         to(piece)
     if seen.hexdigest() != entry.sha256:
-        raise _refused(path, f"{entry.path} is not what was backed up")
+        raise _refused(path, f"{entry.path} differs from the file that was backed up")
 
 
 def _pieces(content: IO[bytes], see: Callable[[bytes], object]) -> Generator[bytes]:
@@ -280,4 +280,4 @@ def _stays_inside(path: str) -> bool:
 
 
 def _refused(path: Path, why: str) -> ConfigurationError:
-    return ConfigurationError(where=str(path), problem=f"is no backup, or a damaged one: {why}; take another one")
+    return ConfigurationError(where=str(path), problem=f"is no backup, or a damaged one: {why}; use another one")

@@ -1,4 +1,4 @@
-"""``trade backup`` and ``trade restore``: a gateway's configuration, keys and state in one file, and back."""
+"""``trade backup`` and ``trade restore``: save and restore a gateway's configuration, keys and state."""
 
 import os
 import shutil
@@ -35,38 +35,40 @@ from trade_gateway.supervisor._single_instance import held_in
 
 _SQLITE: Final = b"SQLite format 3\0"
 _PATIENCE_S: Final = 10.0
-"""How long a database may be held by somebody else."""
+"""How long another process may lock a database, in seconds."""
 _LOGS: Final = "logs"
 
-Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 
 
 def backup(
     file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file, or a system file.")],
-    archive: Annotated[Path | None, typer.Argument(metavar="OUT.tar.gz", help="Where to.")] = None,
+    archive: Annotated[Path | None, typer.Argument(metavar="OUT.tar.gz", help="The backup to write.")] = None,
     state: Annotated[
-        Path | None, typer.Option(help="The folder for state; /var/lib/trade of a service. \\[env: TRADE_STATE_DIR]")
+        Path | None, typer.Option(help="Folder for state; of a service: /var/lib/trade. \\[env: TRADE_STATE_DIR]")
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only say whether a backup, given alone, is whole.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check that a backup, the only argument, is complete; and exit.")
+    ] = False,
     force: Force = False,
 ) -> None:
-    """Write a gateway file, the files it names, with keys, and the state of its systems into one file.
+    """Back up a gateway file, the files it names, keys and state into one file.
 
-    The gateway may run meanwhile. The file can be read by this user alone: with its keys one can be the gateway.
+    The gateway may run meanwhile. Only this user can read the backup, because it contains the gateway's keys.
 
     For example: trade backup /etc/trade/gateway.toml trade.tar.gz --state /var/lib/trade
     """
     out = Output(as_json=False)
     if check:
         if archive is not None:
-            raise UsageError(where="--check", problem=f"takes the backup alone: trade backup --check {archive}")
+            raise UsageError(where="--check", problem=f"takes only the backup: trade backup --check {archive}")
         with _said(file):
             _say(out, file, read_archive(file))
         return
     if archive is None:
         raise UsageError(where="OUT.tar.gz", problem=f"is missing: trade backup {file} OUT.tar.gz")
     if archive.exists() and not force:
-        raise ConfigurationError(where=str(archive), problem="is there already; choose another name, or say --force")
+        raise ConfigurationError(where=str(archive), problem="exists already; choose another name, or use --force")
     folder = (state or _state_folder()).absolute()
     if archive.absolute().is_relative_to(folder):
         raise ConfigurationError(where=str(archive), problem="is in the folder for state; choose another place")
@@ -79,17 +81,15 @@ def backup(
 
 
 def restore(
-    archive: Annotated[Path, typer.Argument(metavar="OUT.tar.gz", help="A backup.")],
-    to: Annotated[Path, typer.Option(help="The folder for the gateway file and what it names.")] = Path(),
-    state: Annotated[
-        Path | None, typer.Option(help="The folder for state; by default `state` in the other one.")
-    ] = None,
+    archive: Annotated[Path, typer.Argument(metavar="OUT.tar.gz", help="The backup.")],
+    to: Annotated[Path, typer.Option(help="Folder for the gateway file and the files it names.")] = Path(),
+    state: Annotated[Path | None, typer.Option(help="Folder for state. Default: state in the folder of --to.")] = None,
     force: Force = False,
 ) -> None:
-    """Put a backup back: first it is found whole, then each file takes its place in one step.
+    """Restore a backup: verify it as a whole, then replace each file atomically.
 
-    Stop the gateway before: where one of its containers is known to run (one that another host stands in for), nothing
-    is written. As root, files are given back to their owners. Who is revoked in a list that is there stays revoked.
+    Stop the gateway first: nothing is written if one of its containers is known to run (one with a standby).
+    As root, files get their owners back. Identities that an existing list revokes stay revoked.
 
     For example: trade restore trade.tar.gz --to /etc/trade --state /var/lib/trade
     """
@@ -97,11 +97,11 @@ def restore(
     folders = {CONFIG: to, STATE: state or to / STATE}
     with _said(to):
         manifest = read_archive(archive)
-        _check_nobody_runs(manifest, folders[STATE])
+        _check_none_runs(manifest, folders[STATE])
         _check_places(manifest, folders, force=force)
         unknown = unpack(archive, manifest, folders, _keep_revoked)
     for names in unknown:
-        complain(f"there is no {names} on this host; what was theirs is yours now: sudo chown")
+        complain(f"there is no {names} on this host, so their files are yours now; change that with `sudo chown`")
     _say(out, archive, manifest)
     out.say(escape(f"configuration in {folders[CONFIG]}, state in {folders[STATE]}"))
     file = next(entry for entry in manifest.files if entry.path == manifest.file).below(to)
@@ -109,7 +109,7 @@ def restore(
 
 
 def _check_places(manifest: Manifest, folders: dict[str, Path], *, force: bool) -> None:
-    """Raises ConfigurationError: something is there already, or a link leads elsewhere."""
+    """Raises ConfigurationError if a file exists already, or a link leads elsewhere."""
     there: list[str] = []
     for entry in manifest.files:
         folder = folders[entry.part]
@@ -120,33 +120,33 @@ def _check_places(manifest: Manifest, folders: dict[str, Path], *, force: bool) 
         if os.path.lexists(target):
             there.append(str(target))
     if there and not force:
-        problem = "would be overwritten; say --force, or another folder with --to. Nothing was written"
+        problem = "would be overwritten; use --force, or another folder with --to. Nothing was written"
         raise ConfigurationError(where=", ".join(there), problem=problem)
 
 
-def _check_nobody_runs(manifest: Manifest, folder: Path) -> None:
-    """Raises ConfigurationError: a container that a gateway has a lease on runs on that state now."""
+def _check_none_runs(manifest: Manifest, folder: Path) -> None:
+    """Raises ConfigurationError if a container with a gateway's lease uses that state now."""
     systems = {entry.below(Path()).parts[0] for entry in manifest.files if entry.part == STATE}
     for lock in (lock for system in systems for lock in held_in(folder / system)):
-        problem = "is held by a container that runs; stop its gateway first. Nothing was written"
+        problem = "is in use by a running container; stop its gateway first. Nothing was written"
         raise ConfigurationError(where=str(lock), problem=problem)
 
 
 def _keep_revoked(there: Path, fresh: Path) -> None:
-    """Who was revoked since the backup was made stays so."""
+    """Keeps identities revoked that were revoked since the backup."""
     now, then = _revoked(there), _revoked(fresh)
     if now is None or then is None or not now - then:
         return
     names = ", ".join(f'"{name}"' for name in sorted(now | then))
     with fresh.open("w", encoding="utf-8") as file:
-        file.write(f"# Of a backup and of what was there before it.\nrevoked = [{names}]\n")
+        file.write(f"# Merged from a backup and the list that existed before.\nrevoked = [{names}]\n")
         file.flush()
         os.fsync(file.fileno())
     complain(f"{there}: {', '.join(sorted(now - then))} stays revoked, although the backup does not say so")
 
 
 def _revoked(path: Path) -> set[str] | None:
-    """The names in a list of revoked ones; None: it is another file."""
+    """Returns the names in a list of revoked identities; None for another file."""
     try:
         read = read_toml_text(path.read_text(encoding="utf-8"))
     except ValueError:
@@ -165,20 +165,20 @@ def _about(file: Path) -> Manifest:
 
 
 def _config(named: Named, staging: Path) -> Iterator[Source]:
-    """The file and what it names. Raises ConfigurationError: something is not there, or not beside it."""
+    """Returns the file and those that it names. Raises ConfigurationError if one is missing or elsewhere."""
     folder = named.files[0].parent
     for one in named.files:
         if not one.is_relative_to(folder):
-            problem = f"is not in {folder}, so a backup could not be put back elsewhere; have it there"
+            problem = f"is not in {folder}, so a backup could not be restored elsewhere; move it there"
             raise ConfigurationError(where=str(one), problem=problem)
         try:
             yield Source(f"{CONFIG}/{one.relative_to(folder).as_posix()}", _copied(one, staging), one.stat())
         except FileNotFoundError:
-            raise ConfigurationError(where=str(one), problem="is named, and is not there") from None
+            raise ConfigurationError(where=str(one), problem="is named, but does not exist") from None
 
 
 def _states(named: Named, folder: Path, staging: Path) -> Iterator[Source]:
-    """What is kept of its systems, but for logs."""
+    """Returns the state of its systems, without logs."""
     for system in named.systems:
         for path in sorted((folder / system).rglob("*")):
             inside = path.relative_to(folder)
@@ -186,7 +186,7 @@ def _states(named: Named, folder: Path, staging: Path) -> Iterator[Source]:
                 continue
             try:
                 yield _state(path, f"{STATE}/{inside.as_posix()}", staging)
-            except FileNotFoundError:  # it has gone meanwhile, as it may
+            except FileNotFoundError:  # it was removed meanwhile
                 continue
 
 
@@ -228,7 +228,7 @@ def _fresh(staging: Path) -> Path:
 
 
 def _state_folder() -> Path:
-    """Where the state of this user's containers is. Raises ConfigurationError."""
+    """Returns the folder for state of this user's containers. Raises UsageError."""
     kept = {name: os.environ[name] for name in os.environ if name == "TRADE_STATE_DIR" or name[:6] != "TRADE_"}
     folder = Settings.read(system="any", environment=kept).state_dir
     if folder is None:
@@ -238,24 +238,24 @@ def _state_folder() -> Path:
 
 @contextmanager
 def _staging(archive: Path) -> Generator[Path]:
-    """A folder of this user's alone beside the backup, where there is room for it."""
+    """Makes a private folder beside the backup, on the disk with room for it."""
     with tempfile.TemporaryDirectory(prefix=".trade-backup-", dir=archive.absolute().parent) as folder:
         yield Path(folder)
 
 
 @contextmanager
 def _said(about: Path) -> Generator[None]:
-    """What the disk refuses is a ConfigurationError."""
+    """Turns an OSError into a ConfigurationError."""
     try:
         yield
     except OSError as bad:
         where = str(bad.filename or about)
-        raise ConfigurationError(where=where, problem=f"{bad.strerror or bad}; see who may read and write it") from None
+        raise ConfigurationError(where=where, problem=f"{bad.strerror or bad}; check its permissions") from None
 
 
 def _say(out: Output, archive: Path, manifest: Manifest) -> None:
     counts = {part: sum(entry.part == part for entry in manifest.files) for part in (CONFIG, STATE)}
     out.say(
-        f"{escape(str(archive))} is whole: TRADE {manifest.version} on {escape(manifest.host)}, {manifest.made_at}; "
+        f"{escape(str(archive))} is complete: TRADE {manifest.version} on {escape(manifest.host)}, {manifest.made_at}; "
         f"{counts[CONFIG]} files of the configuration, {counts[STATE]} of state"
     )

@@ -1,4 +1,4 @@
-"""``trade conformance --peer COMMAND``: does a container in another language keep the rules?"""
+"""``trade conformance --peer COMMAND``: tests whether a container in another language keeps the protocol's rules."""
 
 import signal
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ _COLOURS = {OK: "green", FAILED: "bold red", LEFT_OUT: "yellow"}
 
 def conformance(
     peer: Annotated[
-        str | None, typer.Option(metavar="COMMAND", help="Starts the container to be checked; words as in a shell.")
+        str | None, typer.Option(metavar="COMMAND", help="Command that starts the container to check.")
     ] = None,
-    only: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="Only this check; again for another.")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="Run only this check. Repeatable.")] = None,
     motion: Annotated[
-        bool, typer.Option("--motion", help="Also turn the arm, by up to 30 rad: only where nothing real can move.")
+        bool, typer.Option("--motion", help="Also turn the arm by up to 30 rad; only where nothing real can move.")
     ] = False,
-    listed: Annotated[bool, typer.Option("--list", help="Only say which checks there are.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the checks and exit.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Start a container written in whatever language, and check from outside that it keeps the rules.
+    """Start a container written in any language, and check that it keeps the protocol's rules.
 
-    It runs in a system of its own on this host and is told by the environment where that is; docs/wire-protocol.md says
-    which services it offers for this. Nothing moves without --motion, and most checks of safety need it. The exit code
-    is 1 if a check fails.
+    It runs on this host in its own system, whose settings it gets in the environment.
+    docs/wire-protocol.md lists the services that it must offer. Nothing moves without --motion.
+    Most safety checks need --motion. The exit code is 1 if a check fails.
 
     For example: trade conformance --peer peers/rust/target/debug/trade-peer --motion
     """
@@ -42,8 +42,8 @@ def conformance(
         raise UsageError(
             where="--peer", problem="missing; name the command that starts a container, or --list the checks"
         )
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind
-    outcomes = run(peer, _chosen(only or [], motion=motion), lambda outcome: _tell(out, outcome), motion=motion)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind
+    outcomes = run(peer, _chosen(only or [], motion=motion), lambda outcome: _print(out, outcome), motion=motion)
     failed = [outcome.check for outcome in outcomes if outcome.outcome == FAILED]
     if failed:
         out.say(f"[bold red]failed[/]: {len(failed)} of {len(outcomes)}: {escape(', '.join(failed))}")
@@ -51,11 +51,11 @@ def conformance(
     left_out = [outcome.check for outcome in outcomes if outcome.outcome == LEFT_OUT]
     out.say(f"[bold green]passed[/]: {len(outcomes) - len(left_out)} checks, {len(left_out)} left out")
     if not motion and left_out:
-        out.say("[yellow]nothing is known of its stops and locks[/]: checks of motion need --motion")
+        out.say("[yellow]its stops and locks were not checked[/]: checks of motion need --motion")
 
 
 def _chosen(names: Sequence[str], *, motion: bool) -> list[Check]:
-    """The checks asked for, in the order of the table. Raises UsageError."""
+    """Returns the requested checks in the order of the table. Raises UsageError."""
     checks = chosen(CHECKS, names, "check")
     if names and not motion and (moving := [one.name for one in checks if not one.still]):
         problem = "is a check of motion; add --motion where the arm may turn"
@@ -71,7 +71,7 @@ def _list(out: Output) -> None:
     out.table(("CHECK", "RULE", "MOTION", "WHAT"), rows)
 
 
-def _tell(out: Output, outcome: Outcome) -> None:
+def _print(out: Output, outcome: Outcome) -> None:
     if out.as_json:
         out.data(outcome)
         return

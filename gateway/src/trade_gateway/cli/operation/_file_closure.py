@@ -1,4 +1,4 @@
-"""Which files a gateway file or a system file names, with those that they name in turn."""
+"""Finds the files that a gateway file or a system file names, directly and indirectly."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -19,18 +19,18 @@ _Table = TypeVar("_Table", bound=Struct)
 
 
 class Named(NamedTuple):
-    """What is named, as absolute paths, without asking whether it is there."""
+    """The named files and folders as absolute paths; they need not exist."""
 
     files: tuple[Path, ...]
-    """The file itself first."""
+    """All files, beginning with the file itself."""
     robots: tuple[Path, ...]
-    """Those of them that are robot files."""
+    """The robot files among them."""
     records: tuple[Path, ...]
-    """Folders for the record of what happens."""
+    """Folders of audit records."""
     systems: tuple[str, ...]
-    """The ids of the systems that it is about, its own first."""
+    """The ids of its systems, its own first."""
     containers: int
-    """How many containers of this host there are besides the gateway."""
+    """The number of containers on this host besides the gateway."""
 
 
 class _Door(Struct):
@@ -39,7 +39,7 @@ class _Door(Struct):
 
 
 class _Part(Struct, kw_only=True):
-    """A table that may name files; what else it says is for others to check."""
+    """A table that may name files; its other keys are not checked here."""
 
     tls: str = ""
     policy: str = ""
@@ -51,7 +51,7 @@ class _Part(Struct, kw_only=True):
     host: str = _LOCAL
 
     def files(self, folder: Path) -> Iterator[Path]:
-        """The files of this host that it names itself."""
+        """Returns the files of this host that it names directly."""
         door = self.door or _Door()
         for name in (self.robot, self.rules, door.tokens):
             if name:
@@ -85,10 +85,10 @@ class _Policy(Struct):
 
 
 def named_files(path: Path) -> Named:
-    """Look through a gateway file or a system file.
+    """Reads a gateway file or a system file, and the files that it names.
 
     Raises:
-        ConfigurationError: it, or a policy that it names, cannot be read.
+        ConfigurationError: the file, or a policy that it names, cannot be read.
     """
     path = path.absolute()
     file = _read(path, _File)
@@ -119,5 +119,5 @@ def _read(path: Path, kind: type[_Table]) -> _Table:
         return msgspec.convert(raw, kind)
     except FileNotFoundError:
         raise ConfigurationError(where=str(path), problem="there is no such file") from None
-    except (OSError, ValueError) as bad:  # what is no TOML, no UTF-8 or of another shape is a ValueError
+    except (OSError, ValueError) as bad:  # ValueError: no TOML, no UTF-8, or of another shape
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None

@@ -1,4 +1,4 @@
-"""``trade install GATEWAY.toml``: have the system start a gateway, and know its serial adapters."""
+"""``trade install GATEWAY.toml``: writes a systemd unit for a gateway, and udev rules for serial adapters."""
 
 import hashlib
 import os
@@ -33,23 +33,23 @@ _USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 
 def install(
     file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file.")],
-    user: Annotated[str, typer.Option(help="The user it will run as.")] = "trade",
-    name: Annotated[str, typer.Option(help="The name of the service.")] = "trade-gateway",
-    root: Annotated[Path, typer.Option(help="The folder that is / on the computer that this is for.")] = Path("/"),
-    show: Annotated[bool, typer.Option("--print", help="Only say what would be written.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite also what somebody changed, or wrote.")] = False,
+    user: Annotated[str, typer.Option(help="User that the service runs as.")] = "trade",
+    name: Annotated[str, typer.Option(help="Name of the service.")] = "trade-gateway",
+    root: Annotated[Path, typer.Option(help="Root folder of the target computer.")] = Path("/"),
+    show: Annotated[bool, typer.Option("--print", help="Print the files and exit.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Also overwrite files with other changes.")] = False,
 ) -> None:
-    """Write a unit for systemd that keeps a gateway up, and udev rules for serial adapters; start nothing.
+    """Write a systemd unit that runs a gateway, and udev rules for serial adapters. Start nothing.
 
-    The unit lets the gateway do what its file and robot files need, and no more. Changes of your own belong into
-    NAME.service.d/*.conf. Again after a change of these files: `trade install` writes what has become different.
+    The unit gives the gateway only the rights that its file and robot files need.
+    Put your own changes into NAME.service.d/*.conf. Run this again after a change of the gateway or robot files.
 
     For example: sudo trade install /etc/trade/gateway.toml
     For another computer: trade install image/etc/trade/gateway.toml --root image
     """
     for given, form, option in ((name, _NAME, "--name"), (user, _USER, "--user")):
         if not form.fullmatch(given):
-            raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
+            raise UsageError(where=f"{option} {given}", problem="is no valid name; use letters, digits, _ and -")
     _require_there(file, root)
     plan = read_gateway_file(file)
     if root == Path("/"):
@@ -59,35 +59,35 @@ def install(
     texts = {path: _marked(body) for path, body in bodies.items()}
     if show:
         for path, text in texts.items():
-            print(f"# {path}\n{text}")  # noqa: T201 - as it stands, for other programs
+            print(f"# {path}\n{text}")  # noqa: T201 - unchanged, for other programs
         return
     out = Output(as_json=False)
     fresh = [path for path, text in texts.items() if _is_to_be_written(path, text, force=force)]
     for path, text in texts.items():
         if path in fresh:
             _write(path, text)
-        out.say(escape(f"{'wrote' if path in fresh else 'as it should be:'} {path}"))
+        out.say(escape(f"{'wrote' if path in fresh else 'is up to date:'} {path}"))
     for doubt in _doubts(named, user, root):
         out.say(f"[yellow]warning[/]  {escape(doubt)}")
     _say_next(out, user, name, named.records)
 
 
 def _require_there(file: Path, root: Path) -> None:
-    """Raises UsageError: the file is named as the other computer will see it, and lies in its folder."""
+    """Raises UsageError if the file is named as the target computer sees it."""
     there = root / str(file).lstrip("/")
     if not file.exists() and there.exists():
-        raise UsageError(where=str(file), problem=f"there is none on this computer; did you mean {there}?")
+        raise UsageError(where=str(file), problem=f"does not exist on this computer; did you mean {there}?")
 
 
 def _doubts(named: Named, user: str, root: Path) -> Iterable[str]:
-    """What the service may not find, or not for long."""
+    """Returns warnings about files that the service may not find, or not permanently."""
     for what, path in (("the Python", Path(sys.executable)), *(("file", one) for one in named.files)):
         seen = _seen(path, root)
         if (hidden := hidden_in(seen)) is not None:
-            why = f"user {user} may not be let in there, and what is temporary goes; /opt and /etc are places that last"
+            why = f"user {user} may have no access, and temporary files are removed; use /opt and /etc instead"
             yield f"{what} {seen} lies in {hidden}: {why}"
         elif checkout := next((one for one in path.parents if (one / ".git").exists()), None):
-            yield f"{what} {seen} lies in the checkout {checkout}: a change of it changes the service"
+            yield f"{what} {seen} lies in the checkout {checkout}: a change there changes the service"
     yield from _closed_to(user, named.files) if root == Path("/") else ()
     for port in needs_of(map(load, named.robots)).devices:
         if (hidden := hidden_in(Path(port))) is not None:
@@ -95,30 +95,30 @@ def _doubts(named: Named, user: str, root: Path) -> Iterable[str]:
 
 
 def _closed_to(user: str, files: Sequence[Path]) -> Iterable[str]:
-    """What beside the gateway file, or above it there, is in the way of a user who is to read it all; each once."""
+    """Returns each file or folder at the gateway file that the service's user cannot read or enter."""
     try:
         known = pwd.getpwnam(user)
-    except KeyError:  # to be made yet, which is said
+    except KeyError:  # not created yet, which the next steps say
         return
     groups, own = os.getgrouplist(user, known.pw_gid), files[0].parent
     beside = (path for file in files for path in (*reversed(file.parents), file) if path.is_relative_to(own))
     for path in dict.fromkeys(beside):
         with suppress(OSError):
             if not _may(path.stat(), known.pw_uid, groups, is_folder=path.is_dir()):
-                deed, mode = ("enter", "0750") if path.is_dir() else ("read", "0640")
+                action, mode = ("enter", "0750") if path.is_dir() else ("read", "0640")
                 named = shlex.quote(str(path))
                 remedy = f"sudo chgrp {known.pw_gid} {named} && sudo chmod {mode} {named}"
-                yield f"user {user} cannot {deed} {path}, so the service will not start: {remedy}"
+                yield f"user {user} cannot {action} {path}, so the service will not start: {remedy}"
 
 
 def _may(path: os.stat_result, uid: int, groups: Sequence[int], *, is_folder: bool) -> bool:
-    """Whether that user may enter a folder, or read a file."""
+    """Whether a user may enter a folder, or read a file."""
     shift = 6 if path.st_uid == uid else 3 if path.st_gid in groups else 0
     return bool(path.st_mode >> shift & (0o1 if is_folder else 0o4))
 
 
 def _seen(path: Path, root: Path) -> Path:
-    """A path as the computer sees it whose / is that folder."""
+    """Returns a path as the computer with that root folder sees it."""
     above = Path(os.path.normpath(root.absolute()))
     return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
 
@@ -143,7 +143,7 @@ def _marked(text: str) -> str:
 
 
 def _is_to_be_written(path: Path, text: str, *, force: bool) -> bool:
-    """Raises ConfigurationError: there is one that is not ours to overwrite."""
+    """Whether a file is to be written. Raises ConfigurationError if it has changes of others."""
     try:
         found = path.read_bytes().decode(errors="replace")
     except FileNotFoundError:
@@ -153,8 +153,8 @@ def _is_to_be_written(path: Path, text: str, *, force: bool) -> bool:
     mark = _MARK.match(found)
     ours = mark is not None and _marked(found[mark.end() :]) == found
     if found != text and not ours and not force:
-        problem = "was changed by somebody" if mark else "was written by somebody else"
-        remedy = "move it away, or put your changes into a .d folder beside it and say --force. Nothing was written"
+        problem = "was changed since" if mark else "was not written by `trade install`"
+        remedy = "move it away, or put your changes into a .d folder beside it and use --force. Nothing was written"
         raise ConfigurationError(where=str(path), problem=f"{problem}; {remedy}")
     return found != text
 
@@ -165,7 +165,7 @@ def _write(path: Path, text: str) -> None:
         replace(path, text.encode(), 0o644)
     except PermissionError:
         again = shlex.join([sys.executable, "-m", "trade_gateway", *sys.argv[1:]])
-        raise ConfigurationError(where=str(path), problem=f"takes the rights of root: sudo {again}") from None
+        raise ConfigurationError(where=str(path), problem=f"needs the rights of root: sudo {again}") from None
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be written: {bad.strerror}") from None
 

@@ -1,4 +1,4 @@
-"""What `trade install` writes: a unit for systemd that may do no more than its gateway needs, and udev rules."""
+"""The files of `trade install`: a systemd unit with only the rights that its gateway needs, and udev rules."""
 
 import re
 import sys
@@ -16,22 +16,22 @@ _COMES_AND_GOES: Final = re.compile(r"/dev/(serial/|tty(USB|ACM)\d)")
 _HIDDEN: Final = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108 - what the unit hides
 _STATE: Final = Path("/var/lib/trade")
 _LEAVES_S: Final = 35
-"""How long the gateway, and each of its containers, may take to leave: a robot is brought to rest, states are saved."""
+"""How long the gateway and each container may take to shut down, in seconds: to stop a robot and save states."""
 
 
 class Needs(Struct, frozen=True):
-    """What of the host a gateway and its robots need."""
+    """The resources of the host that a gateway and its robots need."""
 
     serial: bool = False
-    """Whether there are serial ports."""
+    """Whether they need serial ports."""
     devices: tuple[str, ...] = ()
-    """As DeviceAllow= names them."""
+    """Devices as in DeviceAllow=."""
     can: bool = False
-    """Whether there are CAN interfaces of the kernel."""
+    """Whether they need CAN interfaces of the kernel."""
 
 
 def needs_of(robots: Iterable[Robot]) -> Needs:
-    """What robot files name. A camera or sensor is known by the options that begin with ``/dev/``."""
+    """Returns the needs of robot files. Options of cameras and sensors that begin with ``/dev/`` are devices."""
     ports, others, can = set[str](), set[str](), False
     for robot in robots:
         for bus in robot.buses:
@@ -48,14 +48,14 @@ def needs_of(robots: Iterable[Robot]) -> Needs:
             others |= {
                 value for value in sense.options.values() if isinstance(value, str) and value.startswith("/dev/")
             }
-    # One that is plugged in again may have another number, so all of its kind are allowed.
+    # An adapter may get another number when it is plugged in again, so its whole kind is allowed.
     kinds = ("char-ttyUSB", "char-ttyACM") if ports else ()
     fixed = {port for port in ports if not _COMES_AND_GOES.match(port)}
     return Needs(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can)
 
 
 def program_folders() -> list[Path]:
-    """Where the Python that runs now, and what it imports, lies."""
+    """Returns the folders of the running Python and of its imports."""
     return [Path(sys.prefix), Path(sys.base_prefix), *(Path(one) for one in sys.path if Path(one).is_dir())]
 
 
@@ -69,16 +69,16 @@ def unit_text(
     folders: Iterable[Path],
     records: Iterable[Path],
 ) -> str:
-    """A unit for ``trade gateway``.
+    """Returns the text of a unit for ``trade gateway``.
 
     Args:
         gateway: the gateway file, as an absolute path.
         user: the user it runs as.
-        needs: of its robots.
-        containers: how many it looks after.
-        program: the command that is ``trade``, with an absolute path.
-        folders: what has to be readable, as absolute paths.
-        records: what has to be writable besides its folder for state, as absolute paths.
+        needs: what its robots need.
+        containers: how many containers it supervises.
+        program: the command ``trade``, with an absolute path.
+        folders: folders that must be readable, as absolute paths.
+        records: folders that must be writable besides its folder for state, as absolute paths.
     """
     shown = _outermost(filter(_is_hidden, folders))
     written = [folder for folder in _outermost(records) if not folder.is_relative_to(_STATE)]
@@ -108,7 +108,7 @@ def _devices(needs: Needs) -> str:
 
 
 def hidden_in(path: Path) -> Path | None:
-    """Which folder that the unit hides from the service a path lies in."""
+    """Returns the folder around a path that the unit hides from the service, or None."""
     return next((hidden for hidden in _HIDDEN if path.is_relative_to(hidden)), None)
 
 
@@ -125,7 +125,7 @@ def _outermost(folders: Iterable[Path]) -> list[Path]:
 
 
 def _quoted(word: str) -> str:
-    """One word of a list."""
+    """Quotes one word of a list."""
     escaped = _plain(word).replace("\\", "\\\\").replace('"', '\\"')
     return escaped if re.fullmatch(r"[\w@%+=:,./-]+", escaped) else f'"{escaped}"'
 
@@ -139,17 +139,17 @@ _UNIT: Final = """\
 Description=TRADE gateway of @FILE@
 Wants=network-online.target
 After=network-online.target time-sync.target
-# A network or an adapter that comes late is waited for, however long.
+# Wait without limit for a late network or adapter.
 StartLimitIntervalSec=0
 
 [Service]
 Type=notify
 ExecStart=@COMMAND@
 ExecReload=/bin/kill -HUP $MAINPID
-# The gateway alone is told first: it has its containers leave in their order, each robot as its file says.
+# Only the gateway gets the first signal: it shuts its containers down in order, each robot as its file says.
 ExecStop=-/bin/sh -c 'kill -TERM "$MAINPID" && exec tail --pid="$MAINPID" -f /dev/null'
-# What is left then, or if the gateway itself dies or hangs, is told to leave at once, and killed after this time only:
-# motors without a watchdog of their own would go on with what they were told last.
+# Processes that remain, or all if the gateway dies or hangs, get SIGTERM at once, and SIGKILL only after this time:
+# motors without their own watchdog would continue with their last command.
 KillMode=control-group
 TimeoutStopSec=@LEAVES@
 WatchdogSec=30
@@ -192,22 +192,22 @@ SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
 SystemCallErrorNumber=EPERM
 # Not restricted, and why:
-# PrivateNetwork, IPAddressDeny: it carries calls between networks; who may call what is for its policy to say.
+# PrivateNetwork, IPAddressDeny: it forwards calls between networks; its policy restricts them.
 # AF_NETLINK: the transport asks the kernel for the addresses of its interfaces.
 # ProcSubset: `trade containers --load` reads the load and the memory of the host in /proc.
-# RootDirectory: it runs the Python it was installed with, and reads the files that its gateway file names.
+# RootDirectory: it runs the installed Python, and reads the files that its gateway file names.
 
 [Install]
 WantedBy=multi-user.target
 """
 
 UDEV_RULES: Final = """\
-# Their names that stay the same, /dev/serial/by-id/..., are made by the rules of the system.
+# The system's own rules make the lasting names /dev/serial/by-id/...
 ACTION=="remove", GOTO="trade_end"
-# Serial adapters are for the group dialout; ModemManager would ask what is behind them whether it is a modem.
+# Serial adapters belong to the group dialout; ModemManager, which probes them for modems, must ignore them.
 SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*|ttyACM[0-9]*", GROUP="dialout", MODE="0660"
 SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*|ttyACM[0-9]*", ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"
-# FTDI's adapters sit on what has come for 16 ms unless told otherwise, and a cycle of a bus takes as long.
+# FTDI adapters delay received bytes by 16 ms by default, and a bus cycle takes as long.
 SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
 LABEL="trade_end"
 """

@@ -1,4 +1,4 @@
-"""``trade export``: a recording as a dataset of episodes that learning programs read."""
+"""``trade export``: writes a recording as a dataset of episodes for machine learning."""
 
 from enum import Enum
 from pathlib import Path
@@ -15,7 +15,7 @@ from trade_gateway.recording import require
 
 
 class Cut(str, Enum):
-    """What one episode is."""
+    """How a recording is cut into episodes."""
 
     WHOLE = "whole"
     LOCKS = "locks"
@@ -23,22 +23,22 @@ class Cut(str, Enum):
 
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A recording.")],
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to make the dataset: new, or empty.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty folder for the dataset.")],
     group: Annotated[
-        list[str] | None, typer.Option(help="Only these joints or this arm; repeatable. Default: all there are.")
+        list[str] | None, typer.Option(help="Export only these joints or this arm. Repeatable. Default: all.")
     ] = None,
-    fps: Annotated[int, typer.Option(min=1, max=1000, help="Frames a second.")] = 30,
+    fps: Annotated[int, typer.Option(min=1, max=1000, help="Frame rate, in Hz.")] = 30,
     cut: Annotated[
-        Cut, typer.Option("--episodes", help="whole: the recording is one; locks: each time somebody had the joints.")
+        Cut, typer.Option("--episodes", help="whole: one episode; locks: one per lock of the joints.")
     ] = Cut.WHOLE,
     task: Annotated[
-        str | None, typer.Option(help="What is done, in words. Default: the purpose of the lock, or the file's name.")
+        str | None, typer.Option(help="Description of the task. Default: the lock's purpose, or the file's name.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the joints of a recording as a LeRobot dataset (v3.0): tables in Parquet, without pictures.
+    """Export the joints of a recording as a LeRobot dataset (v3.0): Parquet tables, without pictures.
 
-    observation.state is what was measured, in rad; action is what was measured one frame later.
+    observation.state is the measured position in rad; action is the position measured one frame later.
 
     For example: trade export walk.mcap walk/ --group rosie.legs --episodes locks --fps 30
     """

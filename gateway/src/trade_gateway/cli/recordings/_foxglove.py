@@ -1,4 +1,4 @@
-"""``trade foxglove``: show live what ``trade record`` would write, over the Foxglove WebSocket protocol."""
+"""``trade foxglove``: shows live what ``trade record`` would write, over the Foxglove WebSocket protocol."""
 
 import time
 from typing import TYPE_CHECKING, Annotated
@@ -23,15 +23,17 @@ def foxglove(
     context: typer.Context,
     group: Groups = None,
     services: Readers = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Where viewers connect to; 0 takes a free one.")] = 8765,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port that viewers connect to; 0 takes a free one.")
+    ] = 8765,
     host: Annotated[
-        str, typer.Option(help="Another address of this host lets everybody look on who reaches it: there is no login.")
+        str, typer.Option(help="Address to listen on. There is no login: any host that reaches it can view.")
     ] = "127.0.0.1",
     as_json: Json = False,
 ) -> None:
-    """Show joints, cameras, calls, locks and faults live in Foxglove, until Ctrl-C.
+    """Show joints, cameras, calls, locks and faults live in Foxglove until Ctrl-C.
 
-    Viewers can only look on: nothing comes in from them. One that is slow misses messages, and slows nobody down.
+    Viewers are read-only. A slow viewer misses messages and delays nothing.
 
     For example: trade foxglove --group rosie, and then open ws://localhost:8765 in Foxglove
     """
@@ -46,21 +48,19 @@ def foxglove(
         Recorder(container, wanted, ending) as recorder,
     ):
         if not is_loopback(host):
-            complain(
-                f"whoever reaches {live.url} sees all of this: the protocol has no login, and nothing is encrypted"
-            )
+            complain(f"every host that reaches {live.url} sees all data: the protocol has no login and no encryption")
         _show(out, live, recorder)
 
 
 def _show(out: Output, live: "Live", recorder: Recorder) -> None:
-    telling = _Telling(out, live, recorder)
-    telling.begin()
-    recorder.run(live, None, telling.beat)
-    telling.end()
+    progress = _Progress(out, live, recorder)
+    progress.begin()
+    recorder.run(live, None, progress.beat)
+    progress.end()
 
 
-class _Telling:
-    """What is said meanwhile."""
+class _Progress:
+    """Output while the data is shown."""
 
     def __init__(self, out: Output, live: "Live", recorder: Recorder) -> None:
         self._out = out
@@ -70,31 +70,31 @@ class _Telling:
         self._refused = ""
 
     def begin(self) -> None:
-        """Where to look, and what there is to be seen."""
+        """Prints the address and the services that are shown."""
         services = self._recorder.look()
         if self._out.as_json:
             self._out.data({"url": self._live.url, "services": services})
             return
-        named = ", ".join(services) or "nothing yet that has joints or pictures"
+        named = ", ".join(services) or "no service with joints or pictures yet"
         self._out.say(f"[bold green]live[/] at {self._live.url}: {escape(named)}; Ctrl-C ends")
-        self._out.say("there is no login: every program and every web page open on this computer can look on")
+        self._out.say("there is no login: every program and every open web page on this computer can view it")
 
     def beat(self) -> None:
-        """What is to be complained of, and a line a second for programs."""
+        """Prints warnings, and one line per second for programs."""
         self._live.greet()
         for notice in self._live.notices():
             complain(notice)
         if self._recorder.refused not in ("", self._refused):
             self._refused = self._recorder.refused
-            complain(f"not all is shown: {self._refused}")
+            complain(f"some data is not shown: {self._refused}")
         if self._out.as_json:
             self._out.data(self._sums())
 
     def end(self) -> None:
-        """What there was."""
+        """Prints the totals."""
         sums = self._sums()
         if not self._out.as_json:
-            lost = f", {sums['dropped']} samples lost on the way here" if sums["dropped"] else ""
+            lost = f", {sums['dropped']} samples lost before they arrived here" if sums["dropped"] else ""
             self._out.say(f"[bold]shown[/]: {sums['messages']} messages in {sums['seconds']:.0f} s{lost}")
 
     def _sums(self) -> dict[str, float]:

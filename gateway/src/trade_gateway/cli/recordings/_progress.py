@@ -1,4 +1,4 @@
-"""A recording as the command line makes it: where to, and what is said meanwhile."""
+"""Makes a recording for the command line, with output of its progress."""
 
 import sys
 import time
@@ -27,25 +27,25 @@ def to_file(
     attachments: Sequence[Attachment],
     seconds: float | None,
 ) -> None:
-    """Record to one file, until it is asked to end.
+    """Records to one file until it is asked to end.
 
     Raises:
-        ConfigurationError: it cannot be made, or the disk is full; then it is readable so far.
+        ConfigurationError: the file cannot be made, or the disk is full; the file is then readable so far.
     """
-    telling, file = _Telling(out), RecordingFile(path, about, attachments)
+    progress, file = _Progress(out), RecordingFile(path, about, attachments)
 
     def beat() -> None:
         file.flush()
-        telling.beat(recorder, file.size_bytes)
+        progress.beat(recorder, file.size_bytes)
 
     try:
         with file:
-            telling.begin(recorder, file.path)
+            progress.begin(recorder, file.path)
             recorder.run(file, seconds, beat)
     except OSError as bad:
         problem = f"{bad.strerror}; the file ends here and is readable, with {file.size_bytes / _MB:.1f} MB"
         raise ConfigurationError(where=str(file.path), problem=problem) from None
-    telling.end(recorder, file.path, file.size_bytes)
+    progress.end(recorder, file.path, file.size_bytes)
 
 
 def kept_for_faults(
@@ -57,22 +57,22 @@ def kept_for_faults(
     attachments: Sequence[Attachment],
     seconds: float | None,
 ) -> None:
-    """Keep the last seconds until it is asked to end, and save them at each fault.
+    """Keeps the last seconds in memory until it is asked to end, and saves them at each fault.
 
     Raises:
-        ConfigurationError: there can be no such folder.
+        ConfigurationError: the folder cannot be made.
     """
-    telling = _Telling(out)
-    sink = SavedAtFault(folder, ring, about, attachments, telling.saved, complain)
-    telling.begin(recorder, folder)
-    recorder.run(sink, seconds, lambda: telling.beat(recorder, ring.size_bytes))
-    telling.end(recorder, folder, ring.size_bytes)
+    progress = _Progress(out)
+    sink = SavedAtFault(folder, ring, about, attachments, progress.saved, complain)
+    progress.begin(recorder, folder)
+    recorder.run(sink, seconds, lambda: progress.beat(recorder, ring.size_bytes))
+    progress.end(recorder, folder, ring.size_bytes)
     if ring.cut_short:
-        complain(f"{ring.cut_short} messages had to go before their time; --most-mb gives them more room")
+        complain(f"{ring.cut_short} messages were dropped early; --most-mb gives them more memory")
 
 
-class _Telling:
-    """What is said while one records."""
+class _Progress:
+    """Output while a recording runs."""
 
     def __init__(self, out: Output) -> None:
         self._out = out
@@ -80,32 +80,32 @@ class _Telling:
         self._live = sys.stdout.isatty() and not out.as_json
 
     def begin(self, recorder: Recorder, where: Path) -> None:
-        """What is recorded, and where to."""
+        """Prints the recorded services and the destination."""
         services = recorder.look()
         if self._out.as_json:
             self._out.data({"recording": str(where), "services": services})
             return
-        named = ", ".join(services) or "nothing yet that has joints or pictures"
+        named = ", ".join(services) or "no service with joints or pictures yet"
         self._out.say(f"[bold]recording[/] to {escape(str(where))}: {escape(named)}; Ctrl-C ends")
 
     def beat(self, recorder: Recorder, size_bytes: int) -> None:
-        """How far it is: a line that is written over in a terminal, one a second for programs."""
+        """Prints the progress: one line that is overwritten in a terminal, one line per second for programs."""
         if self._out.as_json:
             self._out.data(self._sums(recorder, size_bytes))
         elif self._live:
             print(f"\r{self._text(recorder, size_bytes)} ", end="", flush=True)  # noqa: T201 - Console ends lines
 
     def saved(self, path: Path, why: str, messages: int) -> None:
-        """A file of the last seconds was written."""
+        """Reports that a file of the last seconds was written."""
         if self._out.as_json:
             self._out.data({"saved": str(path), "why": why, "messages": messages})
         else:
             self._out.say(f"[bold red]{escape(why)}[/]: saved {messages} messages to {escape(str(path))}")
 
     def end(self, recorder: Recorder, where: Path, size_bytes: int) -> None:
-        """What there is now, and what there is not."""
+        """Prints the totals, and what was not recorded."""
         if recorder.refused:
-            complain(f"not all was recorded: {recorder.refused}")
+            complain(f"some data was not recorded: {recorder.refused}")
         if self._out.as_json:
             self._out.data({"recorded": str(where), **self._sums(recorder, size_bytes)})
             return

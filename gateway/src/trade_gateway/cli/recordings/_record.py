@@ -1,4 +1,4 @@
-"""``trade record``: write what happens in a system to an MCAP file, or keep the last seconds for when it goes wrong."""
+"""``trade record``: records a system to an MCAP file, or keeps the last seconds to save them at a fault."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -14,37 +14,48 @@ from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
 
 MB: Final = 1_000_000
+_RATES: Final = "Rates"
+_RING: Final = "Last seconds before a fault"
 
 
 def record(
     context: typer.Context,
-    file: Annotated[Path | None, typer.Argument(metavar="OUT.mcap", help="The file to make.")] = None,
+    file: Annotated[Path | None, typer.Argument(metavar="OUT.mcap", help="The file to write.")] = None,
     group: Groups = None,
     services: Readers = None,
-    hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Samples of joints a second, at most.")] = 50.0,
-    camera_hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Pictures a second, at most.")] = 5.0,
-    service_hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Samples of --services a second.")] = 10.0,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long; else with Ctrl-C.")] = None,
+    hz: Annotated[
+        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Highest rate of joint samples, in Hz.")
+    ] = 50.0,
+    camera_hz: Annotated[
+        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Highest rate of pictures, in Hz.")
+    ] = 5.0,
+    service_hz: Annotated[
+        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Rate of --services samples, in Hz.")
+    ] = 10.0,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Duration, in seconds; by default until Ctrl-C.")
+    ] = None,
     attach: Annotated[
-        list[Path] | None, typer.Option(help="A file to put into the recording: the robot file. Repeatable.")
+        list[Path] | None, typer.Option(help="File to embed in the recording: rosie.toml. Repeatable.")
     ] = None,
     keep_last: Annotated[
-        float | None, typer.Option(min=1.0, max=3600.0, help="Keep so many seconds in memory instead (--at-fault).")
+        float | None,
+        typer.Option(rich_help_panel=_RING, min=1.0, max=3600.0, help="Time to keep in memory, in seconds."),
     ] = None,
     at_fault: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Where to save them when something goes wrong.")
+        Path | None, typer.Option(rich_help_panel=_RING, metavar="FOLDER", help="Folder for a file at each fault.")
     ] = None,
-    most_mb: Annotated[int, typer.Option(min=1, help="With --keep-last: megabytes of memory at most.")] = 256,
+    most_mb: Annotated[int, typer.Option(rich_help_panel=_RING, min=1, help="Most memory, in MB.")] = 256,
     as_json: Json = False,
 ) -> None:
-    """Record joints, cameras, calls, locks and faults; any MCAP reader opens the file.
+    """Record joints, cameras, calls, locks and faults to an MCAP file, or at each fault.
 
-    It grows every second, and is readable so far if this is killed. Calls are noted without arguments and results.
+    The file grows every second. It stays readable if the recorder is killed. Calls have no arguments and results.
 
     For example: trade record walk.mcap --group rosie --attach rosie.toml
     """
     if (file is None) == (at_fault is None) or (at_fault is None) != (keep_last is None):
-        problem = "say where to: OUT.mcap, or --keep-last 30 --at-fault FOLDER"
+        problem = "needs a destination: OUT.mcap, or --keep-last 30 --at-fault FOLDER"
         raise UsageError(where="trade record", problem=problem)
     wanted = Wanted(group or [], services or [], hz, camera_hz, service_hz)
     attachments = [_read(path) for path in attach or []]

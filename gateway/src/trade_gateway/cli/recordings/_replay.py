@@ -1,4 +1,4 @@
-"""``trade replay``: a recorded motion once more, as a trajectory under a lock, and compared with the recording."""
+"""``trade replay``: repeats a recorded motion as a trajectory under a lock, and compares it with the recording."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -18,23 +18,23 @@ _WAIT_S: Final = 10.0
 def replay(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A recording.")],
-    group: Annotated[str | None, typer.Option(help="Whose motion, if the recording has several groups.")] = None,
+    group: Annotated[str | None, typer.Option(help="Group to move, if the recording has several.")] = None,
     speed: Annotated[
-        float, typer.Option(min=0.05, max=2.0, help="1 is that of the recording; 0.5 takes twice as long.")
+        float, typer.Option(min=0.05, max=2.0, help="Speed factor; 0.5 takes twice as long as the recording.")
     ] = 1.0,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, move nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and move nothing.")] = False,
     go_to_start: Annotated[
-        bool, typer.Option("--go-to-start", help="First move, slowly, to where the recording begins.")
+        bool, typer.Option("--go-to-start", help="First move slowly to the start of the recording.")
     ] = False,
     tolerance_rad: Annotated[
-        float, typer.Option(min=0.0, help="Exit code 1 if a joint was farther from the recording than this.")
+        float, typer.Option(min=0.0, help="Largest deviation in rad; above it, the exit code is 1.")
     ] = 0.1,
     as_json: Json = False,
 ) -> None:
-    """Move a group of joints, or an arm, as it was recorded, and say how far from that it was.
+    """Move a group of joints or an arm as recorded, and report the deviation.
 
-    What is beyond the limits of the robot file is refused before anything moves, and so is a robot that is not where
-    the recording begins. Ctrl-C stops.
+    A motion beyond the limits of the robot file is refused before anything moves.
+    A robot that is not at the start of the recording is refused, too. Ctrl-C stops the motion.
 
     For example: trade replay walk.mcap --group rosie.head --speed 0.5
     """
@@ -59,7 +59,7 @@ def replay(
             return
         with container.lock(where(group=motion.group), purpose=f"replay {file.name}", wait_s=_WAIT_S):
             if far:
-                out.say("moving to where the recording begins")
+                out.say("moving to the start of the recording")
                 robot.go_to_start()
             found = robot.follow()
     if out.as_json:

@@ -1,4 +1,4 @@
-"""A replay: what is checked, what is moved, what is measured meanwhile."""
+"""Checks, runs and measures a replay."""
 
 import math
 import time
@@ -22,14 +22,14 @@ __all__ = ["Replayed", "Robot", "chosen", "not_at_start"]
 _LIMBS: Final = where(kind="JointGroup") | where(kind="Arm")
 _FIND_S: Final = 5.0
 _START_RAD_S: Final = 0.3
-"""The greatest speed of the move to the start."""
+"""The highest speed of the move to the start."""
 _MORE_S: Final = 15.0
-"""A call has so much more time than what it moves takes."""
+"""How much longer than its motion a call may take, in seconds."""
 _MEASURED_HZ: Final = 50.0
 
 
 class Replayed(Struct, frozen=True, kw_only=True):
-    """How near a replay came to its recording."""
+    """The deviations of a replay from its recording."""
 
     group: str
     joints: list[str]
@@ -43,11 +43,11 @@ class Replayed(Struct, frozen=True, kw_only=True):
 
 
 def chosen(file: Path, group: str | None) -> Motion:
-    """The motion that is to be replayed, without what stands still at its ends.
+    """Returns the motion to replay, without standstill at its ends.
 
     Raises:
-        ConfigurationError: the recording has none, or it has gaps.
-        UsageError: it has several, or not that one.
+        ConfigurationError: the recording has no motion, or the motion has gaps.
+        UsageError: the recording has several motions, or not this one.
     """
     found = motions(file)
     if not found:
@@ -62,21 +62,21 @@ def chosen(file: Path, group: str | None) -> Motion:
 
 
 class Robot:
-    """The joints that are to move: those of a group, or of an arm."""
+    """The joints to move: those of a group, or of an arm."""
 
     def __init__(self, container: Container, motion: Motion, speed: float) -> None:
-        """Look it up and check everything; nothing moves.
+        """Looks the joints up and checks everything; moves nothing.
 
         Raises:
-            ConfigurationError: it has other joints.
+            ConfigurationError: the group has other joints.
             LimitExceeded: the motion would break a limit.
         """
         self._motion = motion
         self._container = container
         limits = self._service("limits")
-        told: Any = limits()
+        found: Any = limits()
         self._is_arm = "Arm" in limits.kinds
-        self._limits: list[JointLimits] = told.joints if self._is_arm else told
+        self._limits: list[JointLimits] = found.joints if self._is_arm else found
         names = [limit.name for limit in self._limits]
         self._arm_joints = names if self._is_arm else None
         if sorted(names) != sorted(motion.joints):
@@ -91,11 +91,11 @@ class Robot:
 
     @property
     def duration_s(self) -> float:
-        """How long it will take, in seconds."""
+        """The duration of the motion, in seconds."""
         return self._trajectory.points[-1].time_from_start_s
 
     def far_from_start(self) -> dict[str, float]:
-        """The joints that are not where the recording begins, and how far they are from that, in rad."""
+        """Returns the joints that are not at the start of the recording, with their distance in rad."""
         begins = dict(zip(self._motion.joints, self._motion.start, strict=True))
         states = joint_states(self._service("state")(), time.time(), self._arm_joints)
         places = zip(states.names, states.position_rad, strict=True)
@@ -103,7 +103,7 @@ class Robot:
         return {name: off for name, off in away.items() if abs(off) > Tolerances().start_rad}
 
     def go_to_start(self) -> None:
-        """Move there, slowly. Raises what the move does."""
+        """Moves slowly to the start. Raises what the move raises."""
         begins = dict(zip(self._motion.joints, self._motion.start, strict=True))
         goals = [begins[limit.name] for limit in self._limits]
         speed = min(_START_RAD_S, *(limit.max_speed_rad_s for limit in self._limits))
@@ -112,7 +112,7 @@ class Robot:
         run_to_end(move.with_(deadline_s=farthest / speed + _MORE_S), goals, speed)
 
     def follow(self) -> Replayed:
-        """Replay it and measure. Raises what the motion does."""
+        """Replays the motion and measures it. Raises what the motion raises."""
         deadline_s = self.duration_s + _MORE_S
         measured: list[JointStates] = []
         with self._container.stream(self._service("state"), hz=_MEASURED_HZ, keep=100_000) as states:
@@ -124,7 +124,7 @@ class Robot:
         while True:
             try:
                 sample = states.take()
-            except DeviceError:  # not measured for a moment
+            except DeviceError:  # briefly not measured
                 continue
             if sample is None:
                 return
@@ -146,7 +146,7 @@ class Robot:
 
 
 def not_at_start(group: str, far: Mapping[str, float]) -> ConfigurationError:
-    """What is raised if a robot is not where the recording begins."""
+    """Returns the error for a robot that is not at the start of the recording."""
     named = ", ".join(f"{joint} is {off:+.2f} rad off" for joint, off in far.items())
-    problem = f"is not where the recording begins: {named}; --go-to-start moves it there first"
+    problem = f"is not at the start of the recording: {named}; --go-to-start moves it there first"
     return ConfigurationError(where=group, problem=problem)

@@ -1,4 +1,4 @@
-"""``trade approvals``: what agents may not do without a person's word, and that word."""
+"""``trade approvals``: shows the calls of agents that wait for human approval, and decides them."""
 
 import time
 from collections.abc import Iterator
@@ -18,15 +18,15 @@ _COLUMNS: Final = ("id", "agent", "service", "arguments", "why", "waits")
 
 app = typer.Typer(
     invoke_without_command=True,
-    help="What agents ask for and wait to be allowed; who administers it decides.\n\n"
+    help="Show the calls of agents that wait for approval; approve or refuse them.\n\n"
     "For example: trade approvals, and then trade approvals yes 1f3a9c",
 )
-Id = Annotated[str, typer.Argument(help="As trade approvals shows it.")]
+Id = Annotated[str, typer.Argument(help="Id of the call, from trade approvals.")]
 
 
 @app.callback()
 def approvals(context: typer.Context, as_json: Json = False) -> None:
-    """Show what waits."""
+    """Show the calls that wait for approval."""
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)
@@ -43,7 +43,7 @@ def approvals(context: typer.Context, as_json: Json = False) -> None:
 
 @app.command()
 def yes(context: typer.Context, id: Id) -> None:  # noqa: A002
-    """Let that call be made, once.
+    """Approve a call, once.
 
     For example: trade approvals yes 1f3a9c
     """
@@ -55,11 +55,11 @@ def yes(context: typer.Context, id: Id) -> None:  # noqa: A002
 def no(
     context: typer.Context,
     id: Id,  # noqa: A002
-    reason: Annotated[str, typer.Option(help="The agent is told.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, reported to the agent.")] = "",
 ) -> None:
-    """Have that call not be made.
+    """Refuse a call.
 
-    For example: trade approvals no 1f3a9c --reason "somebody stands there"
+    For example: trade approvals no 1f3a9c --reason "a person is in the way"
     """
     _decide(context, id, "refuse", id, reason)
     Output(as_json=False).say(f"{escape(id)} is refused")
@@ -72,7 +72,7 @@ def _decide(context: typer.Context, name: str, word: str, *args: str) -> None:
                 beside = where(name=word, container=handle.container)
                 container.find(beside & where(group=handle.key.domain), wait_s=0)(*args)
                 return
-    raise ConfigurationError(where=f"approval {name!r}", problem="nothing of that id waits; see trade approvals")
+    raise ConfigurationError(where=f"approval {name!r}", problem="no call with this id waits; see `trade approvals`")
 
 
 def _pending(container: Container) -> Iterator[tuple[Handle, dict[str, Any]]]:
@@ -81,7 +81,7 @@ def _pending(container: Container) -> Iterator[tuple[Handle, dict[str, Any]]]:
             for one in handle():
                 yield handle, {name: getattr(one, name) for name in ("id", "agent", "service", "args", "why", "until")}
         except TradeError as error:
-            complain(f"{handle.container} does not say what it waits for: {error}")
+            complain(f"{handle.container} did not report its waiting calls: {error}")
 
 
 def _row(one: dict[str, Any], now: float) -> tuple[str, ...]:

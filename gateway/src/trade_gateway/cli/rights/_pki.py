@@ -1,4 +1,4 @@
-"""``trade pki``: give containers and gateways identities that they can prove, and take them back."""
+"""``trade pki``: issues, renews and revokes the certificates of containers and gateways."""
 
 import shlex
 from datetime import datetime, timedelta, timezone
@@ -21,16 +21,16 @@ _DEFAULT: Final = Path("pki")
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Give containers identities that they prove by certificates, and take them back.",
+    help="Issue, renew and revoke the certificates that prove identities.",
 )
 
-Name = Annotated[str, typer.Argument(help="The identity: letters, digits, _ - and .")]
-Folder = Annotated[Path, typer.Option("--ca", help="The folder of the authority.")]
+Name = Annotated[str, typer.Argument(help="Identity: letters, digits, _ - and .")]
+Folder = Annotated[Path, typer.Option("--ca", help="Folder of the authority.")]
 
 
 @app.command()
-def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="A folder for it.")] = _DEFAULT) -> None:
-    """Begin an authority: whoever has its ca.key can be anybody in the system.
+def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of the authority.")] = _DEFAULT) -> None:
+    """Create a certificate authority. Its ca.key can issue any identity of the system.
 
     For example: trade pki init pki, and then trade pki issue arm
     """
@@ -38,7 +38,7 @@ def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="A folder 
 
     made = Authority.create(folder)
     Output(as_json=False).say(
-        f"{escape(str(made.folder))} has an authority. Keep ca.key secret and off the robots, and a copy of it "
+        f"{escape(str(made.folder))} has an authority. Keep ca.key secret and off the robots, and keep a copy "
         "in a safe place.\n"
         f"Next: [bold]trade pki issue NAME --ca {escape(_quoted(folder))}[/]"
     )
@@ -48,33 +48,33 @@ def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="A folder 
 def issue(
     name: Name,
     purpose: Annotated[
-        str | None, typer.Option("--for", help="container or gateway; a name is given for one of them for ever.")
+        str | None, typer.Option("--for", help="container or gateway. A name's purpose cannot be changed later.")
     ] = None,
-    host: Annotated[list[str] | None, typer.Option(help="Name it may be dialled by; repeatable.")] = None,
-    address: Annotated[list[str] | None, typer.Option(help="Address it may be dialled by; repeatable.")] = None,
+    host: Annotated[list[str] | None, typer.Option(help="Host name in the certificate. Repeatable.")] = None,
+    address: Annotated[list[str] | None, typer.Option(help="IP address in the certificate. Repeatable.")] = None,
     hours: Annotated[
         float | None,
         typer.Option(
             min=0.1,
             max=_LONGEST_HOURS,
-            help="How long; a week if not said. A link cannot be revoked before, so not for long.",
+            help="Validity in hours, by default a week. Links cannot be revoked before it ends, so keep it short.",
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="A new key as well, and only the hosts and addresses given now.")
+        bool, typer.Option("--force", help="Make a new key, and drop earlier hosts and addresses.")
     ] = False,
     folder: Folder = _DEFAULT,
     as_json: Json = False,
 ) -> None:
-    """Give a container or gateway its certificate, or the next one before it expires.
+    """Issue a certificate for a container or gateway, or renew it before it expires.
 
-    The next one has the same key and hosts, and replaces the last in one step. A running container dials with the new
-    one at once; it listens with the old one until it is started again.
+    A renewed certificate has the same key and hosts, and replaces the old one in one step.
+    A running container uses the new one for new connections, but listens with the old one until it is restarted.
 
     For example: trade pki issue arm --address 192.168.1.5
     """
     if purpose not in (None, *_PURPOSES):
-        raise UsageError(where=f"--for {purpose}", problem=f"there is {' and '.join(_PURPOSES)}")
+        raise UsageError(where=f"--for {purpose}", problem=f"is no purpose; use {' or '.join(_PURPOSES)}")
     authority = _authority(folder)
     renewed = not force and any(one.name == name and one.until for one in authority.issued())
     given = authority.issue(
@@ -95,9 +95,9 @@ def issue(
 
 def _to_renew(given: "Issued") -> list[str]:
     return [
-        "Its key and ca.pem are the same, so copy only this one, over the old one on its host:",
+        "Its key and ca.pem are unchanged, so copy only this file over the old one on its host:",
         f"  {given.folder / 'cert.pem'}",
-        f"It may be dialled by {', '.join(given.hosts)}" if given.hosts else "Nobody beyond its host can dial it.",
+        f"It accepts connections as {', '.join(given.hosts)}" if given.hosts else "It is reachable on its host only.",
     ]
 
 
@@ -117,12 +117,12 @@ def _for_container(given: "Issued") -> list[str]:
     endpoints = ",".join(_endpoints(given))
     return [
         *_where(given),
-        "Start it with them, wherever you take them, and with the policy of the system:",
+        "Copy them to its host, and start it with them and the system's policy:",
         f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={_quoted(given.folder)} TRADE_POLICY=POLICY.toml",
-        *([f"  export TRADE_LISTEN={endpoints}          # where others dial it"] if endpoints else []),
-        "  export TRADE_CONNECT=tls/ADDRESS:7450          # whom it dials: a gateway, or a robot"
-        + (", if any" if endpoints else "; nobody beyond its host can dial it"),
-        "  trade services          # or trade up ROBOT.toml, or a program of yours",
+        *([f"  export TRADE_LISTEN={endpoints}          # where it listens"] if endpoints else []),
+        "  export TRADE_CONNECT=tls/ADDRESS:7450          # what it connects to: a gateway, or a robot"
+        + (", if any" if endpoints else "; it is reachable on its host only"),
+        "  trade services          # or trade up ROBOT.toml, or your own program",
     ]
 
 
@@ -131,29 +131,29 @@ def _where(given: "Issued") -> list[str]:
 
 
 def _endpoints(given: "Issued") -> list[str]:
-    """Where it may listen; IPv6 does not go with certificates."""
+    """Returns its listening endpoints; certificates do not support IPv6."""
     return [f"tls/{host}:7450" for host in given.hosts if ":" not in host]
 
 
 @app.command()
 def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
-    """Take an identity back for good: it is not issued again, and policies refuse it.
+    """Revoke an identity permanently: it is not issued again, and policies refuse it.
 
     For example: trade pki revoke arm
     """
     taken = _authority(folder).revoke(name)
     Output(as_json=False).say(
-        f"{name} is revoked and not issued again. Links know no revocation: its certificate links until "
-        f"{_moment(taken.until)}. Refused before that it is by the policies that have the list:\n"
+        f"{name} is revoked and not issued again. Links do not check revocation: its certificate can link until "
+        f"{_moment(taken.until)}. Until then, only policies with this list refuse it:\n"
         f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}\n"
-        "Copy it to every host, to where its policy says (revoked_file): what runs there reads it within seconds, and "
-        "says so in its log."
+        "Copy the list to the path of `revoked_file` in the policy of every host. Running containers read it within "
+        "seconds, and log that."
     )
 
 
 @app.command("list")
 def list_(folder: Folder = _DEFAULT, as_json: Json = False) -> None:
-    """List the identities: what for, until when, whether revoked.
+    """List identities with purpose, expiry and state.
 
     For example: trade pki list --json
     """
@@ -162,7 +162,7 @@ def list_(folder: Folder = _DEFAULT, as_json: Json = False) -> None:
     if as_json:
         out.data([_plain(one) for one in found])
     elif not found:
-        out.say("nobody has an identity yet; [bold]trade pki issue NAME[/] gives one")
+        out.say("no identity was issued yet; [bold]trade pki issue NAME[/] issues one")
     else:
         rows = [(one.name, one.purpose, _moment(one.until), _state(one), ", ".join(one.hosts)) for one in found]
         out.table(("NAME", "FOR", "UNTIL", "STATE", "HOSTS"), rows)
@@ -195,7 +195,7 @@ def _state(given: "Issued") -> str:
 
 
 def _moment(when: datetime | None) -> str:
-    return f"{when:%Y-%m-%d %H:%M} UTC" if when else "a time not known here"
+    return f"{when:%Y-%m-%d %H:%M} UTC" if when else "an unknown time"
 
 
 def _quoted(folder: Path) -> str:

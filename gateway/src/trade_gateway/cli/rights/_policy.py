@@ -1,4 +1,4 @@
-"""``trade policy``: who may do what, by a policy file; nothing is started and nobody is asked."""
+"""``trade policy``: shows the rights in a policy file, without a running system."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,27 +11,27 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 
-app = typer.Typer(no_args_is_help=True, help="Who may do what, by the access policy.")
+app = typer.Typer(no_args_is_help=True, help="Show the rights that an access policy gives.")
 
-File = Annotated[Path | None, typer.Option("--policy", envvar="TRADE_POLICY", help="The policy file.")]
+File = Annotated[Path | None, typer.Option("--policy", envvar="TRADE_POLICY", help="Policy file.")]
 
 
 @app.command("check")
 def check(
-    who: Annotated[str, typer.Argument(help="An identity.")],
-    verb: Annotated[str, typer.Argument(help=f"What it wants to do: {', '.join(VERBS)}.")],
-    what: Annotated[str, typer.Argument(help="A group or a service in it: rosie.neck.move_to; _ for no group.")],
+    who: Annotated[str, typer.Argument(help="Identity to check.")],
+    verb: Annotated[str, typer.Argument(help=f"Verb: {', '.join(VERBS)}.")],
+    what: Annotated[str, typer.Argument(help="Group or service: rosie.neck.move_to; _ is no group.")],
     policy: File = None,
     as_json: Json = False,
 ) -> None:
-    """Say whether somebody may do something, and by which rule. Exit code 0: allowed; 1: denied.
+    """Check whether an identity has a right, and by which rule. The exit code is 1 if denied.
 
     A stop service needs no rule, only an identity that is not revoked.
 
     For example: trade policy check planner call rosie.neck.move_to
     """
     if verb not in VERBS:
-        raise UsageError(where=verb, problem=f"is nothing one may do; there is {', '.join(VERBS)}")
+        raise UsageError(where=verb, problem=f"is no verb; use {', '.join(VERBS)}")
     decision = _decision(_read(policy), who, verb, what)
     out = Output(as_json=as_json)
     if as_json:
@@ -50,7 +50,7 @@ def _decision(policy: Policy, who: str, verb: str, what: str) -> Decision:
 
 @app.command("show")
 def show(policy: File = None, as_json: Json = False) -> None:
-    """List the identities of a policy, their roles, and the groups in which they may do what.
+    """List the identities of a policy with their roles and rights.
 
     For example: trade policy show --policy policy.toml
     """
@@ -74,5 +74,7 @@ def _groups(policy: Policy, who: str) -> dict[str, list[str]]:
 
 def _read(path: Path | None) -> Policy:
     if path is None:
-        raise UsageError(where="trade policy", problem="say which: --policy FILE, or TRADE_POLICY in the environment")
+        raise UsageError(
+            where="trade policy", problem="needs a policy: --policy FILE, or TRADE_POLICY in the environment"
+        )
     return read_policy(path)
