@@ -166,12 +166,12 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ('restart = "sometimes"\n', 4, "restart"),
         ("restarts = -1\n", 4, ">= 0"),
         ("answers_within_s = 0.0\n", 4, ">= 0.2"),
-        ('host = "far"\n', 4, "a gateway looks after containers of its own host; leave it out"),
+        ('host = "far"\n', 4, "a gateway supervises containers of its own host; leave it out"),
         ('after = ["nobody"]\n', 4, "there is no container 'nobody'; there is eyes"),
         ('rules = "care.toml"\n', 4, "there is providers and rules"),
         ('lease_from = "base"\nstands_in_for = "base"\n', 4, "leave one of them out"),
         ("lease_s = 5.0\n", 4, "goes with stands_in_for; leave it out"),
-        ('lease_from = "base"\nlease_s = 5.0\n', 5, "is for base to say; leave it out"),
+        ('lease_from = "base"\nlease_s = 5.0\n', 5, "is set in the file of base; leave it out"),
         ('stands_in_for = "rover"\nlease_s = 1.0\n', 5, ">= 2"),
         ('lease_from = "base"\nrestart = "never"\n', 5, "does not go with lease_from"),
         ('[container.care]\nrules = "care.toml"\nlease_from = "base"\n', 6, "a rules is pinned to its host"),
@@ -266,7 +266,7 @@ def test_a_limit_that_would_not_hold_is_refused(file: Path, limit: str, said: st
         (
             '"tls/10.0.0.7:7450"',
             '"tls/127.0.5.1:7450"',
-            r"listen: tls/127.0.5.1:7450: lo is known by 127.0.0.1",
+            r"listen: tls/127.0.5.1:7450: lo works only with 127.0.0.1",
         ),
         ('tls = "pki/issued/door"', 'credentials = "lab:secret"', r"credentials: is for laboratories"),
         ("[network.lab]", "[network", r"not valid TOML"),
@@ -281,7 +281,7 @@ def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) 
 def test_papers_of_a_container_are_told_from_those_of_a_gateway(file: Path) -> None:
     Papers(file.parent / "more").of("rosie")
     change(file, 'tls = "pki/issued/door"', 'tls = "more/issued/rosie"')
-    said = r"gateway.toml: tls: .* has the papers of 'rosie', which the policy does not call a gateway \(door\)"
+    said = r"gateway.toml: tls: .* has the certificate of 'rosie', which the policy does not list in gateways \(door\)"
     with pytest.raises(ConfigurationError, match=rf"{said}.*trade pki issue NAME --for gateway --address 192.168.7.1"):
         read_gateway_file(file)
 
@@ -313,14 +313,14 @@ def test_what_has_changed_is_told_by_name(file: Path) -> None:
     before = named()
     assert named().since(before) == ""
     (file.parent / "revoked.toml").write_text('revoked = ["planner"]')
-    assert named().since(before) == "revoked.toml is another one, planner is revoked now"
+    assert named().since(before) == "revoked.toml has changed, planner is revoked now"
     before = named()
     Authority(file.parent / "pki").issue("door", lasts=timedelta(days=3))
     until = Certificate.read(file.parent / "pki" / "issued" / "door").until
     assert named().since(before) == f"new certificate of door until {until:%Y-%m-%d %H:%M} UTC"
     before = named()
     change(file.parent / "policy.toml", 'planner = ["viewer"]', "planner = []")
-    assert named().since(before) == "policy.toml is another one, other identities"
+    assert named().since(before) == "policy.toml has changed, other identities"
 
 
 def test_check_starts_nothing(file: Path) -> None:

@@ -122,7 +122,7 @@ def test_the_name_of_a_gateway_is_never_signed_for_somebody_else(authority: Auth
     given = authority.issue("door", purpose=first)
     before = files(given.folder)
     for force in (False, True):
-        with pytest.raises(NameTaken, match=f"is the name of a {first}"):
+        with pytest.raises(NameTaken, match=f"is permanently the name of a {first}"):
             authority.issue("door", purpose=second, new_key=force)
     assert files(given.folder) == before
     assert authority.issue("door").purpose == first  # renewing needs no reminder
@@ -261,7 +261,7 @@ def test_a_second_authority_in_a_folder_is_refused_and_the_first_one_stays(autho
 
 def test_an_authority_that_cannot_be_used_says_why(authority: Authority, tmp_path: Path) -> None:
     folder = authority.folder
-    with pytest.raises(NoAuthority, match="begin one with trade pki init"):
+    with pytest.raises(NoAuthority, match="create one with trade pki init"):
         Authority(tmp_path / "nowhere")
     (folder / "ca.key").chmod(0o640)
     with pytest.raises(NoAuthority, match="chmod 600"):
@@ -279,7 +279,7 @@ def test_an_authority_that_cannot_be_used_says_why(authority: Authority, tmp_pat
 def test_an_expired_authority_issues_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_authority, "_AUTHORITY_LASTS", timedelta(0))
     authority = Authority.create(folder)
-    with pytest.raises(NoAuthority, match=r"has expired .*begin a new one"):
+    with pytest.raises(NoAuthority, match=r"has expired .*create a new one"):
         authority.issue("arm")
     assert authority.issued() == []
 

@@ -87,7 +87,7 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f"{HEAD}{LAMPS}sim = true\n", 6, "goes with robot"),
         (f'{HEAD}{LAMPS}without = ["legs"]\n', 6, "goes with robot"),
         (f'{HEAD}[container.a]\nrobot = "rosie.toml"\nallow = ["x:Y"]\n', 6, "goes with providers"),
-        (f"{HEAD}{PAGE}door = {{}}\n", 5, "nobody could come in; name tokens"),
+        (f"{HEAD}{PAGE}door = {{}}\n", 5, "no client could log in; name tokens"),
         (f'{HEAD}{PAGE}door = {{ tokens = "t.toml" }}\n', 5, "trade door token NAME --tokens "),
         (
             f"{HEAD}{PAGE}door = {{ port = 80 }}\n",
@@ -98,7 +98,7 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}[container.a]\nrobot = "nobody.toml"\n', 5, "nobody.toml: there is no such file"),
         (f'{HEAD}[container.a]\nrules = "rosie.toml"\n', 5, "rosie.toml"),
         (f'{HEAD}[container.a]\ngateway = "nobody.toml"\n', 5, "there is no such file"),
-        (f'{HEAD}[container.a]\ngateway = "x.toml"\ntls = "pki"\n', 6, "is said by the gateway file"),
+        (f'{HEAD}[container.a]\ngateway = "x.toml"\ntls = "pki"\n', 6, "is set in the gateway file"),
         (f'{HEAD}[container."a/b"]\nproviders = []\n', 4, "is no name for a container"),
         (f'{HEAD}{LAMPS}tls = "nowhere"\n', 4, "nowhere"),
         (f'{HEAD}{LAMPS}policy = "nobody.toml"\n', 4, "nobody.toml"),

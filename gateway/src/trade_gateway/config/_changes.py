@@ -1,4 +1,4 @@
-"""What a gateway file names, and in what that has become different since it was read."""
+"""Detects changes in the files that a gateway file names."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -20,30 +20,30 @@ _CERTIFICATE: Final = "cert.pem"
 
 
 def digest(path: Path) -> str:
-    """Changes when the file does, or anything that it names."""
+    """Returns a digest of the file and of all files that it names."""
     return _digest([path, *_beside(path)])
 
 
 class Named(NamedTuple):
-    """What a gateway file names, as it is at one moment."""
+    """The files that a gateway file names, at one moment."""
 
     digests: Mapping[Path, str]
-    """Of policies, lists of revoked names and certificates: what changes with each."""
+    """Digests of policies, lists of revoked names and certificates."""
     policy: Policy | None
-    """Its own."""
+    """The gateway's own policy."""
 
     def since(self, before: "Named") -> str:
-        """What has become different, in words; empty: nothing."""
+        """Describes the changes in words; empty if there are none."""
         changed = [path for path, seen in self.digests.items() if before.digests.get(path) != seen]
-        told = [_certified(path) for path in changed if path.name == _CERTIFICATE]
-        told += [f"{path.name} is another one" for path in changed if path.name != _CERTIFICATE]
+        changes = [_certified(path) for path in changed if path.name == _CERTIFICATE]
+        changes += [f"{path.name} has changed" for path in changed if path.name != _CERTIFICATE]
         if changed and self.policy is not None and before.policy is not None:
-            told += different(before.policy, self.policy)
-        return ", ".join(told)
+            changes += different(before.policy, self.policy)
+        return ", ".join(changes)
 
 
 def named_by(path: Path, plan: Plan) -> Named:
-    """What a gateway file names, now. Raises ConfigurationError: its policy is wrong by now."""
+    """Reads what a gateway file names now. Raises ConfigurationError if its policy has an error."""
     policy = plan.settings.policy
     return Named({file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy))
 
@@ -69,7 +69,7 @@ def _digest(files: Sequence[Path]) -> str:
 def _beside(path: Path) -> list[Path]:
     try:
         raw = read_toml_text(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # what is wrong with it is said by who reads it
+    except (OSError, ValueError):  # the reload reports the error
         return []
     shares = raw.get("share")
     parts = [raw, *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
@@ -78,5 +78,5 @@ def _beside(path: Path) -> list[Path]:
 
 
 def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
-    papers = [path.parent / str(part["tls"]) / _CERTIFICATE] if part.get("tls") else []
-    return [*papers, *(policy_files(path.parent / str(part["policy"])) if part.get("policy") else ())]
+    certificates = [path.parent / str(part["tls"]) / _CERTIFICATE] if part.get("tls") else []
+    return [*certificates, *(policy_files(path.parent / str(part["policy"])) if part.get("policy") else ())]

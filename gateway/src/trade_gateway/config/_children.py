@@ -1,4 +1,4 @@
-"""The tables of containers that a gateway looks after: what a system file says of one, and how it is looked after."""
+"""Tables of the containers that a gateway supervises: those of a system file, with keys for supervision."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,43 +12,43 @@ __all__ = ["Child", "Supervised", "read_children"]
 
 _LEASE_S: Final = 10.0
 _MISSES: Final = 4
-"""So many questions in a row are not answered before a container counts as hung."""
+"""How many health checks in a row may fail before a container counts as hung."""
 
 
 class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One container that a gateway starts, and starts again."""
+    """One container that a gateway starts and restarts."""
 
     restart: Literal["always", "never"] = "always"
-    """When its process has ended unasked."""
+    """Whether to restart it when its process ended by itself."""
     restarts: Annotated[int, Meta(ge=0, le=1000)] = 10
-    """So often within ``window_s``; then it is given up."""
+    """The most restarts within ``window_s``; then it is given up."""
     window_s: Annotated[float, Meta(gt=0)] = 300.0
     answers_within_s: Annotated[float, Meta(ge=0.2, le=600)] = 5.0
-    """Who has not answered for so long hangs, and is ended."""
+    """How long it may fail to answer before it counts as hung and is ended."""
     save_every_s: Annotated[float, Meta(ge=1)] = 60.0
-    """How often the state of its providers is saved; also when it is stopped."""
+    """The interval at which its providers' state is saved; also saved when it is stopped."""
     max_rss_mb: Annotated[float, Meta(gt=0)] | None = None
-    """Who has more resident memory is ended; none: as much as there is."""
+    """Resident memory above which it is ended; None: no limit."""
     lease_from: str = ""
-    """A gateway of another host, without whose word it is not up here, and which has it up if this host is lost."""
+    """A gateway of another host whose lease it needs to run here, and which runs it if this host is lost."""
     stands_in_for: str = ""
-    """The gateway of another host whose container this is; it is up here while that one is lost."""
+    """The gateway of another host that owns this container; it runs here while that host is lost."""
     lease_s: Annotated[float, Meta(ge=2, le=600)] = _LEASE_S
-    """With ``stands_in_for``: how long that one has it after it was heard of last."""
+    """With ``stands_in_for``: how long that gateway has the container after its last sign of life."""
 
     @property
     def question_s(self) -> float:
-        """How long it may take to answer one question."""
+        """The timeout of one health check."""
         return self.answers_within_s / _MISSES
 
     @property
     def misses(self) -> int:
-        """How many questions it may leave unanswered."""
+        """How many health checks may fail."""
         return _MISSES
 
 
 class Child(NamedTuple):
-    """A container of this host, how it is started, and how it is looked after."""
+    """A container of this host, with how it is started and supervised."""
 
     part: ContainerSpec
     terms: Supervised
@@ -60,7 +60,7 @@ class Child(NamedTuple):
         return self.part.name
 
     def starts_like(self, other: "Child") -> bool:
-        """Whether the two differ only in how they are looked after."""
+        """Whether the two differ only in their supervision."""
         return self._started == other._started
 
     @property
@@ -70,24 +70,24 @@ class Child(NamedTuple):
 
     @property
     def lease(self) -> tuple[str, str]:
-        """Who it is leased from, whom it stands in for; both empty: neither."""
+        """The gateway that leases it, and the gateway that it is a standby for; both may be empty."""
         return self.terms.lease_from, self.terms.stands_in_for
 
 
 def read_children(
     path: Path, text: str, around: Around, tables: Mapping[str, Any], *, certified: bool
 ) -> tuple[Child, ...]:
-    """The containers of a gateway file, in the order in which they are started.
+    """Reads the containers of a gateway file, in the order in which they are started.
 
     Args:
-        path: of the file.
-        text: of the file.
-        around: what the file says for all of them.
-        tables: those of ``[container.NAME]``.
-        certified: whether the gateway proves who it is with a certificate.
+        path: the file.
+        text: the file's text.
+        around: settings of the file for all containers.
+        tables: the tables ``[container.NAME]``.
+        certified: whether the gateway has a certificate.
 
     Raises:
-        ConfigurationError: names the file, the line, the key and what would be right.
+        ConfigurationError: with the file, the line, the key and the remedy.
     """
     entries = {name: converted(table, Supervised, path, text, ("container", name)) for name, table in tables.items()}
     parts = _OfGateway(path, text, around, entries, certified=certified).parts()
@@ -95,7 +95,7 @@ def read_children(
 
 
 class _OfGateway(Tables):
-    """They run on the gateway's own host, and each proves by itself who it is."""
+    """Tables of containers on the gateway's own host, each with its own certificate."""
 
     def __init__(
         self, path: Path, text: str, around: Around, entries: Mapping[str, Supervised], *, certified: bool
@@ -106,9 +106,11 @@ class _OfGateway(Tables):
     def check_kind(self, name: str, entry: Entry) -> None:
         super().check_kind(name, entry)
         if not entry.is_local:
-            self.refuse(name, "host", "a gateway looks after containers of its own host; leave it out")
+            self.refuse(name, "host", "a gateway supervises containers of its own host; leave it out")
         if entry.gateway:
-            self.refuse(name, "gateway", "is this file; a gateway looks after robots, providers, rules and doors")
+            self.refuse(
+                name, "gateway", "is this file; a gateway supervises robots, providers, rules and HTTP gateways"
+            )
         if isinstance(entry, Supervised):
             self._check_lease(name, entry)
         if self._certified and not entry.tls:
@@ -121,9 +123,11 @@ class _OfGateway(Tables):
                 self.refuse(name, "lease_s", "goes with stands_in_for; leave it out")
             return
         if entry.lease_from and entry.stands_in_for:
-            self.refuse(name, key, "of two gateways one leases it and the other one stands in; leave one of them out")
+            self.refuse(
+                name, key, "one of two gateways leases it and the other one is the standby; leave one of them out"
+            )
         if entry.lease_from and entry.lease_s != _LEASE_S:
-            self.refuse(name, "lease_s", f"is for {entry.lease_from} to say; leave it out")
+            self.refuse(name, "lease_s", f"is set in the file of {entry.lease_from}; leave it out")
         if entry.providers is None:
             self.refuse(name, key, f"goes with providers; a {entry.kind} is pinned to its host; leave it out")
         if entry.restart == "never":

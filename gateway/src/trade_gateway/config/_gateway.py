@@ -1,4 +1,4 @@
-"""The gateway file: which networks are joined, what crosses, who may do what, what is kept up. Checked as a whole."""
+"""The gateway file: networks, exports, policy and supervised containers; checked as a whole."""
 
 import os
 import re
@@ -23,14 +23,14 @@ __all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
 
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
-"""The transport knows the interface of a link by the interface's own addresses; it would apply no rule."""
+"""Addresses that the transport cannot assign to an interface, so that it would apply no rule."""
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _EXAMPLES: Final = {
     "system": 'system = "lab"',
     "network": '[network.private] and interface = "eth0"',
-    "interface": 'interface = "eth0" (`ip link` shows those there are)',
+    "interface": 'interface = "eth0" (`ip link` lists the interfaces)',
     "listen": 'listen = ["tls/192.168.1.1:7450"]',
 }
 
@@ -38,47 +38,47 @@ _Text = Annotated[str, Meta(min_length=1)]
 
 
 class Network(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One network that the gateway has a foot in."""
+    """One network that the gateway joins."""
 
     interface: _Text
-    """Of this host, such as ``eth0``."""
+    """An interface of this host, such as ``eth0``."""
     listen: list[_Text] = []
-    """Endpoints on it; none is fine if the gateway only dials out by it."""
+    """Endpoints on it; none if the gateway only connects to others."""
     export: list[str] | None = None
-    """Groups whose services on this network the others see and call; an empty list: none; left out: all."""
+    """Groups of this network that the others can see and call; empty: none; left out: all."""
     stream_hz: float | dict[str, float] = {}
-    """How many samples a second of each stream of these the others hear at most: of all, or by group."""
+    """The highest rate of each stream that the others receive, in Hz: for all groups, or by group."""
 
     @property
     def limits(self) -> Mapping[str, float]:
-        """By group."""
+        """The highest rates by group."""
         if isinstance(self.stream_hz, dict):
             return self.stream_hz
         return dict.fromkeys(_or_all(self.export), self.stream_hz)
 
 
 class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"import_": "import"}):
-    """Another system, in which the gateway is a guest: what of ours it offers there, and the other way round."""
+    """Another system with which the gateway, as a guest there, shares groups."""
 
     system: _Text
     """Its system id."""
     tls: str = ""
     """The folder with the guest's certificate, of that system's authority."""
     policy: str = ""
-    """That system's policy: who of it may see and call what is offered there."""
+    """That system's policy, which restricts who may see and call the shared groups."""
     connect: list[_Text] = []
-    """Endpoints in it to dial."""
+    """Endpoints in it to connect to."""
     listen: list[_Text] = []
-    """Endpoints where its containers may dial the guest."""
+    """Endpoints on which the guest accepts its containers."""
     export: list[str] = []
-    """Groups of ours that they see and call."""
+    """Our groups that the other system can see and call."""
     import_: list[str] = []
-    """Groups of theirs that ours see and call."""
+    """The other system's groups that ours can see and call."""
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
 
     def settings(self, where: Path, name: str, audit: Path | None, *, insecure_lan: bool) -> Settings:
-        """What the guest is started with. Raises ConfigurationError."""
+        """Returns the guest's settings. Raises ConfigurationError."""
         if self.policy:
             read_policy(where.parent / self.policy)
         return Settings.read(
@@ -97,12 +97,12 @@ class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, renam
 
 
 class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A gateway file, read; paths in it are beside it."""
+    """The contents of a gateway file; its paths are relative to it."""
 
     system: _Text
     """The system id."""
     name: _Text = "gateway"
-    """Of its container."""
+    """The name of its container."""
     tls: str = ""
     """The folder that `trade pki issue --for gateway` made."""
     policy: str = ""
@@ -110,15 +110,15 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     metrics: str = ""
     """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
     audit: str = ""
-    """The folder for the record of what happens in it, and in its guests in other systems."""
+    """The folder of the audit records of the gateway and its guests in other systems."""
     connect: list[_Text] = []
-    """Other gateways that it dials."""
+    """Other gateways that it connects to."""
     network: dict[str, Network] = {}
-    """By a name for people; at least one, unless the gateway only shares or looks after containers."""
+    """Networks by a name for people; at least one, unless the gateway only shares or supervises."""
     share: dict[str, Share] = {}
     """Other systems, by a name for people."""
     container: dict[str, dict[str, Any]] = {}
-    """Containers of this host that it keeps up, by name."""
+    """Containers of this host that it supervises, by name."""
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
     insecure_lan: bool = False
@@ -130,15 +130,15 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         return bool(self.share) and len(self.network) < 2 and not self.connect
 
     def settings(self, where: Path) -> Settings:
-        """What its container is started with.
+        """Returns its container's settings.
 
         Raises:
             ConfigurationError: certificates, policy and endpoints do not fit together.
         """
         beside = where.parent
         if self.policy:
-            policy = read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
-            self._check_papers(where, policy.gateways)
+            policy = read_policy(beside / self.policy)  # an error is found before anything is closed
+            self._check_certificate(where, policy.gateways)
         networks = [] if self.alone else list(self.network.values())
         limited = any(network.export is not None or network.limits for network in networks)
         exports = {network.interface: tuple(_or_all(network.export)) for network in networks}
@@ -159,22 +159,22 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             environment=_without_system(),
         )
 
-    def _check_papers(self, where: Path, gateways: Collection[str]) -> None:
-        """Raises ConfigurationError: they are a container's, and for none of the addresses."""
+    def _check_certificate(self, where: Path, gateways: Collection[str]) -> None:
+        """Raises ConfigurationError if the certificate is a container's, and for none of the addresses."""
         if not (self.tls and gateways):
             return
-        papers = Certificate.read((where.parent / self.tls).absolute())
+        certificate = Certificate.read((where.parent / self.tls).absolute())
         hosts = [Endpoint.read(one).host for network in self.network.values() for one in network.listen]
-        if papers.identity not in gateways and hosts and not papers.hosts.intersection(hosts):
+        if certificate.identity not in gateways and hosts and not certificate.hosts.intersection(hosts):
             problem = (
-                f"{papers.folder} has the papers of {papers.identity!r}, which the policy does not call a gateway "
-                f"({', '.join(gateways)}) and which are not for {hosts[0]}; a gateway's are needed here: trade pki "
+                f"{certificate.folder} has the certificate of {certificate.identity!r}, which the policy does not list "
+                f"in gateways ({', '.join(gateways)}) and which is not for {hosts[0]}; use a gateway's: trade pki "
                 f"issue NAME --for gateway --address {hosts[0]}"
             )
             raise ConfigurationError(where=f"{where}: tls", problem=problem)
 
     def audit_folder(self, where: Path) -> Path | None:
-        """Beside the file."""
+        """Returns the folder of audit records, relative to the file."""
         return where.parent / self.audit if self.audit else None
 
 
@@ -188,7 +188,7 @@ def _or_all(groups: Sequence[str] | None) -> Sequence[str]:
 
 
 def _without_system() -> dict[str, str]:
-    """The file says it all, and not whatever shell the gateway is started from; but for what concerns this host."""
+    """Returns the environment without settings of a system, which only the file sets."""
     kept = ("TRADE_AUDIT_READS", "TRADE_AUDIT_KEEP_DAYS", "TRADE_AUDIT_KEEP_ROWS")
     return {
         name: value
@@ -201,21 +201,21 @@ _KINDS: Final[Mapping[str, type[Struct]]] = {"network": Network, "share": Share}
 
 
 class Plan(NamedTuple):
-    """A gateway file with all that it names, checked."""
+    """A checked gateway file, with the files that it names."""
 
     file: GatewayFile
     settings: Settings
     shares: Mapping[str, Settings]
-    """What the guests in other systems are started with, by the name of the share."""
+    """The settings of the guests in other systems, by the name of the share."""
     children: Sequence[Child]
-    """The containers that it looks after, in the order in which they are started."""
+    """The containers that it supervises, in the order in which they are started."""
 
     @property
     def unnamed(self) -> str:
-        """What is wrong with a policy that does not name the gateway; empty: nothing.
+        """Returns the problem of a policy that does not name the gateway, or an empty text.
 
         Raises:
-            ConfigurationError: the policy is wrong by now.
+            ConfigurationError: the policy has an error.
         """
         carries = self.settings.bridge and self.settings.tls is not None
         if not carries or self.settings.policy is None:
@@ -225,15 +225,13 @@ class Plan(NamedTuple):
         if name in named:
             return ""
         said = ", ".join(f'"{one}"' for one in (*named, name))
-        return (
-            f"does not name the gateway {name!r}, so nobody believes it whom it speaks for; write gateways = [{said}]"
-        )
+        return f"does not name the gateway {name!r}, so containers refuse what it forwards; write gateways = [{said}]"
 
     def check_here(self, where: Path) -> None:
-        """That each network listens at addresses of its own interface, as far as this host has them.
+        """Checks that each network listens at addresses of its own interface, as far as this host has them.
 
-        Who dials is taken to be of the network whose interface has the address, so that with two of them swapped the
-        one would see what is of the other.
+        A link belongs to the network whose interface has the address. With two addresses swapped, clients of one
+        network would see services of the other.
 
         Raises:
             ConfigurationError: an address is of another interface of this host.
@@ -248,7 +246,7 @@ class Plan(NamedTuple):
                 if others := _others_at(endpoint, own, known):
                     problem = (
                         f"{endpoint} is an address of {', '.join(others)} on this host, and interface is "
-                        f"{network.interface}: who dials there would count as of another network, and see what that "
+                        f"{network.interface}: links there would count as another network's, and see services that it "
                         f"does not export; write an address of {network.interface} "
                         f"({_listed(known.get(network.interface, ()))}), or the interface that has this one"
                     )
@@ -256,7 +254,7 @@ class Plan(NamedTuple):
 
 
 def _others_at(endpoint: str, own: set[str], known: Mapping[str, frozenset[str]]) -> list[str]:
-    """The interfaces of this host that have an address of an endpoint, if none of its own has."""
+    """Returns the interfaces of this host that have an address of an endpoint, if none of its own has."""
     place = Endpoint.read(endpoint)
     if place.everywhere:
         return []
@@ -273,10 +271,10 @@ def _listed(known: Iterable[str]) -> str:
 
 
 def read_gateway_file(path: Path) -> Plan:
-    """Read and check a gateway file, the policy and the certificate that it names.
+    """Reads and checks a gateway file, and the policy and certificate that it names.
 
     Raises:
-        ConfigurationError: names the file, the key and what would be right.
+        ConfigurationError: with the file, the key and the remedy.
     """
     where = str(path)
     try:
@@ -310,7 +308,7 @@ def read_gateway_file(path: Path) -> Plan:
 
 
 def _of_children(file: GatewayFile) -> dict[str, str]:
-    """Variables by which containers of this host are let into the system as the gateway is."""
+    """Returns the variables that give containers of this host the gateway's laboratory credentials."""
     laboratory = {"TRADE_CREDENTIALS": file.credentials, "TRADE_INSECURE_LAN": "1" if file.insecure_lan else ""}
     return {name: value for name, value in laboratory.items() if value}
 
@@ -330,7 +328,9 @@ def _check(file: GatewayFile, where: str) -> None:
         _check_groups(share.import_, f"{at}import")
         _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
         if not share.policy and not file.insecure_lan:
-            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
+            problem = (
+                f"missing; name the policy of {share.system}: without one, all its clients could call the shared groups"
+            )
             raise ConfigurationError(where=f"{at}policy", problem=problem)
 
 
@@ -343,12 +343,12 @@ def _check_networks(file: GatewayFile, where: str) -> None:
         owners[network.interface] = name
         for endpoint in network.listen:
             if _UNKNOWN_LOOPBACK.search(endpoint):
-                problem = f"{endpoint}: lo is known by 127.0.0.1 alone, and nothing would cross; write that one"
+                problem = f"{endpoint}: lo works only with 127.0.0.1; use that address"
                 raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
         _check_groups(network.export or (), f"{where}: network.{name}.export")
         given = {"export": network.export is not None, "stream_hz": network.stream_hz != {}}
         for key in [key for key, is_given in given.items() if is_given and file.alone]:
-            problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
+            problem = "there is no other network of this system; leave it out. [share...] sets what other systems see"
             raise ConfigurationError(where=f"{where}: network.{name}.{key}", problem=problem)
 
 
@@ -391,7 +391,7 @@ def _fits(part: object, kind: type[Struct] | None) -> bool:
 
 
 def _named(path: str, raw: Mapping[str, Any]) -> str:
-    """The place of a value, with its network's or share's own name where the check only says that it is one of them."""
+    """Returns the place of a value, with the name of its network or share where the check leaves it out."""
     if "[...]" in path:
         table = path.partition("[")[0]
         named = cast("Mapping[str, object]", raw.get(table, {}))

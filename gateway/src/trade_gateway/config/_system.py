@@ -1,4 +1,4 @@
-"""The system file: which containers make up a system, on which hosts, in which order. Checked as a whole."""
+"""The system file: the containers of a system, their hosts and their order; checked as a whole."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, a
 __all__ = ["SystemPlan", "read_system_file"]
 
 _TELLS_ITSELF: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
-"""What a gateway file says, and the system file does not."""
+"""Keys that a gateway file sets instead of the system file."""
 
 _Text = Annotated[str, Meta(min_length=1)]
 
@@ -26,33 +26,33 @@ class _System(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: _Text
     """The system id."""
     tls: str = ""
-    """Of `trade system` itself, and of containers of this host that name none."""
+    """The certificate folder of `trade system`, and of containers of this host that name none."""
     policy: str = ""
     audit: str = ""
-    """Of containers of this host that name none."""
+    """The folder of audit records of containers of this host that name none."""
     connect: list[_Text] = []
 
 
 class SystemPlan(NamedTuple):
-    """A system file with all that it names on this host, checked."""
+    """A checked system file, with the files that it names on this host."""
 
     path: Path
     settings: Settings
-    """Of who brings it up."""
+    """The settings of `trade system` itself."""
     parts: Sequence[ContainerSpec]
-    """In the order in which they are started."""
+    """The containers in the order in which they are started."""
     text: str
 
     def at(self, name: str, key: str = "") -> str:
-        """Where the file speaks of a container, for errors."""
+        """Returns the place of a container in the file, for errors."""
         return at(self.path, self.text, ("container", name), key)
 
 
 def read_system_file(path: Path) -> SystemPlan:
-    """Read and check a system file, and the files of this host that it names. Nothing is started and nobody is asked.
+    """Reads and checks a system file and the files of this host that it names, without a running system.
 
     Raises:
-        ConfigurationError: names the file, the line, the key and what would be right.
+        ConfigurationError: with the file, the line, the key and the remedy.
     """
     text, raw = read_toml(path)
     for key in raw:
@@ -78,26 +78,26 @@ def read_system_file(path: Path) -> SystemPlan:
 
 
 def _own_settings(reading: Tables, text: str) -> Settings:
-    """Of who brings the system up."""
+    """Returns the settings of `trade system` itself."""
     system = reading.around
     environment = {**os.environ, **reading.environment(system.tls, system.policy)}
     try:
         if system.policy:
             read_policy(reading.beside(system.policy))
         settings = Settings.read(system=system.system, connect=system.connect, environment=environment)
-        return replace(settings, audit=None, metrics="")  # it comes and goes
+        return replace(settings, audit=None, metrics="")  # it is short-lived
     except ConfigurationError as wrong:
         raise ConfigurationError(where=at(reading.path, text, ("system",), ""), problem=str(wrong)) from None
 
 
 class _WithGateways(Tables):
-    """Of a system file, where a container may be a gateway."""
+    """Tables of a system file, where a container may be a gateway."""
 
     def check_kind(self, name: str, entry: Entry) -> None:
         super().check_kind(name, entry)
         for key in _TELLS_ITSELF if entry.gateway else ():
             if getattr(entry, key):
-                self.refuse(name, key, "is said by the gateway file; leave it out")
+                self.refuse(name, key, "is set in the gateway file; leave it out")
 
     def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
         if not entry.gateway:

@@ -1,4 +1,4 @@
-"""The tables of containers in a file: checked, in order, and how each container is started."""
+"""Reads the tables of containers in a file, in start order, with the command that starts each."""
 
 import importlib.util
 import os
@@ -46,31 +46,31 @@ _Read = TypeVar("_Read", bound=Struct)
 
 
 class ObjectSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"class_": "class"}):
-    """An object that is made in a container, and offered."""
+    """An object to create in a container and offer as services."""
 
     class_: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$")]
-    """Such as ``mypkg.vision:Camera``."""
+    """The class, such as ``mypkg.vision:Camera``."""
     groups: list[_Text] = []
     args: list[Any] | dict[str, Any] = []
-    """For its constructor, in order or by name."""
+    """Arguments of its constructor, by position or by name."""
 
 
 class DoorSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """HTTP and WebSocket for those who speak nothing else: the options of ``trade door``."""
+    """An HTTP gateway: the options of ``trade door``."""
 
     listen: _Text = "127.0.0.1:7080"
     tokens: str = ""
     """The file of tokens: ``trade door token NAME --tokens FILE``."""
     tls: str = ""
-    """Folder of the certificate that pages see."""
+    """Folder of the server's certificate."""
     origins: list[_Text] = []
-    """Sites whose pages may come in."""
+    """Allowed origins of web pages."""
     hosts: list[_Text] = []
-    """Further names by which it is called."""
+    """Further host names of the server."""
 
 
 class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One container. Files are beside the system file; those of another host are as that host sees them."""
+    """One container. Paths are relative to the system file; those of another host are paths there."""
 
     host: _Text = LOCAL
     """``local``, or as for ssh: HOST or USER@HOST."""
@@ -79,33 +79,33 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     sim: bool = False
     """Simulate the robot's devices."""
     without: list[_Text] = []
-    """Buses, cameras and sensors of the robot that are left out."""
+    """Buses, cameras and sensors of the robot to leave out."""
     gateway: str = ""
     """A gateway file."""
     providers: list[ObjectSpec] | None = None
-    """What is made in it; modules of this host may be beside the system file."""
+    """Objects to create in it; modules of this host may be beside the system file."""
     allow: list[_Text] = []
-    """Classes that others may make in it, besides these."""
+    """Further classes that others may create in it."""
     rules: str = ""
     """A rules file."""
     door: DoorSpec | None = None
     after: list[_Text] = []
-    """Containers that must be up before."""
+    """Containers that must be up first."""
     tls: str = ""
     policy: str = ""
     audit: str = ""
-    """Folder for the record of what happens in it."""
+    """Folder of its audit record."""
     metrics: str = ""
     """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
     connect: list[_Text] | None = None
-    """Endpoints it dials; none: those of the system."""
+    """Endpoints that it connects to; None: those of the system."""
     listen: list[_Text] = []
     command: _Text = "trade"
-    """Of another host: the path of ``trade`` there."""
+    """The path of ``trade`` on another host."""
 
     @property
     def kind(self) -> str:
-        """The key that says what it is; the file is checked to have one."""
+        """The key that sets its kind; a checked file has exactly one."""
         return next(kind for kind in _KINDS if getattr(self, kind) not in ("", None))
 
     @property
@@ -115,54 +115,54 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def is_local(self) -> bool:
-        """Whether it runs on the host of whoever brings the system up."""
+        """Whether it runs on the host of `trade system`."""
         return self.host == LOCAL
 
 
 _INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": ObjectSpec, "door": DoorSpec}
-"""What stands under a key of an entry."""
+"""The type of the table under a key of an entry."""
 
 
 class Around(Struct, frozen=True, kw_only=True):
-    """What holds for all containers of a file."""
+    """Settings for all containers of a file."""
 
     system: str
     """The system id."""
     tls: str = ""
-    """Of containers of this host that name none; so are the policy and the folder for records."""
+    """The default of containers of this host; likewise the policy and the folder of audit records."""
     policy: str = ""
     audit: str = ""
     connect: Sequence[str] = ()
     environment: Mapping[str, str] = {}
-    """Variables of containers of this host, besides those they inherit."""
+    """Further variables of containers of this host, besides inherited ones."""
     inherited: Mapping[str, str] = os.environ
 
 
 class ContainerSpec(NamedTuple):
-    """A container, and how it is started."""
+    """A container, with the command that starts it."""
 
     name: str
     entry: Entry
     words: Sequence[str]
-    """After ``trade``."""
+    """The words after ``trade``."""
     environment: Mapping[str, str]
-    """Besides what is set anyway."""
+    """Variables besides those that are set anyway."""
 
     @property
     def files(self) -> list[str]:
-        """What its host has to have."""
+        """The files that its host must have."""
         named = [self.environment[name] for name in ("TRADE_TLS", "TRADE_POLICY") if name in self.environment]
         return [*([self.entry.file] if self.entry.file else []), *named]
 
 
 class Tables:
-    """The tables ``[container.NAME]`` of one file, whose shape is right.
+    """The tables ``[container.NAME]`` of one file, already of the right types.
 
     Args:
-        path: of the file.
-        text: of the file, to tell lines.
-        around: what holds for all of them.
-        entries: by name.
+        path: the file.
+        text: the file's text, to find line numbers.
+        around: settings for all containers.
+        entries: the tables by name.
     """
 
     def __init__(self, path: Path, text: str, around: Around, entries: Mapping[str, Entry]) -> None:
@@ -172,7 +172,7 @@ class Tables:
         self._entries = entries
 
     def parts(self) -> "list[ContainerSpec]":
-        """All of them, each behind those that it has to wait for. Raises ConfigurationError."""
+        """Returns all containers, each after those that it waits for. Raises ConfigurationError."""
         return [self._part(name) for name in self._order()]
 
     def _order(self) -> list[str]:
@@ -187,7 +187,7 @@ class Tables:
             self.refuse(ring[0], "after", f"is a ring: {' after '.join(ring)}; leave one of them out")
 
     def _part(self, name: str) -> "ContainerSpec":
-        """How a container is started."""
+        """Returns how a container is started."""
         entry = self._entries[name]
         self.check_kind(name, entry)
         environment = {} if entry.gateway else self._environment_of(entry)
@@ -200,14 +200,14 @@ class Tables:
 
     @contextmanager
     def about(self, name: str, entry: Entry) -> Generator[None]:
-        """What is found wrong inside is said of a container's table."""
+        """Reports errors inside as errors of a container's table."""
         try:
             yield
         except ConfigurationError as wrong:
             self.refuse(name, entry.kind if entry.file else "", str(wrong))
 
     def check_kind(self, name: str, entry: Entry) -> None:
-        """Raises ConfigurationError: keys that do not go together."""
+        """Raises ConfigurationError if keys exclude each other."""
         kinds = [kind for kind in _KINDS if getattr(entry, kind) not in ("", None)]
         if len(kinds) != 1:
             found = f"there is {' and '.join(kinds)}" if kinds else "there is none"
@@ -219,13 +219,13 @@ class Tables:
             self.refuse(name, "command", "goes with another host; leave it out")
 
     def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
-        """Raises ConfigurationError: what it needs of this host is not there, or is wrong."""
+        """Raises ConfigurationError if something that it needs on this host is missing or wrong."""
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
         if entry.door and importlib.util.find_spec("uvicorn") is None:
             self.refuse(name, "door", "needs the extra http; pip install 'trade-gateway[http]'")
         if entry.door and not (entry.door.tokens or entry.door.tls):
-            self.refuse(name, "door", "nobody could come in; name tokens, or tls and its authority's certificates")
+            self.refuse(name, "door", "no client could log in; name tokens, or tls and its authority's certificates")
         if entry.door and entry.door.tokens and not (tokens := self.beside(entry.door.tokens)).exists():
             self.refuse(name, "door", f"there is no {tokens}; make it: trade door token NAME --tokens {tokens}")
         with self.about(name, entry):
@@ -286,13 +286,13 @@ class Tables:
         return {**around.environment, **named}
 
     def environment(self, tls: str, policy: str, host: str = LOCAL) -> dict[str, str]:
-        """The variables for a certificate and a policy, as the host sees them."""
+        """Returns the variables for a certificate and a policy, with paths on that host."""
         places = {"TRADE_TLS": tls, "TRADE_POLICY": policy}
         named = {name: place for name, place in places.items() if place}
         return {name: str(self.beside(place)) for name, place in named.items()} if host == LOCAL else named
 
     def beside(self, named: str) -> Path:
-        """A file that the file names."""
+        """Returns the absolute path of a file that the file names."""
         return (self.path.parent / named).absolute()
 
     def refuse(self, name: str, key: str, problem: str) -> NoReturn:
@@ -301,7 +301,7 @@ class Tables:
 
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
-    """The text of a file, and what it says. Raises ConfigurationError."""
+    """Reads a TOML file; returns its text and its contents. Raises ConfigurationError."""
     try:
         text = path.read_text(encoding="utf-8")
         return text, read_toml_text(text)
@@ -314,7 +314,7 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...]) -> _Read:
-    """What a table says. Raises ConfigurationError, which names the line."""
+    """Converts a table to its type. Raises ConfigurationError with the line."""
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
@@ -332,12 +332,12 @@ def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tupl
 
 
 def at(path: Path, text: str, table: tuple[str, ...], key: str) -> str:
-    """Where a file speaks of something, for errors."""
+    """Returns a place in a file, for errors."""
     return f"{path}:{line_of(text, table, key)}: {'.'.join((*table, key) if key else table)}"
 
 
 def line_of(text: str, table: Sequence[str], key: str = "") -> int:
-    """The line of a key in a table of a TOML text; else that of the table's header; 1 if that is not found either."""
+    """Returns the line of a key in a table of a TOML text; else of the table's header; else 1."""
     inside, found = False, 1
     wanted = re.compile(rf"""\s*["']?{re.escape(key)}["']?\s*=""")
     for number, line in enumerate(text.splitlines(), 1):

@@ -1,10 +1,10 @@
-"""A certificate authority in a folder: gives containers and gateways their identities for a while, and takes them back.
+"""A certificate authority in a folder: issues, renews and revokes certificates of containers and gateways.
 
 ========================  ==========================================================================================
-``ca.pem``, ``ca.key``    the authority; whoever has the key can be anybody
-``names/NAME``            what a name was given for, for ever: ``container`` or ``gateway``
+``ca.pem``, ``ca.key``    the authority; its key can issue any identity
+``names/NAME``            the permanent purpose of a name: ``container`` or ``gateway``
 ``issued/NAME/``          ``ca.pem``, ``cert.pem`` and ``key.pem``: what a container is started with (``TRADE_TLS``)
-``revoked/NAME``          marks a name that was taken back, for ever
+``revoked/NAME``          marks a name as permanently revoked
 ``revoked.toml``          ``revoked``, all of them: the names that a policy has to refuse
 ========================  ==========================================================================================
 """
@@ -35,47 +35,47 @@ __all__ = ["Authority", "Issued", "NameRevoked", "NameTaken", "NoAuthority", "Pu
 Purpose = Literal["container", "gateway"]
 
 _LASTS: Final = timedelta(days=7)
-"""Links know no revocation: a stolen key is good until its certificate ends, so that has to be soon. But a container
-listens with the certificate that it started with until it is started again, so it has to be longer than a shift."""
+"""Links do not check revocation: a stolen key works until its certificate expires, so this is short. But a container
+listens with the certificate that it started with until it is restarted, so this is longer than a shift."""
 _AUTHORITY_LASTS: Final = timedelta(days=3650)
 _CLOCKS_DIFFER: Final = timedelta(minutes=5)
 _LONGEST_NAME: Final = 64
-"""X.509 has no room for more in a common name."""
+"""The longest common name in X.509."""
 _HERE: Final = ("localhost", "127.0.0.1", "::1")
 
 _Host = x509.DNSName | x509.IPAddress
 
 
 class NoAuthority(ConfigurationError):
-    """There is none in the folder, it cannot be used, or there is one already."""
+    """The folder has no usable authority, or has one already."""
 
 
 class NameTaken(ConfigurationError):
-    """A gateway's name is asked for somebody else, or the other way round."""
+    """A gateway's name is requested for a container, or the other way round."""
 
 
 class NameRevoked(ConfigurationError):
-    """The name was taken back."""
+    """The name was revoked."""
 
 
 class Issued(Struct, frozen=True):
-    """A name, and the last certificate it has."""
+    """A name, with its latest certificate."""
 
     name: str
     purpose: Purpose
     until: datetime | None
-    """None: its files are not in the folder any more."""
+    """None: its files are no longer in the folder."""
     hosts: tuple[str, ...]
-    """Names and addresses that it may be dialled by, beyond this host's own."""
+    """Its host names and addresses besides localhost."""
     revoked: bool
     folder: Path
 
 
 class Authority:
-    """The authority of a folder.
+    """The certificate authority of a folder.
 
     Raises:
-        NoAuthority: there is none, or it cannot be used.
+        NoAuthority: the folder has no usable authority.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -84,7 +84,7 @@ class Authority:
 
     @classmethod
     def create(cls, folder: Path) -> "Authority":
-        """A new one. Raises NoAuthority: there is one already, and what it issued would be worth nothing."""
+        """Creates an authority. Raises NoAuthority if there is one, whose certificates would become worthless."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = _named(f"TRADE authority {secrets.token_hex(4)}")
         now = datetime.now(timezone.utc)
@@ -118,23 +118,23 @@ class Authority:
         lasts: timedelta | None = None,
         new_key: bool = False,
     ) -> Issued:
-        """Give a name its certificate, or the next one.
+        """Issues a certificate for a name, or renews it.
 
-        The next one has the key of the last and its hosts as well, and replaces it in one step.
+        A renewed certificate keeps the key and the hosts, and replaces the old one atomically.
 
         Args:
             name: the identity.
-            purpose: what for; none: as before, and a container if it is new.
-            hosts: names it may be dialled by, besides localhost.
-            addresses: addresses it may be dialled by, besides those of the loopback interface.
-            lasts: how long from now on, a week if not said; not beyond the end of the authority.
-            new_key: as if it were the first one: another key, and only the hosts and addresses given.
+            purpose: the purpose; None: as before, or container for a new name.
+            hosts: host names besides localhost.
+            addresses: addresses besides those of the loopback interface.
+            lasts: the validity, by default a week; limited by the authority's own.
+            new_key: make a new key, and drop earlier hosts and addresses.
 
         Raises:
-            NameTaken: it was given for another purpose.
-            NameRevoked: it was revoked.
+            NameTaken: the name has another purpose.
+            NameRevoked: the name was revoked.
             NoAuthority: the authority itself has expired.
-            ConfigurationError: it is no name, host or address, or its key is not here any more.
+            ConfigurationError: a name, host or address is invalid, or the key is missing.
         """
         _check_name(name)
         wanted = [*_addresses(addresses), *map(_dns_name, hosts)]
@@ -156,15 +156,15 @@ class Authority:
         return self._known(name)
 
     def revoke(self, name: str) -> Issued:
-        """Take a name back for good: it is not issued again, and policies that have the list refuse it.
+        """Revokes a name permanently: it is not issued again, and policies with the list refuse it.
 
         Raises:
-            ConfigurationError: no such name was ever issued.
+            ConfigurationError: the name was never issued.
         """
         if name not in self._names():
-            problem = f"was never issued; there is {', '.join(self._names()) or 'nobody'}"
+            problem = f"was never issued; there is {', '.join(self._names()) or 'no identity'}"
             raise ConfigurationError(where=name, problem=problem)
-        self._listed()  # damaged, it is to be put right first
+        self._listed()  # a damaged list must be repaired first
         marks = self.folder / "revoked"
         marks.mkdir(mode=0o700, exist_ok=True)
         with contextlib.suppress(FileExistsError):
@@ -173,23 +173,23 @@ class Authority:
         return self._known(name)
 
     def _list_revoked(self) -> None:
-        """Write the list until it has all: who revokes at the same time has marked it before writing an older one."""
+        """Writes the list until it is complete: a concurrent revocation marks its name before it writes its list."""
         while (names := self.revoked()) != self._listed():
             listed = ", ".join(f'"{name}"' for name in sorted(names))
             text = f"# Written by trade pki: identities that policies refuse.\nrevoked = [{listed}]\n"
             replace(self._revoked_file, text.encode(), 0o644)
 
     def issued(self) -> list[Issued]:
-        """All names that were ever issued, in their order."""
+        """Returns all names that were ever issued, sorted."""
         return [self._known(name) for name in self._names()]
 
     def revoked(self) -> frozenset[str]:
-        """The names that were taken back. Raises ConfigurationError: the list is damaged."""
+        """Returns the revoked names. Raises ConfigurationError if the list is damaged."""
         marked = frozenset(path.name for path in (self.folder / "revoked").glob("[!.]*"))
         return marked | (self._listed() or frozenset())
 
     def _listed(self) -> frozenset[str] | None:
-        """Those in the list for policies; None: there is no list."""
+        """Returns the names in the list for policies; None if there is no list."""
         try:
             listed = read_toml_text(self._revoked_file.read_text(encoding="utf-8"))["revoked"]
         except FileNotFoundError:
@@ -198,7 +198,7 @@ class Authority:
             listed = None
         names = cast("list[object]", listed) if isinstance(listed, list) else [None]
         if not all(isinstance(name, str) and is_chunk(name) for name in names):
-            problem = 'must be like revoked = ["old-arm"]; put that right first: nobody may be forgotten'
+            problem = 'must be like revoked = ["old-arm"]; correct it first, so that no revoked name is lost'
             raise ConfigurationError(where=str(self._revoked_file), problem=problem)
         return frozenset(map(str, names))
 
@@ -212,12 +212,14 @@ class Authority:
             certificate = _load(self.folder / "ca.pem")
             key = serialization.load_pem_private_key(path.read_bytes(), None)
         except FileNotFoundError:
-            problem = f"has no authority; begin one with trade pki init {self.folder}, or name its folder with --ca"
+            problem = f"has no authority; create one with trade pki init {self.folder}, or name its folder with --ca"
             raise NoAuthority(where=str(self.folder), problem=problem) from None
         except (OSError, ValueError, TypeError) as bad:
             raise NoAuthority(where=str(self.folder), problem=f"ca.pem or ca.key cannot be read: {bad}") from None
         if os.name == "posix" and stat.S_IMODE(path.stat().st_mode) & 0o077:
-            problem = f"others can read it, and so be anybody; chmod 600 {path}, and begin a new authority if they did"
+            problem = (
+                f"others can read it, and issue any identity; chmod 600 {path}, and create a new authority if they did"
+            )
             raise NoAuthority(where=str(path), problem=problem)
         if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
             raise NoAuthority(where=str(path), problem="is not the key of ca.pem beside it; take both from one backup")
@@ -227,12 +229,12 @@ class Authority:
         return sorted(path.name for path in (self.folder / "names").glob("[!.]*"))
 
     def _purpose(self, name: str) -> Purpose:
-        """What a name was given for; one whose mark is damaged is nobody else's than a gateway's."""
+        """Returns the purpose of a name; a damaged mark counts as a gateway's."""
         mark = (self.folder / "names" / name).read_text(encoding="utf-8").strip()
         return "container" if mark == "container" else "gateway"
 
     def _take(self, name: str, purpose: Purpose | None) -> bool:
-        """Mark a name as given; returns whether it was before. Raises NameTaken: for another purpose."""
+        """Marks a name as issued; returns whether it was before. Raises NameTaken."""
         marks = self.folder / "names"
         marks.mkdir(mode=0o700, exist_ok=True)
         with contextlib.suppress(FileExistsError):
@@ -240,7 +242,7 @@ class Authority:
             return False
         given = self._purpose(name)
         if purpose not in (None, given):
-            problem = f"is the name of a {given} for ever, not of a {purpose}; choose another name"
+            problem = f"is permanently the name of a {given}, not of a {purpose}; choose another name"
             raise NameTaken(where=name, problem=problem)
         return True
 
@@ -257,7 +259,7 @@ class Authority:
     def _end(self, lasts: timedelta) -> datetime:
         now, end = datetime.now(timezone.utc), self._certificate.not_valid_after_utc
         if now >= end:
-            problem = f"has expired ({end:%Y-%m-%d}); begin a new one in another folder, and issue all names there"
+            problem = f"has expired ({end:%Y-%m-%d}); create a new one in another folder, and issue all names there"
             raise NoAuthority(where=str(self.folder), problem=problem)
         return min(now + lasts, end)
 
@@ -341,11 +343,11 @@ def _hosts(certificate: x509.Certificate) -> list[_Host]:
 
 
 def _hosts_so_far(path: Path) -> list[_Host]:
-    """Whom the last certificate is for."""
+    """Returns the hosts of the latest certificate."""
     try:
         return _hosts(_load(path))
     except (OSError, ValueError):
-        problem = "cannot be read, so what it was for is not known; with --force it is made anew"
+        problem = "cannot be read, so its hosts are unknown; --force makes a new one"
         raise ConfigurationError(where=str(path), problem=problem) from None
 
 
@@ -355,7 +357,7 @@ def _read_key(path: Path, name: str) -> ec.EllipticCurvePrivateKey:
     except (OSError, ValueError, TypeError):
         key = None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        problem = f"is not there or damaged; put it back, or give {name} another one with --force"
+        problem = f"is missing or damaged; restore it, or give {name} another one with --force"
         raise ConfigurationError(where=str(path), problem=problem)
     return key
 

@@ -1,4 +1,4 @@
-"""Addresses: whether one is of this host alone, how it is written, which interface has it, what the host passes on."""
+"""IP addresses: loopback check, form in a URL, addresses of interfaces, forwarding by the host."""
 
 import socket
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ _SYSCTLS: Final = Path("/proc/sys/net")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether nobody beyond this host can reach it; a name other than ``localhost`` counts as reachable."""
+    """Whether only this host can reach it; a name other than ``localhost`` counts as reachable by others."""
     if host == "localhost":
         return True
     try:
@@ -23,12 +23,12 @@ def is_loopback(host: str) -> bool:
 
 
 def in_url(host: str) -> str:
-    """A host as it stands in a URL: IPv6 addresses have brackets there."""
+    """Returns a host as part of a URL, with brackets around IPv6 addresses."""
     return f"[{host}]" if ":" in host else host
 
 
 def addresses() -> Mapping[str, frozenset[str]]:
-    """The addresses of each interface of this host, by its name; empty where the system does not list them."""
+    """Returns the addresses of each interface of this host by name; empty if the system does not list them."""
     import psutil  # noqa: PLC0415 - commands that need no list of interfaces start without it
 
     found: dict[str, set[str]] = {}
@@ -40,12 +40,12 @@ def addresses() -> Mapping[str, frozenset[str]]:
 
 
 def _bare(address: str) -> str:
-    """Without the interface that follows a link-local address."""
+    """Removes the interface from a link-local address."""
     return str(ip_address(address.partition("%")[0]))
 
 
 def forwarding(interfaces: Iterable[str], sysctls: Path = _SYSCTLS) -> list[str]:
-    """The settings of the kernel that have it pass on packets which come in by one of these interfaces."""
+    """Returns the kernel settings that forward packets received on one of these interfaces."""
     on: list[str] = []
     for version in ("ipv4", "ipv6"):
         for name in interfaces:

@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all."""
+"""Atomic file writes: a file appears completely or not at all."""
 
 import os
 import secrets
@@ -8,7 +8,7 @@ __all__ = ["claim", "fresh_beside", "replace"]
 
 
 def claim(path: Path, text: bytes) -> None:
-    """Write a file for this user only. Raises FileExistsError: it is there already."""
+    """Creates a file for this user only. Raises FileExistsError."""
     made = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     try:
         with os.fdopen(made, "wb") as file:
@@ -21,7 +21,7 @@ def claim(path: Path, text: bytes) -> None:
 
 
 def replace(path: Path, text: bytes, mode: int) -> None:
-    """Write a file in place of another in one step."""
+    """Replaces a file atomically."""
     fresh = fresh_beside(path)
     try:
         claim(fresh, text)
@@ -33,5 +33,5 @@ def replace(path: Path, text: bytes, mode: int) -> None:
 
 
 def fresh_beside(path: Path) -> Path:
-    """A name in the same folder that nobody has; what is written there can take the place of the other in one step."""
+    """Returns an unused name in the same folder, from which a file can atomically replace the other one."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")

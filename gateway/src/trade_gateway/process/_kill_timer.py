@@ -1,4 +1,4 @@
-"""What ends this process at a given moment whatever it does, also while it is frozen: timers of the kernel."""
+"""Kernel timers that end this process at a given time, even while it is frozen."""
 
 import ctypes
 import os
@@ -15,31 +15,31 @@ _AT: Final = 1
 
 
 class TimerLease(NamedTuple):
-    """How long a process may stay; seconds of `uptime_s`, so that all processes of a host mean the same."""
+    """How long a process may run, in seconds of `uptime_s`, the same clock for all processes of a host."""
 
     leave_at: float
-    """It is told to leave then, in order."""
+    """When it gets SIGTERM, to shut down in order."""
     until: float
-    """It is ended then."""
+    """When it gets SIGKILL."""
 
     def line(self) -> str:
-        """As `read` reads it."""
+        """Returns it as a line for `read`."""
         return f"{self.leave_at:.6f} {self.until:.6f}"
 
     @classmethod
     def read(cls, line: str) -> "TimerLease":
-        """Raises ValueError: it is none."""
+        """Parses a line. Raises ValueError."""
         leave_at, until = line.split()
         return cls(float(leave_at), float(until))
 
 
 def uptime_s() -> float:
-    """Seconds since this host was started, those in which it was suspended included."""
+    """Returns the seconds since this host was started, including those in suspension."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class KillTimer:
-    """Timers that send this process SIGTERM, and later SIGKILL, unless they are moved on before.
+    """Timers that send this process SIGTERM, and later SIGKILL, unless they are postponed.
 
     Raises:
         ConfigurationError: this system has no such timers.
@@ -51,7 +51,7 @@ class KillTimer:
         self.move(term)
 
     def move(self, term: TimerLease) -> None:
-        """Stay so long instead; a time that has passed is now."""
+        """Sets new times; a time in the past means now."""
         _set(self._end, term.until)
         _set(self._leave, term.leave_at)
 

@@ -1,4 +1,4 @@
-"""What ends a command together with the one that started it: standard input, which that one holds open."""
+"""Ends a command together with its parent process, which holds its standard input open."""
 
 import contextlib
 import os
@@ -10,31 +10,31 @@ from typing import Final
 from trade_gateway.process._kill_timer import KillTimer, TimerLease
 
 _LEAVE_S: Final = 15.0
-"""How long it may take to leave in order; a robot is brought to rest first."""
+"""How long an orderly shutdown may take, in seconds; a robot is brought to rest first."""
 
 
 def end_with_stdin(*, leased: bool = False) -> None:
-    """From now on the end of standard input is as SIGTERM is; who does not leave then is ended.
+    """Treats the end of standard input as SIGTERM; a process that does not shut down then is ended.
 
     Args:
-        leased: it may stay only so long as standard input says. Each line is a `TimerLease`; the first is waited for.
+        leased: limit the run to the leases on standard input. Each line is a `TimerLease`; waits for the first.
 
     Raises:
-        ConfigurationError: there is no way to end it then for certain.
+        ConfigurationError: this system has no timer that ends a process.
     """
-    told = _Told()
-    fence = KillTimer(told.next()) if leased else None
-    threading.Thread(target=_watch, args=(told, fence), name="trade-lifeline", daemon=True).start()
+    leases = _LeaseLines()
+    fence = KillTimer(leases.next()) if leased else None
+    threading.Thread(target=_watch, args=(leases, fence), name="trade-lifeline", daemon=True).start()
 
 
-class _Told:
-    """What is said on standard input."""
+class _LeaseLines:
+    """The leases on standard input."""
 
     def __init__(self) -> None:
         self._said = b""
 
     def next(self) -> TimerLease:
-        """The latest that is said by now; waits for one if there is none. Raises EOFError."""
+        """Returns the latest lease; waits for one if there is none. Raises EOFError."""
         lines: list[bytes] = []
         while not lines:
             data = os.read(sys.stdin.fileno(), 65536)
@@ -44,10 +44,10 @@ class _Told:
         return TimerLease.read(lines[-1].decode())
 
 
-def _watch(told: _Told, fence: KillTimer | None) -> None:
-    with contextlib.suppress(EOFError, OSError):  # it is as gone as can be
+def _watch(leases: _LeaseLines, fence: KillTimer | None) -> None:
+    with contextlib.suppress(EOFError, OSError):  # standard input has ended
         while True:
-            term = told.next()
+            term = leases.next()
             if fence is not None:
                 fence.move(term)
     os.kill(os.getpid(), signal.SIGTERM)

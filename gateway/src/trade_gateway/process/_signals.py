@@ -1,4 +1,4 @@
-"""Signals as events, and how a program stays up until it is asked to leave."""
+"""Signals as events, for programs that run until they are asked to end."""
 
 import gc
 import queue
@@ -13,10 +13,10 @@ from trade.errors import ConfigurationError
 
 
 class SignalEvent:
-    """Used as a `threading.Event`, which may not be set in the handler of a signal.
+    """An event like `threading.Event` that a signal handler can set safely.
 
-    A handler runs on the main thread, amid whatever that is doing. If it just waits for an event, it may have the lock
-    of that event, and setting it would wait for that lock for ever: a robot that does not leave when it is told to.
+    A handler interrupts the main thread. If that thread waits for a `threading.Event`, it may hold the event's lock,
+    and `set` in the handler would deadlock: the robot would ignore the signal.
     """
 
     def __init__(self) -> None:
@@ -24,19 +24,19 @@ class SignalEvent:
         self._bell = queue.SimpleQueue[None]()
 
     def set(self) -> None:
-        """It is asked for; from a handler, too."""
+        """Sets the event; safe in a signal handler."""
         self._asked = True
-        self._bell.put(None)  # of all queues the one that a handler may put into
+        self._bell.put(None)  # the only queue that is reentrant
 
     def clear(self) -> None:
-        """It has been done."""
+        """Clears the event."""
         self._asked = False
 
     def is_set(self) -> bool:
         return self._asked
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is asked for, or for so many seconds; whether it is."""
+        """Waits until the event is set, or for a timeout; returns whether it is set."""
         until = None if timeout is None else time.monotonic() + timeout
         while not self._asked:
             try:
@@ -44,13 +44,13 @@ class SignalEvent:
             except queue.Empty:
                 break
             if self._asked:
-                self._bell.put(None)  # for others who wait
+                self._bell.put(None)  # for other waiting threads
         return self._asked
 
 
 @contextmanager
 def leaving() -> Generator[SignalEvent]:
-    """What Ctrl-C and SIGTERM ask for, so that devices are always left in order."""
+    """Turns Ctrl-C and SIGTERM into an event, so that devices are shut down in order."""
     event = SignalEvent()
 
     def leave(_number: int, _frame: FrameType | None) -> None:
@@ -65,16 +65,16 @@ def leaving() -> Generator[SignalEvent]:
 
 
 def settle() -> None:
-    """To be called once all stands: from now on garbage collections leave out what is there already.
+    """Excludes all existing objects from garbage collection; to be called after start-up.
 
-    A full one looks through all of it, which takes 50 ms in the process of a robot, and every thread waits meanwhile.
+    A full collection would visit them all, which stops every thread of a robot's process for 50 ms.
     """
     gc.collect()
     gc.freeze()
 
 
 def refuse_twice(container: Container, command: str) -> None:
-    """Two containers of one name that stay up would make every look-up ambiguous."""
+    """Raises ConfigurationError if a container of this name is up: two would make every look-up ambiguous."""
     for other in container.containers():
         if other.name == container.name and other.epoch != container.address.epoch:
             problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
@@ -83,7 +83,7 @@ def refuse_twice(container: Container, command: str) -> None:
 
 @contextmanager
 def hangups() -> Generator[SignalEvent]:
-    """What SIGHUP asks for."""
+    """Turns SIGHUP into an event."""
     event = SignalEvent()
 
     def heard(_number: int, _frame: FrameType | None) -> None:

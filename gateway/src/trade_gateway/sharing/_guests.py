@@ -1,4 +1,4 @@
-"""What the gateway offers in other systems, and takes from them, as its file says."""
+"""The gateway's guests: its containers in other systems, which share groups as its file says."""
 
 import threading
 from contextlib import ExitStack
@@ -14,7 +14,7 @@ _AGAIN_S: Final = 0.2
 
 
 class _Guest:
-    """In one other system."""
+    """A guest in one other system."""
 
     def __init__(self, ours: Container, settings: Settings, share: Share) -> None:
         with ExitStack() as leaving:
@@ -30,13 +30,13 @@ class _Guest:
 
 
 class Guests:
-    """In all other systems that a gateway file names."""
+    """The guests in all other systems that a gateway file names."""
 
     def __init__(self) -> None:
         self._guests: dict[str, _Guest] = {}
 
     def apply(self, ours: Container, plan: Plan) -> None:
-        """Be where the file says, with its lists; who was there and stays there is not disturbed.
+        """Opens and closes guests as the file says; unchanged ones are not disturbed.
 
         Raises:
             ConfigurationError: one of them cannot be started; the others are as the file says.
@@ -52,13 +52,13 @@ class Guests:
                 guest.border.share(exported=share.export, imported=share.import_)
 
     def close(self) -> None:
-        """Leave all of them: what their clients set moving stops. Idempotent."""
+        """Leaves all other systems, which stops the motion of their clients. Idempotent."""
         for name in list(self._guests):
             self._guests.pop(name).close()
 
 
 def opened(settings: Settings) -> Container:
-    """A container; the one before may need a moment to let go of its addresses. Raises ConfigurationError."""
+    """Opens a container; retries while the one before still has its addresses. Raises ConfigurationError."""
     for _ in range(_TRIES - 1):
         try:
             return Container(settings)
