@@ -65,7 +65,7 @@ def test_P71_what_a_lost_gateway_had_is_where_it_is_stood_in_for_with_its_state_
     lost = pair.rover.become("a", "elsewhere")
     assert (lost.pid, lost.why.startswith("no lease: ")) == (0, True)
     assert call("count") == 3
-    with pytest.raises(ConfigurationError, match="rover has not asked for it for 2 s"):
+    with pytest.raises(ConfigurationError, match="rover has not requested it for 2 s"):
         pair.base.supervisor.stand_in("a").hand_back()
     pair.link()
     wait_until(pair.handed_back, "rover asks again")
@@ -80,7 +80,7 @@ def test_what_is_given_up_where_it_is_leased_is_tried_where_it_is_stood_in_for(p
     pair.rover.become("a", "given up")
     pair.base.become("a", "up")
     assert pair.rover.supervisor.restart("a", "anna")
-    refused = "no lease: who stands in has it"
+    refused = "no lease: the standby has it"
     wait_until(lambda: pair.rover.become("a", "elsewhere").why == refused, "rover asks again, and is refused")
 
 
@@ -117,5 +117,5 @@ def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
             there.lease(caller, gateway, turn)
         with pytest.raises(AccessDenied, match="only rover"):
             there.keep_for(caller, gateway, turn, 9, one)
-    with pytest.raises(ConfigurationError, match="no container 'b' is stood in for"):
+    with pytest.raises(ConfigurationError, match="no standby for a container 'b'"):
         pair.base.supervisor.stand_in("b")

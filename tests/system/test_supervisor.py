@@ -177,8 +177,8 @@ def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., K
     kept.become("a", "up", restarts=1)
     assert not psutil.pid_exists(hung.pid)
     assert kept.texts()[1:4] == [
-        "a is told to leave: it did not answer within 1 s",
-        "a does not leave and is killed",
+        "a is asked to shut down: it did not answer within 1 s",
+        "a does not shut down and is killed",
         "a crashed (signal 9); back in 0.1 s",
     ]
 
@@ -189,7 +189,7 @@ def test_a_child_that_ignores_being_told_to_leave_is_killed(keeping: Callable[..
     os.kill(stays.pid, signal.SIGSTOP)
     kept.supervisor.close()
     assert not psutil.pid_exists(stays.pid)
-    assert kept.texts()[1:] == ["a does not leave and is killed", "a crashed (signal 9)"]
+    assert kept.texts()[1:] == ["a does not shut down and is killed", "a crashed (signal 9)"]
 
 
 def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_again_with_its_state(
@@ -204,9 +204,9 @@ def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_agai
     assert not psutil.pid_exists(stays.pid)
     assert call("shown") == 1
     assert kept.texts()[1:] == [
-        "a is started again, as anna asks for it",
-        "a is told to leave: it is to start again",
-        "a does not leave and is killed",
+        "a is restarted at the request of anna",
+        "a is asked to shut down: it is to start again",
+        "a does not shut down and is killed",
         f"a is back, process {again.pid}",
     ]
 

@@ -92,7 +92,7 @@ def test_a_lock_is_free_when_the_process_that_has_it_has_ended_and_not_before(tm
         process = subprocess.Popen(["sleep", "1000"], pass_fds=locked)
     try:
         assert not is_free(path)
-        with pytest.raises(BlockingIOError, match="the one before has not ended"), alone(path):
+        with pytest.raises(BlockingIOError, match="the previous process has not ended"), alone(path):
             go.set()
     finally:
         process.kill()

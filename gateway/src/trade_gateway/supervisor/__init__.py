@@ -1,4 +1,4 @@
-"""Containers as child processes: started in order, asked whether they answer, started again, their state kept."""
+"""Supervision of containers as child processes: ordered start, health checks, restarts, saved state."""
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.config._children import Child, read_children

@@ -1,4 +1,4 @@
-"""A child with all that belongs to it, and what is told of it."""
+"""A supervised child, and the reports about it."""
 
 import math
 from collections.abc import Callable
@@ -16,23 +16,23 @@ __all__ = ["ChildInfo", "News", "Unit"]
 
 
 class ChildInfo(Struct, frozen=True):
-    """How a child fares."""
+    """The state of a child."""
 
     name: str
     state: str
     """``stopped``, ``starting``, ``up``, ``silent``, ``stopping``, ``waiting``, ``given up`` or ``elsewhere``."""
     pid: int
-    """0: it has no process."""
+    """The process id; 0 without a process."""
     restarts: int
     why: str
-    """Why it ended, or is ended; empty while it is up."""
+    """Why it ended or is being ended; empty while it is up."""
     rss_mb: float = 0.0
     saved_at: float = 0.0
-    """What all its objects knew then, in seconds since the epoch, is on disk; 0: nothing yet."""
+    """When the state of all its objects was last saved, in seconds since the Unix epoch; 0: not yet."""
 
 
 class News(Struct, frozen=True):
-    """Something has become of a child."""
+    """A report about a child."""
 
     child: str
     state: str
@@ -41,7 +41,7 @@ class News(Struct, frozen=True):
 
 
 class Unit:
-    """A child with all that belongs to it; only the supervisor's thread touches it."""
+    """A child with its process and policy; used only by the supervisor's thread."""
 
     def __init__(self, child: Child, grace_s: float, clock: Callable[[], float]) -> None:
         self.child = child
@@ -49,21 +49,21 @@ class Unit:
         self.life = Life(child.terms, grace_s=grace_s)
         self.process: Process | None = None
         self.boot = 0
-        """Counts processes: what is told of an earlier one counts for nothing."""
+        """Counts processes, so that reports about an earlier one are ignored."""
         self.furnished: CreatedObjects | None = None
         self.begun = False
         self.was_up = False
         self.leaving = ""
-        """Why it is not wanted any more."""
+        """Why it is to end."""
         self.save_at = math.inf
         self.saved_at = 0.0
         self.lease: Leased | None = None
-        self.told: TimerLease | None = None
-        """How long its process knows that it may stay."""
+        self.sent: TimerLease | None = None
+        """The lease that its process has received."""
 
     @property
     def due_s(self) -> float:
-        """How long until something is to be done for it."""
+        """The time until its next action, in seconds."""
         now = self._clock()
         leased_s = math.inf if self.lease is None else self.lease.due - uptime_s()
         return min(self.life.deadline - now, self.save_at - now, leased_s)
@@ -74,35 +74,35 @@ class Unit:
 
     @property
     def to_begin(self) -> bool:
-        """Whether it is to be started for the first time, or since it was elsewhere."""
+        """Whether it is to be started for the first time, or again after it was elsewhere."""
         return not self.begun and not self.life.alive and not self.given_up
 
     @property
     def elsewhere(self) -> bool:
-        """Whether it has no process here as it may have none."""
+        """Whether it has no process here because it has no lease."""
         return self.lease is not None and self.to_begin
 
     @property
     def given_up(self) -> bool:
-        """Whether only somebody who asks for it starts it again."""
+        """Whether only an explicit request restarts it."""
         return self.life.state is State.GIVEN_UP
 
     def may_be_up(self) -> bool:
-        """Whether no other host has it, for all that is known now."""
+        """Whether it may run here: without a lease always, else while it has one."""
         if self.lease is None:
             return True
         wanted = self.life.alive or not (self.leaving or self.given_up)
         return self.lease.look(alive=self.life.alive, wanted=wanted)
 
     def stay(self) -> None:
-        """Its process is told how long it may stay, if that is something else than before."""
+        """Sends its process a changed lease."""
         term = None if self.lease is None else self.lease.term
-        if self.process is not None and term is not None and term != self.told:
+        if self.process is not None and term is not None and term != self.sent:
             self.process.stay(term)
-            self.told = term
+            self.sent = term
 
     def info(self) -> ChildInfo:
-        """How it fares."""
+        """Returns its state."""
         lease, life = self.lease, self.life
         away = lease is not None and self.elsewhere
         return ChildInfo(

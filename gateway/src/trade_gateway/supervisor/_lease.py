@@ -1,8 +1,8 @@
-"""Which of two gateways may have a container up: told what happened and when, they never say both. No I/O, no clock.
+"""The lease protocol: which of two gateways may run a container. At most one may at any time. No I/O, no clock.
 
-The one that stands in is the arbiter: it lets the other one have the container for so long at a time. Each counts by
-its own clock, the holder from before it asked, the arbiter from when it answered, and the arbiter waits longer by more
-than their clocks can differ. So whatever is lost, late or frozen in between, one of them at most has it.
+The standby gateway is the arbiter. It leases the container to the other one, the holder, for a limited time. Each uses
+its own clock: the holder counts from before its request, the arbiter from its answer, and the arbiter waits longer by
+more than their clocks can differ. So at most one has the container, whatever message is lost, late or frozen.
 """
 
 import math
@@ -15,38 +15,38 @@ from trade_gateway.process._kill_timer import TimerLease
 __all__ = ["Arbiter", "Holder", "Lease", "waits_s"]
 
 DRIFT: Final = 0.025
-"""Of a lease: more than two clocks differ of which each is wrong by 1 %."""
+"""Share of a lease; more than the difference of two clocks with an error of 1 % each."""
 MARGIN_S: Final = 1.0
-"""How long the kernel may take to end a process whose time is over."""
+"""How long the kernel may take to end a process whose lease has expired."""
 _LEAVES: Final = 3
-"""The last third of a lease is for leaving in order."""
+"""The last third of a lease is for an orderly shutdown."""
 _ASKS: Final = 6
-"""So often within a lease it is asked for anew."""
+"""How often a lease is renewed within its time."""
 
 
 def waits_s(lease_s: float) -> float:
-    """How long the arbiter waits after it gave a lease."""
+    """Returns how long the arbiter waits after it gave a lease, in seconds."""
     return lease_s * (1 + DRIFT) + MARGIN_S
 
 
 class Lease(Struct, frozen=True):
-    """What the arbiter answers."""
+    """The arbiter's answer to a request."""
 
     turn: str
-    """Names the holding that it belongs to; empty: it is refused."""
+    """The id of the lease with its renewals; empty: refused."""
     lease_s: float = 0.0
     why: str = ""
-    """It is refused."""
+    """Why it is refused."""
     states: bytes = b""
-    """With a turn that the asker did not name: of the container's objects, as they were saved last."""
+    """With a new turn: the last saved states of the container's objects."""
 
 
 class Holder:
-    """Asks for a lease, again and again; times are seconds of its own host's `uptime_s`.
+    """The holder: requests and renews a lease. Times are seconds of its own host's `uptime_s`.
 
     Args:
-        now: the time.
-        arbiter: its name.
+        now: the current time.
+        arbiter: the arbiter's name.
     """
 
     def __init__(self, now: float, arbiter: str) -> None:
@@ -54,29 +54,29 @@ class Holder:
         self.why = f"{arbiter} was not asked yet"
         """Why it has no lease."""
         self.term = TimerLease(-math.inf, -math.inf)
-        """How long the container may stay up."""
+        """How long the container may run."""
         self.states = b""
-        """What the container is to begin with, once it is held."""
+        """The states with which the container starts."""
         self._arbiter = arbiter
         self._ask_at = now
         self._every_s = 1.0
 
     def held(self, now: float) -> bool:
-        """Whether the container may be up."""
+        """Whether the container may run."""
         return now < self.term.leave_at
 
     @property
     def within_s(self) -> float:
-        """How long an answer may take: no longer than two questions."""
+        """The timeout of a request: two intervals."""
         return 2 * self._every_s
 
     @property
     def due(self) -> float:
-        """When to look next."""
+        """When to check next."""
         return min(self._ask_at, self.term.leave_at) if self.turn else self._ask_at
 
     def asks(self, now: float) -> bool:
-        """Whether it is time to ask; the answer counts from now."""
+        """Whether it is time for a request; its lease counts from now."""
         if now >= self.term.leave_at and self.turn:
             self.turn, self.why = "", self.why or f"{self._arbiter} does not answer"
         if now < self._ask_at:
@@ -85,8 +85,8 @@ class Holder:
         return True
 
     def answered(self, asked_at: float, turn: str, lease: Lease) -> None:
-        """An answer to what was asked then, under that turn, has come."""
-        if turn != self.turn:  # what it had when it asked has ended meanwhile
+        """Handles the answer to a request of that time and turn."""
+        if turn != self.turn:  # its lease at the request has ended meanwhile
             return
         if not lease.turn:
             self.why = lease.why
@@ -98,28 +98,27 @@ class Holder:
         self.term = TimerLease(until - lease.lease_s / _LEAVES, until)
 
     def unanswered(self, why: str) -> None:
-        """A question was lost, or could not be asked."""
+        """Handles a request that was lost or could not be sent."""
         self.why = why
 
 
 class Arbiter:
-    """Gives leases, and has the container up itself once the last one is over for certain.
+    """The arbiter: gives leases, and runs the container itself once the last one has certainly expired.
 
-    It begins as if the container were up here and were to be given back: a boot of which nothing is known any more may
-    have left it behind.
+    It starts as if the container ran here and had to be handed back, because an earlier boot may have left it running.
 
     Args:
-        asker: the name of the other one.
-        mark: no other boot has it.
+        asker: the name of the other gateway.
+        mark: an id unique to this boot.
     """
 
     def __init__(self, asker: str, mark: str) -> None:
         self.mine = True
-        """Whether it is here, or is to be, or has not ended yet."""
+        """Whether the container runs here, is to run here, or has not ended yet."""
         self.handing = True
-        """Whether it is to end here and to be given back."""
+        """Whether it is to end here and to be handed back."""
         self.turn = ""
-        """Whose states count; empty: its own."""
+        """The turn whose states are saved; empty: its own."""
         self.asked_at = -math.inf
         self._asker = asker
         self._free_at = math.inf
@@ -128,18 +127,18 @@ class Arbiter:
 
     @property
     def due(self) -> float:
-        """When nobody else can have it any more, unless it is asked for before."""
+        """When the other gateway's lease has certainly expired, unless it is renewed."""
         return math.inf if self.mine else self._free_at
 
     @property
     def why(self) -> str:
-        """Why it is not to be here."""
+        """Why the container is not to run here."""
         if self.handing:
             return f"it is for {self._asker} again"
         return f"{self._asker} has it" if self.turn else f"{self._asker} may have it"
 
     def asked(self, now: float, turn: str, lease_s: float) -> bool:
-        """Whether the other one gets it for so long; then `turn` is its turn."""
+        """Handles a request; returns whether the other gateway gets the lease, then `turn` is its turn."""
         self.asked_at = now
         if self.mine:
             return False
@@ -150,18 +149,18 @@ class Arbiter:
         return True
 
     def looked(self, now: float) -> bool:
-        """Have it, if nobody else can; returns whether that has just come about."""
+        """Takes the container if the last lease has expired; returns whether it just did."""
         if self.mine or now < self._free_at:
             return False
         self.mine, self.turn = True, ""
         return True
 
     def hand_back(self) -> None:
-        """It is to end here; `ended` says when it has."""
+        """Begins to hand the container back; `ended` completes that."""
         self.handing = self.mine
 
     def ended(self, now: float, lease_s: float) -> None:
-        """It has ended here, if it was to, and is for the other one alone until a lease of so long is over."""
+        """Completes the hand-back: the container ended here, and is the other gateway's for at least one lease."""
         if self.handing:
             self.mine = self.handing = False
             self._free_at = now + waits_s(lease_s)

@@ -1,4 +1,4 @@
-"""Both ends of a lease: the gateway that asks for a container, and the one that stands in."""
+"""Both ends of a lease: the gateway that requests a container, and its standby."""
 
 import math
 import secrets
@@ -22,30 +22,30 @@ from trade_gateway.supervisor._store import StateStore
 __all__ = ["Asking", "Leased", "StandIn"]
 
 _KEEP_S: Final = 5.0
-"""How long the arbiter may take to keep states."""
+"""How long the arbiter may take to save states, in seconds."""
 _MOST_BYTES: Final = 16 * 1024 * 1024
-"""Of the states of one container."""
+"""The limit of the states of one container, in bytes."""
 _LOOK_EVERY_S: Final = 0.25
-"""Whether the process before has ended."""
+"""How often to check whether the previous process has ended, in seconds."""
 
 Keep = Callable[[Mapping[str, Any]], bool]
 """Saves states; returns whether they are on disk."""
 
 
 class Leased(Protocol):
-    """What a supervisor needs to know; told and asked on its thread alone, but for what `load` and `keep` give."""
+    """The supervisor's view of a lease; used only on its thread, except the results of `load` and `keep`."""
 
     lock: Path
-    """What its process has for its life."""
+    """The lock file that its process holds for its life."""
 
     @property
     def why(self) -> str:
-        """Why the container is not to be up."""
+        """Why the container may not run here."""
         ...
 
     @property
     def term(self) -> TimerLease | None:
-        """How long it may stay up; None: as long as this gateway has it."""
+        """How long the container may run; None: as long as this gateway has it."""
         ...
 
     @property
@@ -54,31 +54,31 @@ class Leased(Protocol):
         ...
 
     def look(self, *, alive: bool, wanted: bool) -> bool:
-        """Do what is due. Returns whether the container may be up.
+        """Does what is due; returns whether the container may run here.
 
         Args:
-            alive: whether it has a process.
-            wanted: whether it would be up here, if it may.
+            alive: whether the container has a process.
+            wanted: whether it would run here with a lease.
         """
         ...
 
     def load(self) -> dict[str, Any]:
-        """What it is to begin with."""
+        """Returns the states with which it starts."""
         ...
 
     def keep(self) -> Keep:
-        """Where to save what is asked for from now on."""
+        """Returns the function that saves states read from now on."""
         ...
 
 
 class Asking:
-    """The end that needs a lease.
+    """The end that requests a lease.
 
     Args:
         child: the container.
-        member: the container that asks; it may be another one each time.
-        post: has something done on the supervisor's thread.
-        tell: is told what is wrong with saving.
+        member: returns the container that requests; it may change.
+        post: runs a function on the supervisor's thread.
+        tell: called with a problem of saving, and with its end.
         lock: see `Leased`.
     """
 
@@ -99,7 +99,7 @@ class Asking:
         self._holder = Holder(uptime_s(), self._from)
         self._states: dict[str, Any] = {}
         self._begun = ""
-        """The turn that these states are of, or of which they were at first."""
+        """The turn in which these states were received."""
         self._number = 0
         self._trouble = ""
 
@@ -141,7 +141,7 @@ class Asking:
                 raise ConfigurationError(where=self._name, problem=f"its states take more than {_MOST_BYTES} bytes")
             keep = self._function("keep_child").with_(deadline_s=_KEEP_S)
             kept = bool(turn) and keep(self._name, self._member().name, turn, number, data)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the container goes on
+        except Exception as error:  # noqa: BLE001 - the container continues after any error
             self._say(str(error))
             return False
         self._say("" if kept else f"{self._from} does not keep it")
@@ -149,7 +149,9 @@ class Asking:
 
     def _say(self, trouble: str) -> None:
         if bool(trouble) != bool(self._trouble):
-            what = f"is not saved: {trouble}; all else goes on" if trouble else f"is saved again, by {self._from}"
+            what = (
+                f"is not saved: {trouble}; the container continues" if trouble else f"is saved again, by {self._from}"
+            )
             self._tell(f"the state of {self._name} {what}")
         self._trouble = trouble
 
@@ -159,7 +161,7 @@ class Asking:
             run = ask.start(self._name, self._member().name, turn)
         except TradeError as error:
             seen = not isinstance(error, NoSuchService)
-            self._holder.unanswered(str(error) if seen else f"{self._from} is not seen")
+            self._holder.unanswered(str(error) if seen else f"{self._from} is not visible")
             return
         run.when_done(lambda run: self._post(partial(self._answered, now, turn, run)))
 
@@ -179,13 +181,13 @@ class Asking:
 
 
 class StandIn:
-    """The end that gives leases, and has the container while there can be none.
+    """The standby's end: gives leases, and runs the container while the other gateway has none.
 
     Args:
         child: the container.
-        store: where states are kept.
+        store: the store of states.
         lock: see `Leased`.
-        rung: has the supervisor look.
+        rung: wakes the supervisor.
     """
 
     def __init__(self, child: Child, store: StateStore, lock: Path, rung: Callable[[], None]) -> None:
@@ -196,9 +198,9 @@ class StandIn:
         self._rung = rung
         self._lease_s = 0.0
         self._longest_s = 0.0
-        """No lease was ever longer, by what the store knows."""
+        """The longest lease ever given, from the store."""
         self._guard = threading.Lock()
-        """Of the arbiter and of the number of the last save."""
+        """Guards the arbiter and the number of the last save."""
         self._arbiter = Arbiter(self._asker, secrets.token_hex(4))
         self._saved = 0
         self._look_at = 0.0
@@ -207,7 +209,7 @@ class StandIn:
     # --- on the supervisor's thread
 
     def go_by(self, child: Child) -> None:
-        """Leases are as long as its table says from now on."""
+        """Applies the lease time of the container's table from now on."""
         lease_s, own = child.terms.lease_s, f"{self._name} leases"  # no container has a space in its name
         known_s = max(self._longest_s, self._store.load(own).get("longest_s", 0.0))
         if lease_s > known_s:
@@ -226,7 +228,7 @@ class StandIn:
     def due(self) -> float:
         return min(self._look_at, self._arbiter.due)
 
-    def look(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - given up here, it is nowhere
+    def look(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - one given up here runs nowhere
         ended, now = not alive and is_free(self.lock), uptime_s()
         with self._guard:
             if ended:
@@ -245,7 +247,7 @@ class StandIn:
     # --- from other threads
 
     def lease(self, caller: str | None, gateway: str, turn: str) -> Lease:
-        """The other gateway asks; ``caller`` is None where nobody can prove who it is. Raises AccessDenied."""
+        """Handles a request of the other gateway; ``caller`` is None without certificates. Raises AccessDenied."""
         self._check(caller, gateway)
         with self._guard:
             given = self._arbiter.asked(uptime_s(), turn, self._lease_s)
@@ -253,16 +255,16 @@ class StandIn:
             if given and its != turn:
                 self._saved = 0
         if not given:
-            return Lease("", why="who stands in has it")
+            return Lease("", why="the standby has it")
         states = b"" if its == turn else msgspec.msgpack.encode(self.load())
         return Lease(its, self._lease_s, states=states)
 
     def keep_for(self, caller: str | None, gateway: str, turn: str, number: int, states: bytes) -> bool:
-        """Save what the other gateway's container knows, unless it is late; returns whether it is on disk.
+        """Saves the states of the other gateway's container, unless they are late; returns whether they are on disk.
 
         Raises:
-            AccessDenied: it is another gateway.
-            ConfigurationError: it is no states, or too much.
+            AccessDenied: the caller is another gateway.
+            ConfigurationError: the states are invalid or too large.
         """
         self._check(caller, gateway)
         problem = f"more than {_MOST_BYTES} bytes" if len(states) > _MOST_BYTES else ""
@@ -275,12 +277,12 @@ class StandIn:
         return self._store.save(self._name, known, lambda: self._is_newest(turn, number))
 
     def hand_back(self) -> None:
-        """Save it, end it here, and let the other gateway have it. Raises ConfigurationError: that one is not there."""
+        """Saves and ends the container here, for the other gateway. Raises ConfigurationError if that is absent."""
         with self._guard:
             if not self._arbiter.mine:
-                problem = f"it is not here: {self._arbiter.why}"
+                problem = f"it does not run here: {self._arbiter.why}"
             elif uptime_s() - self._arbiter.asked_at > self._lease_s:
-                problem = f"{self._asker} has not asked for it for {self._lease_s:g} s; is it up, and is this one seen?"
+                problem = f"{self._asker} has not requested it for {self._lease_s:g} s; is it up and connected?"
             else:
                 self._arbiter.hand_back()
                 problem = ""
@@ -298,7 +300,7 @@ class StandIn:
     def _check(self, caller: str | None, gateway: str) -> None:
         asks = gateway if caller is None else caller
         if asks != self._asker:
-            rule = f"only {self._asker} has it otherwise"
+            rule = f"only {self._asker} may request it"
             raise AccessDenied(who=asks, verb="call", what=f"the lease of {self._name}", rule=rule)
 
 

@@ -1,4 +1,4 @@
-"""The objects that a child's table names: made with their state once its process is up, and saved."""
+"""Creates the objects of a child's table with their saved state, and saves it."""
 
 import re
 import threading
@@ -19,7 +19,7 @@ _LOOK_EVERY_S: Final = 0.02
 
 
 def function_of(member: Container, container: str, name: str, *, epoch: str, wait_s: float) -> Handle:
-    """A function of one boot of a container, as soon as it is seen. Raises NoSuchService."""
+    """Waits for a function of one boot of a container. Raises NoSuchService."""
     wanted, until, pause = (
         where(name=name, group=GROUP, container=container),
         time.monotonic() + wait_s,
@@ -35,7 +35,7 @@ def function_of(member: Container, container: str, name: str, *, epoch: str, wai
 
 
 def lacking(member: Container, part: ContainerSpec) -> list[ObjectSpec]:
-    """What the file wants made in a container, and it does not offer."""
+    """Returns the objects of the file that a container does not offer."""
     if not part.entry.providers:
         return []
     found = member.services(where(container=part.name))
@@ -46,15 +46,15 @@ def lacking(member: Container, part: ContainerSpec) -> list[ObjectSpec]:
 
 
 def make(instantiate: Handle, made: ObjectSpec, *, wait_s: float, state: Any = None) -> tuple[Handle, ...]:
-    """Have an object made; handles of its services. Raises what ``instantiate`` does."""
+    """Creates an object in a container; returns handles of its services. Raises what ``instantiate`` raises."""
     args = made.args if isinstance(made.args, Mapping) else tuple(made.args)
-    told = (made.class_, args, tuple(made.groups))
+    wanted = (made.class_, args, tuple(made.groups))
     ask = instantiate.with_(deadline_s=wait_s)
-    return ask(*told) if state is None else ask(*told, state)
+    return ask(*wanted) if state is None else ask(*wanted, state)
 
 
 def name_of(made: ObjectSpec, known: Mapping[str, object]) -> str:
-    """A name for an object that no other one of the same container has, and the next one in its place has, too."""
+    """Returns a name for an object, unique in its container and the same after a restart."""
     name = " ".join((made.class_, *made.groups))
     return next(one for one in (name, *(f"{name} #{n}" for n in range(2, len(known) + 3))) if one not in known)
 
@@ -64,28 +64,28 @@ _MADE_S: Final = 30.0
 
 
 class CreatedObjects(NamedTuple):
-    """A child that has all that its table names."""
+    """A child with all objects of its table."""
 
     clock: Handle
-    """What it is asked for, to see whether it answers."""
+    """The service for health checks."""
     made: dict[str, Handle]
-    """A service of each object that may have a state, by the object's name."""
+    """A service of each object that may have a state, by object name."""
     problems: list[str]
 
 
 def furnish(
     member: Callable[[], Container], child: Child, started: Started, states: Mapping[str, Any]
 ) -> CreatedObjects:
-    """Wait until a child is seen, and make its objects; each has its state before anybody can call it.
+    """Waits until a child is visible, and creates its objects; each has its state before the first call.
 
     Args:
-        member: the container that asks; if it is another one meanwhile, that one goes on.
-        child: which.
+        member: returns the calling container; if it changes meanwhile, the new one continues.
+        child: the child.
         started: its process.
-        states: by the names of its objects.
+        states: the states by object name.
 
     Raises:
-        TradeError: it is not seen, or an object cannot be made, or is pinned to this host and must not be (S20).
+        TradeError: the child is not visible, or an object cannot be created or is wrongly pinned to this host (S20).
     """
     made: dict[str, Handle] = {}
     problems: list[str] = []
@@ -109,9 +109,7 @@ def _function(member: Callable[[], Container], child: Child, started: Started, n
             return _function(member, child, started, name)
         if not isinstance(unseen, NoSuchService):
             raise
-    problem = (
-        f"{child.name} is not seen within {_SEEN_S:g} s; does its certificate, its policy or its connect let it in?"
-    )
+    problem = f"{child.name} was not visible within {_SEEN_S:g} s; check its certificate, its policy and its connect"
     raise ConfigurationError(where=f"container.{child.name}", problem=problem)
 
 
@@ -120,33 +118,33 @@ def _made(instantiate: Handle, one: ObjectSpec, state: Any, problems: list[str])
         try:
             return make(instantiate, one, wait_s=_MADE_S, state=state)
         except CannotInstantiate as refused:
-            problems.append(f"{one.class_} begins anew, as it does not take its state: {refused.problem}")
+            problems.append(f"{one.class_} starts without its saved state, which it refused: {refused.problem}")
     return make(instantiate, one, wait_s=_MADE_S)
 
 
 def _refuse_pinned(one: ObjectSpec, services: tuple[Handle, ...]) -> None:
     drives = sorted({name for service in services for name in _pinned_by(service)})
     if drives:
-        problem = f"it drives {', '.join(drives)} of this host; only a class that is relocatable can be back elsewhere"
+        problem = f"it drives {', '.join(drives)} of this host; only a relocatable class can run on another host"
         raise ConfigurationError(where=one.class_, problem=problem)
 
 
 def _pinned_by(service: Handle) -> tuple[str, ...]:
-    """What it drives that its class does not say can be reached from elsewhere. Raises ServiceGone: it is not seen."""
+    """Returns the resources that pin a service to this host. Raises ServiceGone if it is not visible."""
     until, pause = time.monotonic() + _SEEN_S, threading.Event()
     while True:
         try:
             return () if service.meta.get("relocatable") else service.resources
-        except ServiceGone:  # it is called before it is heard of
+        except ServiceGone:  # its announcement has not arrived yet
             if time.monotonic() > until:
                 raise
         pause.wait(_LOOK_EVERY_S)
 
 
 def save(member: Container, furnished: CreatedObjects) -> dict[str, Any]:
-    """The states of a child's objects, by name; without those that are in use, moving or not there.
+    """Returns the states of a child's objects by name, without objects that are in use, moving or absent.
 
-    What has no state is not asked again.
+    Objects without a state are not asked again.
     """
     states: dict[str, Any] = {}
     for name, service in list(furnished.made.items()):
@@ -154,7 +152,7 @@ def save(member: Container, furnished: CreatedObjects) -> dict[str, Any]:
             state = member.save_state(member.handle(service.key))
         except ConfigurationError:
             del furnished.made[name]
-        except Exception:  # noqa: BLE001, S112 - what save_state raises comes as its own type; the state of before stays
+        except Exception:  # noqa: BLE001, S112 - save_state raises the object's own types; the earlier state stays
             continue
         else:
             if state is not None:

@@ -1,4 +1,4 @@
-"""One process of a child: started with a lifeline to this one, watched by a file descriptor, ended."""
+"""The process of a child: started with a pipe to its standard input, watched by a pidfd, ended."""
 
 import contextlib
 import os
@@ -18,21 +18,21 @@ from trade_gateway.supervisor._single_instance import alone
 __all__ = ["Process", "rss_mb"]
 
 _LONGEST: Final = 300
-"""Characters of its last words."""
+"""The longest quotation of its last line, in characters."""
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 
 
 class Process:
-    """``trade WORDS --json`` as a child process. It leaves when this process ends, however that ends.
+    """``trade WORDS --json`` as a child process, which ends when this process ends for any reason.
 
     Args:
-        child: which.
-        logs: a folder for what it complains of, in ``NAME.log``; of the one before in ``NAME.1.log``.
-        lock: a file that it locks for its life, if it must be the only one.
-        term: how long it may stay unless it is told otherwise; None: as long as this process.
+        child: the child.
+        logs: the folder for its standard error, ``NAME.log``; the previous process's is ``NAME.1.log``.
+        lock: a file that it locks for its life, if it must be unique.
+        term: its first lease; None: it may run as long as this process.
 
     Raises:
-        OSError: there can be no further process.
+        OSError: the process cannot be started.
     """
 
     def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: TimerLease | None = None) -> None:
@@ -48,7 +48,7 @@ class Process:
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL if errors is None else errors,
                     env=dict(child.environment),
-                    start_new_session=True,  # Ctrl-C is for this process, which tells them in their order
+                    start_new_session=True,  # Ctrl-C is for this process, which ends them in order
                     pass_fds=locked,
                 )
         finally:
@@ -77,15 +77,15 @@ class Process:
 
     @property
     def output(self) -> int:
-        """A file descriptor that can be read when it has said something, or will say nothing any more."""
+        """A file descriptor that becomes readable with new output, or at its end."""
         assert self._process.stdout is not None  # noqa: S101 - a pipe
         return self._process.stdout.fileno()
 
     def read(self) -> tuple[Started | None, bool]:
-        """What it says once it is up, if this is it; and whether there may be more.
+        """Reads the line that the process prints once it is up, or None; and whether more may follow.
 
         Raises:
-            ValueError: its first line is something else.
+            ValueError: the first line is another one.
         """
         try:
             data = os.read(self.output, 65536)
@@ -100,20 +100,20 @@ class Process:
         return msgspec.json.decode(line, type=Started), True
 
     def stay(self, term: TimerLease) -> None:
-        """It may stay so long; one that does not listen is as far as before."""
+        """Sends a lease; a process that does not read keeps the earlier one."""
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._input, f"{term.line()}\n".encode())
 
     def leave(self) -> None:
-        """Tell it to leave."""
+        """Sends SIGTERM."""
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """End it at once; the watchdogs of its devices stop what moves."""
+        """Sends SIGKILL; the watchdogs of its devices stop their motion."""
         self._process.kill()
 
     def close(self) -> str:
-        """It has ended: how, in words. To be called once `end` says so."""
+        """Describes how it ended; to be called when `end` becomes readable."""
         os.close(self.end)
         code = self._forget()
         if code < 0:
@@ -138,7 +138,7 @@ class Process:
 
 
 def rss_mb(pid: int) -> float:
-    """Resident memory of a process, in MB; 0 if there is none."""
+    """Returns the resident memory of a process in MB; 0 without a process."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * _PAGE / 1e6
     except (OSError, IndexError):
@@ -146,7 +146,7 @@ def rss_mb(pid: int) -> float:
 
 
 def _fresh(log: Path) -> int | None:
-    """An empty log; None where none can be written: a full disk keeps nobody from running."""
+    """Opens an empty log; None if that fails, since a full disk must not stop a child."""
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
         if log.exists():

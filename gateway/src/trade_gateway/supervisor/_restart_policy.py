@@ -1,4 +1,4 @@
-"""The restart policy of one child as a state machine: it gets events with their times and says what to do. No I/O."""
+"""The restart policy of one child: a state machine from events with their times to actions. No I/O."""
 
 import enum
 import math
@@ -10,46 +10,46 @@ from trade_gateway.config._children import Supervised
 __all__ = ["GRACE_S", "Life", "State", "Transition"]
 
 START_S: Final = 60.0
-"""How long it may take from its first instruction until it is up."""
+"""How long a child may take to start, in seconds."""
 SAVE_S: Final = 6.0
-"""How long the state of one that is to end may take to be saved."""
+"""How long saving its state before its end may take, in seconds."""
 GRACE_S: Final = 20.0
-"""How long it may take to leave: a robot is brought to rest before."""
+"""How long its shutdown may take, in seconds: a robot is brought to rest first."""
 _FIRST_S: Final = 0.1
 _LONGEST_S: Final = 30.0
-"""The wait before it is started again doubles from the one to the other."""
+"""The wait before a restart doubles from the first to the longest."""
 
 
 class State(enum.Enum):
-    """Where a child stands."""
+    """The state of a child."""
 
     STOPPED = "stopped"
-    """Not started yet, or ended and not to be started again."""
+    """Not started yet, or ended without restart."""
     STARTING = "starting"
     UP = "up"
     SILENT = "silent"
-    """Its process lives and has left a question unanswered."""
+    """Its process runs but did not answer the last health check."""
     STOPPING = "stopping"
     WAITING = "waiting"
-    """It ended unasked, and is started again after a while."""
+    """It ended by itself, and is restarted after a wait."""
     GIVEN_UP = "given up"
-    """It ended unasked too often; only somebody who asks for it starts it again."""
+    """It ended by itself too often; only an explicit request restarts it."""
 
 
 class Transition(enum.Enum):
-    """What is to be done now."""
+    """An action for the supervisor."""
 
     LAUNCH = enum.auto()
     ASK = enum.auto()
-    """Whether it answers."""
+    """Send a health check."""
     SAVE = enum.auto()
-    """Its state, before it is told to leave."""
+    """Save its state before its shutdown."""
     LEAVE = enum.auto()
     KILL = enum.auto()
 
 
 class _After(enum.Enum):
-    """What its end means."""
+    """What follows its end."""
 
     STOPPED = enum.auto()
     START = enum.auto()
@@ -60,22 +60,22 @@ _ALIVE: Final = frozenset((State.STARTING, State.UP, State.SILENT, State.STOPPIN
 
 
 class Life:
-    """One child. Times are seconds of a clock that never jumps.
+    """The life of one child. Times are seconds of a monotonic clock.
 
     Args:
-        terms: how it is looked after; may be replaced at any time.
-        grace_s: how long it may take to leave.
+        terms: its supervision; may be replaced at any time.
+        grace_s: how long its shutdown may take, in seconds.
     """
 
     def __init__(self, terms: Supervised, *, grace_s: float = GRACE_S) -> None:
         self.terms = terms
         self.state = State.STOPPED
         self.why = ""
-        """Why it is ended, or has ended."""
+        """Why it ended or is being ended."""
         self.restarts = 0
-        """How often it was started again, by itself or because somebody asked."""
+        """How often it was restarted, automatically or by request."""
         self.wait_s = 0.0
-        """How long it waits until it is started again, once it waits."""
+        """The wait before its next restart, in seconds."""
         self.deadline = math.inf
         """When `due` is to be called."""
         self._grace_s = grace_s
@@ -83,7 +83,7 @@ class Life:
         self._failures: deque[float] = deque()
         self._after = _After.FAILED
         self._next: deque[Transition] = deque()
-        """What is still to be tried to end it."""
+        """The remaining steps to end it."""
         self._asked = -math.inf
         self._missed = 0
 
@@ -94,41 +94,41 @@ class Life:
 
     @property
     def _was_up(self) -> bool:
-        """Whether there may be a state to save, though it may not be told any more."""
+        """Whether it may have a state to save."""
         return self.state in (State.UP, State.SILENT)
 
-    # --- told by who wants it up or down
+    # --- requests
 
     def start(self, now: float) -> Transition | None:
-        """It is wanted: at once if it waits or was given up, again if it runs."""
+        """Starts it, also if it waits or was given up; restarts it if it runs."""
         self._failures.clear()
         if not self.alive:
             return self._launch(now)
         return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
     def stop(self, now: float, why: str, *, save: bool = True) -> Transition | None:
-        """It is not wanted any more; its state may be worth nothing any more, either."""
+        """Ends it, with or without saving its state."""
         if self.alive:
             return self._end(now, why, _After.STOPPED, save=save and self._was_up)
         self._rest(State.STOPPED)
         return None
 
-    # --- told by who watches it
+    # --- events
 
     def up(self, now: float) -> None:
-        """All that it is to have in it is there."""
+        """It is up with all its objects."""
         if self.state is State.STARTING:
             self.state, self.why, self._missed = State.UP, "", 0
             self.deadline = self._tick(now)
 
     def answered(self, now: float) -> None:
-        """It has answered the question asked last."""
+        """It answered the last health check."""
         if self.state in (State.UP, State.SILENT):
             self.state, self._missed = State.UP, 0
             self.deadline = self._tick(now)
 
     def missed(self, now: float) -> Transition | None:
-        """It has not answered the question asked last, or cannot be reached."""
+        """It did not answer the last health check, or is unreachable."""
         if self.state not in (State.UP, State.SILENT):
             return None
         self.state, self._missed = State.SILENT, self._missed + 1
@@ -138,19 +138,19 @@ class Life:
         return None
 
     def fail(self, now: float, why: str) -> Transition | None:
-        """Something is so wrong with it that it has to go; it is started again as after a crash."""
+        """Ends it after a serious error; it is restarted as after a crash."""
         if self.state in (State.STARTING, State.UP, State.SILENT):
             return self._end(now, why, _After.FAILED, save=self._was_up)
         return None
 
     def saved(self, now: float) -> Transition | None:
-        """Its state is saved, or cannot be."""
+        """Its state is saved, or cannot be saved."""
         if self.state is State.STOPPING and self._next and self._next[0] is Transition.LEAVE:
             return self._step(now)
         return None
 
     def ended(self, now: float, how: str) -> Transition | None:
-        """It has no process any more, or could not be given one."""
+        """Its process ended or could not be started."""
         after = self._after if self.state is State.STOPPING else _After.FAILED
         if self.state is not State.STOPPING:
             self.why = how
@@ -166,7 +166,7 @@ class Life:
         return None
 
     def due(self, now: float) -> Transition | None:
-        """`deadline` has passed."""
+        """Handles the passing of `deadline`."""
         match self.state:
             case State.STARTING:
                 return self._end(now, f"it was not up within {START_S:g} s", _After.FAILED)
@@ -182,10 +182,10 @@ class Life:
                 return None
 
     def _tick(self, now: float) -> float:
-        """When to ask it next: at the same moments as others of its terms, so that one wake does for all."""
+        """Returns the time of the next health check, aligned with others so that one wake-up serves all."""
         return (math.floor(now / self.terms.question_s) + 1) * self.terms.question_s
 
-    # --- going on
+    # --- transitions
 
     def _launch(self, now: float) -> Transition:
         self.restarts, self._launched = self.restarts + self._launched, True
@@ -193,7 +193,7 @@ class Life:
         return Transition.LAUNCH
 
     def _end(self, now: float, why: str, after: _After, *, save: bool = False) -> Transition | None:
-        """Have it end; what it means that it has ended is for who asks last to say."""
+        """Begins to end it; the last request decides what follows."""
         self.why, self._after = why, after
         if self.state is State.STOPPING:
             return None
@@ -204,7 +204,7 @@ class Life:
         return self._step(now)
 
     def _step(self, now: float) -> Transition | None:
-        """The next way to end it; each has its time. One that is killed and does not end is beyond help."""
+        """Takes the next step to end it, each with its time limit; the last one is SIGKILL."""
         do = self._next.popleft() if self._next else None
         took = {Transition.SAVE: SAVE_S, Transition.LEAVE: self._grace_s}
         self.deadline = math.inf if do is None else now + took.get(do, math.inf)

@@ -1,7 +1,6 @@
-"""A lock file that a process holds for its life, whoever started it: of one container there is one process on a host.
+"""A lock file that a process holds for its life, so that a container has only one process on a host.
 
-No library for lock files: these unlock when they are released, and with that every process the lock was passed on to
-(decision 78).
+Libraries for lock files do not fit: their release also unlocks for every process that inherited the lock (decision 78).
 """
 
 import contextlib
@@ -17,24 +16,24 @@ _FOLDER: Final = "locks"
 
 
 def lock_of(folder: Path, gateway: str, child: str) -> Path:
-    """The file of a child that a gateway has a lease on, in the folder of a system's state."""
+    """Returns the lock file of a leased child, in the folder of a system's state."""
     return folder / _FOLDER / f"{gateway}.{child}.lock"
 
 
 def held_in(folder: Path) -> list[Path]:
-    """Those in the folder of a system's state that a process has now."""
+    """Returns the lock files in the folder of a system's state that a process holds now."""
     return [path for path in sorted((folder / _FOLDER).glob("*.lock")) if not is_free(path)]
 
 
 @contextlib.contextmanager
 def alone(path: Path | None) -> Generator[list[int]]:
-    """The lock of a file, to be passed on to a process; it is free once that one and all it passed it to have ended.
+    """Locks a file for a child process to inherit; it is free when that process and all heirs of the lock have ended.
 
     Args:
-        path: of the file; None: there is nothing to lock, and nothing to pass on.
+        path: the file; None: lock nothing.
 
     Raises:
-        OSError: a process has it, or there can be none.
+        OSError: a process holds the lock, or the file cannot be locked.
     """
     if path is None:
         yield []
@@ -45,14 +44,14 @@ def alone(path: Path | None) -> Generator[list[int]]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BlockingIOError(f"the one before has not ended: {path} is locked") from None
+            raise BlockingIOError(f"the previous process has not ended: {path} is locked") from None
         yield [file]
     finally:
         os.close(file)
 
 
 def is_free(path: Path) -> bool:
-    """Whether nobody has it; also no if that cannot be told."""
+    """Whether no process holds a lock file; False if that is unknown."""
     try:
         with alone(path):
             return True

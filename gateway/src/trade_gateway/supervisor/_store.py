@@ -1,4 +1,4 @@
-"""What providers remembered, on disk: the last complete save of each survives whatever ends this process."""
+"""The state store: the last complete save of each provider on disk, safe against a crash of this process."""
 
 import sqlite3
 import time
@@ -23,23 +23,23 @@ _LOAD: Final = "select object, blob from state where container = ?"
 
 
 class StateStore(Database):
-    """One file with the states of all objects.
+    """A database with the states of all objects.
 
     Args:
-        path: of the file; its folder is made.
-        tell: is told what is wrong, and when it is not any more.
+        path: the file; its folder is created.
+        tell: called with a problem, and with its end.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
         super().__init__(path, _TABLE, "state", tell)
 
     def save(self, container: str, states: Mapping[str, Any], wanted: Callable[[], bool] = lambda: True) -> bool:
-        """Keep the states of objects of one container, all or none; returns whether they are on disk.
+        """Saves the states of a container's objects, all or none; returns whether they are on disk.
 
         Args:
-            container: its name.
-            states: by the names of its objects.
-            wanted: asked when its turn has come, after all that was saved or loaded before it.
+            container: the container's name.
+            states: the states by object name.
+            wanted: called immediately before the save, after all earlier saves and loads.
         """
         rows = [(container, name, time.time(), msgspec.msgpack.encode(state)) for name, state in states.items()]
 
@@ -53,7 +53,7 @@ class StateStore(Database):
         return self._ask(save, default=False)
 
     def load(self, container: str) -> dict[str, Any]:
-        """The states of a container's objects as they were saved last; nothing if there are none to be had."""
+        """Returns the last saved states of a container's objects; empty if there are none."""
 
         def load(database: sqlite3.Connection) -> dict[str, Any]:
             found = database.execute(_LOAD, (container,)).fetchall()

@@ -1,4 +1,4 @@
-"""Keeps child processes up: one thread that starts them in order, asks them, ends them and starts them again."""
+"""The supervisor: one thread that starts, checks, restarts and ends child processes."""
 
 import contextlib
 import math
@@ -30,20 +30,20 @@ from trade_gateway.supervisor._store import StateStore
 __all__ = ["Supervisor"]
 
 _ENDS_S: Final = GRACE_S + SAVE_S + 5.0
-"""How long one child may take to be gone."""
+"""How long one child may take to end, in seconds."""
 
 
 class Supervisor:
-    """Looks after the children that `go_by` names, until `close` ends them, last first.
+    """Supervises the children that `go_by` names, until `close` ends them in reverse order.
 
     Args:
-        member: the container from which they are asked; it may be another one each time.
-        tell: is told of what becomes of them, on the supervisor's thread.
-        folder: for logs, in ``logs``, and for what providers remember.
-        grace_s: how long one may take to leave before it is killed.
-        clock: ``time.monotonic``; a test has its own, and processes that are none.
+        member: returns the container that calls them; it may change.
+        tell: called with reports about them, on the supervisor's thread.
+        folder: the folder for ``logs`` and for the states of providers.
+        grace_s: how long a shutdown may take before SIGKILL, in seconds.
+        clock: ``time.monotonic``; a test has its own clock and fake processes.
         launch: starts the process of a child.
-        furnish: waits until that is seen, and makes its objects.
+        furnish: waits until the child is visible, and creates its objects.
     """
 
     def __init__(
@@ -81,40 +81,40 @@ class Supervisor:
     # --- from other threads
 
     def go_by(self, children: Sequence[Child]) -> None:
-        """These are wanted, started in this order; only those that are started otherwise than before start again."""
+        """Sets the children, in start order; only those with a changed start are restarted."""
         self._post(partial(self._go_by, {child.name: child for child in children}))
 
     @property
     def alive(self) -> bool:
-        """Whether somebody looks after them."""
+        """Whether the supervisor's thread runs."""
         return self._thread.is_alive()
 
     @property
     def certified(self) -> bool:
-        """Whether links tell who is who."""
+        """Whether links have certificates."""
         return self._member().settings.tls is not None
 
     def children(self) -> list[ChildInfo]:
-        """How they fare."""
+        """Returns their states."""
         return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]
 
     def restart(self, name: str, who: str) -> bool:
-        """Start one again, also if it was given up; returns whether there is one of that name."""
+        """Restarts a child, also if it was given up; returns whether the name is known."""
         if all(info.name != name for info in self._shown):
             return False
         self._post(partial(self._restart, name, who))
         return True
 
     def stand_in(self, name: str) -> StandIn:
-        """What gives another gateway leases of one. Raises ConfigurationError: none is stood in for."""
+        """Returns the standby's end of a child's lease. Raises ConfigurationError if it has none."""
         unit = self._units.get(name)
         if unit is None or not isinstance(unit.lease, StandIn):
-            problem = f"no container {name!r} is stood in for here; its table needs stands_in_for"
+            problem = f"this gateway is no standby for a container {name!r}; its table needs stands_in_for"
             raise ConfigurationError(where=f"container {name}", problem=problem)
         return unit.lease
 
     def close(self) -> None:
-        """End them, those first that others do not wait for; their state is saved before. Idempotent."""
+        """Ends them in reverse order of their dependencies, after it saved their state. Idempotent."""
         if not self._thread.is_alive():
             return
         self._post(self._close)
@@ -128,7 +128,7 @@ class Supervisor:
 
     def _post(self, what: Callable[[], None]) -> None:
         self._inbox.append(what)
-        with contextlib.suppress(BlockingIOError, OSError):  # rung already, or closed
+        with contextlib.suppress(BlockingIOError, OSError):  # woken already, or closed
             os.write(self._rope, b"!")
 
     # --- the thread
@@ -137,7 +137,7 @@ class Supervisor:
         while not (self._closing and all(unit.gone for unit in self._units.values())):
             due_s = min((unit.due_s for unit in self._units.values()), default=math.inf)
             ready = self._selector.select(None if due_s == math.inf else max(0.0, due_s))
-            for unit in list(self._units.values()):  # one that has no lease any more is not started again
+            for unit in list(self._units.values()):  # a child without a lease is not restarted
                 self._by_lease(unit)
             for key, _ in ready:
                 key.data()
@@ -152,7 +152,7 @@ class Supervisor:
             os.read(self._bell, 4096)
 
     def _by_lease(self, unit: Unit) -> bool:
-        """Have it end if it may not be here any more; returns whether it may."""
+        """Ends a child that may no longer run here; returns whether it may."""
         if unit.may_be_up():
             unit.stay()
             return True
@@ -172,7 +172,7 @@ class Supervisor:
         elif unit.to_begin and may_be_up and all(self._has_been_up(name) for name in unit.child.terms.after):
             unit.begun = True
             if unit.lease is not None:
-                self._told(unit, f"{unit.child.name} is for this host now")
+                self._report(unit, f"{unit.child.name} runs on this host now")
             self._do(unit, unit.life.start(now))
         if unit.life.deadline <= now:
             self._do(unit, unit.life.due(now))
@@ -185,14 +185,14 @@ class Supervisor:
         return unit is not None and (unit.was_up or unit.elsewhere)
 
     def _needed(self, unit: Unit) -> bool:
-        """Whether one that is to end before it is still there."""
+        """Whether a child that must end first still runs."""
         others = (other for other in self._units.values() if unit.child.name in other.child.terms.after)
         return any(other.leaving and other.life.alive for other in others)
 
     def _go_by(self, children: Mapping[str, Child]) -> None:
         for name, unit in self._units.items():
             if name not in children:
-                unit.leaving = "the file names it no more"
+                unit.leaving = "the file no longer names it"
         for name, child in children.items():
             unit = self._units.get(name)
             if unit is None:
@@ -221,9 +221,11 @@ class Supervisor:
         if unit is None or unit.leaving:
             return
         if unit.lease is not None and not unit.may_be_up():
-            self._do(unit, unit.life.stop(self._clock(), unit.lease.why))  # if it was given up, it is asked for again
+            self._do(
+                unit, unit.life.stop(self._clock(), unit.lease.why)
+            )  # one that was given up requests its lease again
         else:
-            self._told(unit, f"{name} is started again, as {who} asks for it")
+            self._report(unit, f"{name} is restarted at the request of {who}")
             unit.begun = True
             self._do(unit, unit.life.start(self._clock()))
 
@@ -232,7 +234,7 @@ class Supervisor:
         for unit in self._units.values():
             unit.leaving = "the gateway leaves"
 
-    # --- doing what a life says
+    # --- actions
 
     def _do(self, unit: Unit, do: Transition | None) -> None:
         match do:
@@ -244,10 +246,10 @@ class Supervisor:
                 self._save(unit)
             case Transition.LEAVE if unit.process is not None:
                 if not unit.leaving:
-                    self._told(unit, f"{unit.child.name} is told to leave: {unit.life.why}")
+                    self._report(unit, f"{unit.child.name} is asked to shut down: {unit.life.why}")
                 unit.process.leave()
             case Transition.KILL if unit.process is not None:
-                self._told(unit, f"{unit.child.name} does not leave and is killed", bad=True)
+                self._report(unit, f"{unit.child.name} does not shut down and is killed", bad=True)
                 unit.process.kill()
             case _:
                 pass
@@ -255,10 +257,10 @@ class Supervisor:
     def _launch(self, unit: Unit) -> None:
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         try:
-            lock, unit.told = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
-            unit.process = self._new_process(unit.child, self._folder / "logs", lock, unit.told)
+            lock, unit.sent = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
+            unit.process = self._new_process(unit.child, self._folder / "logs", lock, unit.sent)
         except OSError as none:
-            self._ended(unit, f"there can be no process: {none}")
+            self._ended(unit, f"its process could not be started: {none}")
             return
         self._selector.register(unit.process.end, selectors.EVENT_READ, partial(self._died, unit))
         self._selector.register(unit.process.output, selectors.EVENT_READ, partial(self._heard, unit))
@@ -270,7 +272,7 @@ class Supervisor:
         try:
             started, more = process.read()
         except ValueError:
-            self._do(unit, unit.life.fail(self._clock(), "it said something else than that it is up"))
+            self._do(unit, unit.life.fail(self._clock(), "its first line did not report that it is up"))
             return
         if not more:
             self._selector.unregister(process.output)
@@ -283,7 +285,7 @@ class Supervisor:
         if process is None:
             return
         self._selector.unregister(process.end)
-        with contextlib.suppress(KeyError):  # it had nothing more to say before
+        with contextlib.suppress(KeyError):  # its output ended before
             self._selector.unregister(process.output)
         self._ended(unit, process.close())
 
@@ -293,18 +295,18 @@ class Supervisor:
         do = life.ended(self._clock(), how)
         match life.state:
             case State.WAITING:
-                self._told(unit, f"{name} {how}; back in {life.wait_s:g} s", bad=True)
+                self._report(unit, f"{name} {how}; back in {life.wait_s:g} s", bad=True)
             case State.GIVEN_UP:
                 times = f"{life.terms.restarts + 1} times in {life.terms.window_s:g} s"
                 again = f"trade call trade.restart_child '\"{name}\"' starts it again"
-                self._told(unit, f"{name} ended {times} and is given up; the last time it {how}. {again}", bad=True)
+                self._report(unit, f"{name} ended {times} and is given up; the last time it {how}. {again}", bad=True)
             case State.STOPPED:
-                self._told(unit, f"{name} {how}", bad=not unit.leaving)
+                self._report(unit, f"{name} {how}", bad=not unit.leaving)
             case _:
                 pass
         self._do(unit, do)
 
-    # --- asking them
+    # --- health checks
 
     def _ask(self, unit: Unit) -> None:
         terms, furnished, now = unit.child.terms, unit.furnished, self._clock()
@@ -330,10 +332,10 @@ class Supervisor:
         else:
             unit.life.answered(now)
 
-    # --- what takes its time, on threads of its own
+    # --- slow work, on its own threads
 
     def _job(self, unit: Unit, what: str, work: Callable[[], Callable[[], None]]) -> None:
-        """Have something done that waits; what comes of it counts only for the process that is there now."""
+        """Runs blocking work on a thread; its result counts only for the current process."""
         boot = unit.boot
 
         def run() -> None:
@@ -348,7 +350,7 @@ class Supervisor:
     def _furnish(self, unit: Unit, child: Child, started: Started, load: Callable[[], Any]) -> Callable[[], None]:
         try:
             furnished = self._furnishes(self._member, child, started, load())
-        except Exception as wrong:  # noqa: BLE001 - what an object raises may come as its own type
+        except Exception as wrong:  # noqa: BLE001 - an object may raise its own types
             why = f"it came up, but: {wrong}"
             return lambda: self._do(unit, unit.life.fail(self._clock(), why))
         return lambda: self._up(unit, furnished)
@@ -360,9 +362,9 @@ class Supervisor:
         unit.furnished, unit.was_up = furnished, True
         unit.save_at = self._clock() + unit.child.terms.save_every_s if furnished.made else math.inf
         pid = unit.process.pid if unit.process else 0
-        self._told(unit, f"{unit.child.name} is {'back' if unit.life.restarts else 'up'}, process {pid}")
+        self._report(unit, f"{unit.child.name} is {'back' if unit.life.restarts else 'up'}, process {pid}")
         for problem in furnished.problems:
-            self._told(unit, problem, bad=True)
+            self._report(unit, problem, bad=True)
 
     def _save(self, unit: Unit) -> None:
         furnished = unit.furnished
@@ -391,10 +393,10 @@ class Supervisor:
     def _complain(self, text: str) -> None:
         self._tell(News(child="", state="", text=text, bad=True))
 
-    def _told(self, unit: Unit, text: str, *, bad: bool = False) -> None:
+    def _report(self, unit: Unit, text: str, *, bad: bool = False) -> None:
         self._tell(News(child=unit.child.name, state=unit.life.state.value, text=text, bad=bad))
 
 
 def _again(member: Container, handle: Handle) -> Handle:
-    """The same service, asked from another container."""
+    """Returns the same service's handle of another container."""
     return member.handle(handle.key)
