@@ -53,9 +53,10 @@ def calibrate(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write the file without a prompt.")] = False,
 ) -> None:
-    """Measure zero and range of a joint that you move by hand, and write them into the robot file.
+    """Measure zero and range of a joint that you move by hand.
 
-    The joint's torque must be off. Nothing is written to the device. Comments in the file are kept.
+    Both are written into the robot file, whose comments are kept.
+    The joint's torque must be off. Nothing is written to the device.
 
     For example: trade calibrate rosie.toml neck.pan
     """

@@ -30,11 +30,11 @@ def doctor(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check this host and a robot for problems, and suggest fixes. Nothing is changed.
+    """Check this host and a robot for problems, and suggest fixes.
 
     Host: rights and latency of serial ports, libraries, clock, certificates, visible containers.
     Robot file: errors that its drivers find, ports, CAN interfaces, devices and their setup, missing watchdogs.
-    Lines in use by a driver are skipped. The exit code is 1 on errors.
+    Nothing is changed. Lines in use by a driver are skipped. The exit code is 1 on errors.
 
     For example: trade doctor rosie.toml
     """

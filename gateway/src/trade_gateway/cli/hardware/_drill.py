@@ -33,9 +33,9 @@ def drill(
     listed: Annotated[bool, typer.Option("--list", help="List the scenes and exit.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Kill, freeze and disconnect each part that a moving, simulated robot depends on; it must stop each time.
+    """Check that a simulated robot stops when any part it depends on fails.
 
-    All devices are simulated; no hardware is touched.
+    The drill kills, freezes and disconnects one part after the other. No hardware is touched.
     One joint or arm of each bus moves, across two gateways. The simulator's log shows when it came to rest.
     The exit code is 1 if that took longer than the limit in \\[drill] of the robot file (docs/drill.md).
 

@@ -51,9 +51,10 @@ def scan(
     write: Annotated[Path | None, typer.Option(metavar="ROBOT.toml", help="Write a template of a robot file.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Find devices on a serial line or a CAN bus: ids, models, rates. Nothing is written to them.
+    """Find devices on a serial line or a CAN bus: ids, models, rates.
 
-    No other program may use the line. The scan ends at the first device whose torque is on.
+    Nothing is written to devices. No other program may use the line.
+    The scan ends at the first device whose torque is on.
     Each driver scans in turn until one finds a device. --driver, --bauds and --ids make a scan faster.
     The exit code is 1 if no device answers, or if a device that answers cannot be used as it is.
 

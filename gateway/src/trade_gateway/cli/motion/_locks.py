@@ -89,7 +89,7 @@ def _there(container: Container, group: str) -> Constraint:
 
 
 def resume(context: typer.Context, group: Group) -> None:
-    """Let a group move again after another client's stop. This moves nothing itself.
+    """Let a group move again after another client's stop; move nothing.
 
     The exit code is 1 while an e-stop is open: nothing moves until it is cleared.
 

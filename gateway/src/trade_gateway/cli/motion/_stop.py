@@ -19,9 +19,10 @@ def stop(
     limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,
 ) -> None:
-    """Stop all motion in a group: call all its stop services at once. This needs no lock.
+    """Stop all motion in a group at once. This needs no lock.
 
-    The command uses the stop line first, which works while the middleware's links are busy.
+    The command calls all stop services of the group.
+    It uses the stop line first, which works while the middleware's links are busy.
     The exit code is not 0 if a device could not be stopped, or if there was nothing to stop.
     This is software. It is not safety-rated and does not replace a switch that cuts the power.
 

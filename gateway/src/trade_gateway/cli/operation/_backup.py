@@ -86,8 +86,9 @@ def restore(
     state: Annotated[Path | None, typer.Option(help="Folder for state. Default: state in the folder of --to.")] = None,
     force: Force = False,
 ) -> None:
-    """Restore a backup: verify it as a whole, then replace each file atomically.
+    """Verify a backup as a whole, then restore it.
 
+    Each file is replaced atomically.
     Stop the gateway first: nothing is written if one of its containers is known to run (one with a standby).
     As root, files get their owners back. Identities that an existing list revokes stay revoked.
 

@@ -26,9 +26,9 @@ def conformance(
     listed: Annotated[bool, typer.Option("--list", help="List the checks and exit.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Start a container written in any language, and check that it keeps the protocol's rules.
+    """Check that a container in any language keeps the protocol's rules.
 
-    It runs on this host in its own system, whose settings it gets in the environment.
+    The container runs on this host in its own system, whose settings it gets in the environment.
     docs/wire-protocol.md lists the services that it must offer. Nothing moves without --motion.
     Most safety checks need --motion. The exit code is 1 if a check fails.
 

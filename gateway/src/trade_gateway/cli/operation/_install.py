@@ -39,9 +39,9 @@ def install(
     show: Annotated[bool, typer.Option("--print", help="Print the files and exit.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Also overwrite files with other changes.")] = False,
 ) -> None:
-    """Write a systemd unit that runs a gateway, and udev rules for serial adapters. Start nothing.
+    """Write a systemd unit for a gateway, and udev rules for serial adapters.
 
-    The unit gives the gateway only the rights that its file and robot files need.
+    This starts nothing. The unit gives the gateway only the rights that its file and robot files need.
     Put your own changes into NAME.service.d/*.conf. Run this again after a change of the gateway or robot files.
 
     For example: sudo trade install /etc/trade/gateway.toml

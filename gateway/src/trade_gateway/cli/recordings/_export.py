@@ -36,8 +36,9 @@ def export(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Export the joints of a recording as a LeRobot dataset (v3.0): Parquet tables, without pictures.
+    """Export the joints of a recording as a LeRobot dataset (v3.0).
 
+    The dataset has Parquet tables, without pictures.
     observation.state is the measured position in rad; action is the position measured one frame later.
 
     For example: trade export walk.mcap walk/ --group rosie.legs --episodes locks --fps 30

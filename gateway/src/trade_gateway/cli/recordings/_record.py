@@ -48,9 +48,10 @@ def record(
     most_mb: Annotated[int, typer.Option(rich_help_panel=_RING, min=1, help="Most memory, in MB.")] = 256,
     as_json: Json = False,
 ) -> None:
-    """Record joints, cameras, calls, locks and faults to an MCAP file, or at each fault.
+    """Record joints, cameras, calls, locks and faults to an MCAP file.
 
-    The file grows every second. It stays readable if the recorder is killed. Calls have no arguments and results.
+    The file grows every second and stays readable if the recorder is killed. It has no arguments and results of calls.
+    With --keep-last and --at-fault, only the last seconds before each fault are saved.
 
     For example: trade record walk.mcap --group rosie --attach rosie.toml
     """

@@ -30,7 +30,9 @@ Folder = Annotated[Path, typer.Option("--ca", help="Folder of the authority.")]
 
 @app.command()
 def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of the authority.")] = _DEFAULT) -> None:
-    """Create a certificate authority. Its ca.key can issue any identity of the system.
+    """Create a certificate authority.
+
+    Its ca.key can issue any identity of the system.
 
     For example: trade pki init pki, and then trade pki issue arm
     """
@@ -66,7 +68,7 @@ def issue(
     folder: Folder = _DEFAULT,
     as_json: Json = False,
 ) -> None:
-    """Issue a certificate for a container or gateway, or renew it before it expires.
+    """Issue or renew the certificate of a container or gateway.
 
     A renewed certificate has the same key and hosts, and replaces the old one in one step.
     A running container uses the new one for new connections, but listens with the old one until it is restarted.
@@ -137,7 +139,9 @@ def _endpoints(given: "Issued") -> list[str]:
 
 @app.command()
 def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
-    """Revoke an identity permanently: it is not issued again, and policies refuse it.
+    """Revoke an identity permanently.
+
+    It is not issued again, and policies refuse it.
 
     For example: trade pki revoke arm
     """

@@ -24,9 +24,9 @@ def check(
     policy: File = None,
     as_json: Json = False,
 ) -> None:
-    """Check whether an identity has a right, and by which rule. The exit code is 1 if denied.
+    """Check whether an identity has a right, and by which rule.
 
-    A stop service needs no rule, only an identity that is not revoked.
+    The exit code is 1 if it is denied. A stop service needs no rule, only an identity that is not revoked.
 
     For example: trade policy check planner call rosie.neck.move_to
     """

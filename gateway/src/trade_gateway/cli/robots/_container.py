@@ -28,7 +28,7 @@ def container(
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Run an empty container until Ctrl-C, SIGTERM or a call of its terminate_container.
+    """Run an empty container until Ctrl-C, SIGTERM or terminate_container.
 
     For example: trade container --name eyes --allow "mypkg.vision:*"
     """

@@ -32,7 +32,7 @@ def gateway(
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Forward calls between separate networks, as far as the file and its policy allow.
+    """Forward calls between networks, as the file and its policy allow.
 
     A gateway can also share groups with other systems.
     It supervises the containers of its host that the file names: it restarts them when they crash or hang.

@@ -20,7 +20,7 @@ _NAME: Final = "door"
 
 app = typer.Typer(
     invoke_without_command=True,
-    help="Serve HTTP and WebSocket clients and the dashboard, each client with its own identity.\n\n"
+    help="Serve HTTP and WebSocket clients and the dashboard.\n\n"
     "For example: trade door token anna, and then trade door",
 )
 

@@ -20,7 +20,7 @@ def migrate(
     container: Annotated[str | None, typer.Option(help="Current container, if several have the group.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Move a provider with its state to another container, on this or another host.
+    """Move a provider with its state to another container, on any host.
 
     It is refused while the provider is locked or moves. If it fails, the provider stays where it is.
     The target container must allow the provider's class.

@@ -22,9 +22,9 @@ def start(
     wait: Annotated[float, typer.Option(min=0.0, max=600.0, help="Time until it must be visible, in seconds.")] = 10.0,
     as_json: Json = False,
 ) -> None:
-    """Start an empty container on another host through ssh; it outlives this command.
+    """Start an empty container on another host through ssh.
 
-    Set up ssh before: the host's key must be known, and ssh may not prompt.
+    The container outlives this command. Set up ssh before: the host's key must be known, and ssh may not prompt.
 
     For example: trade start robot.example eyes --allow "mypkg.vision:*"
     """

@@ -16,7 +16,7 @@ from trade_gateway.cli.robots._system_up import Bringing, Report, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
 
-app = typer.Typer(no_args_is_help=True, help="Start, show and end the system that a file describes, on all its hosts.")
+app = typer.Typer(no_args_is_help=True, help="Start, show and end the system of a file, on all its hosts.")
 
 File = Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="The system file.")]
 SshConfig = Annotated[Path | None, typer.Option(help="Configuration of ssh instead of ~/.ssh/config.")]
@@ -34,9 +34,10 @@ def up(
     ssh_config: SshConfig = None,
     as_json: Json = False,
 ) -> None:
-    """Start the containers of a file that are not up, in order; they outlive this command.
+    """Start the containers of a file that are not up, in order.
 
-    The file and its hosts are checked first. If a start fails, the containers started before are ended.
+    The containers outlive this command. The file and its hosts are checked first.
+    If a start fails, the containers started before are ended.
 
     For example: trade system up examples/system.toml --check
     """
@@ -53,7 +54,9 @@ def up(
 
 @app.command("status")
 def status(context: typer.Context, file: File, as_json: Json = False) -> None:
-    """Show whether each container of a file is up. The exit code is 1 if one is missing or incomplete.
+    """Show whether each container of a file is up.
+
+    The exit code is 1 if one is missing or incomplete.
 
     For example: trade system status examples/system.toml
     """
@@ -78,7 +81,9 @@ def down(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """End the containers of a file in reverse order; stop at one that is locked or moves.
+    """End the containers of a file in reverse order.
+
+    The command ends with an error at the first container that is locked or moves.
 
     For example: trade system down examples/system.toml
     """

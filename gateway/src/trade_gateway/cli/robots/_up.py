@@ -109,9 +109,10 @@ def up(
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Start a robot and keep it up. Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
+    """Start a robot and keep it up until Ctrl-C or SIGTERM.
 
-    Attaching moves nothing and resets nothing. A line reports each fault of a joint, and its end.
+    The robot is left as its file says (hold or relax). Attaching moves nothing and resets nothing.
+    A line reports each fault of a joint, and its end.
 
     For example: trade up examples/rosie.toml --sim
     """

@@ -23,7 +23,7 @@ def ask(
     phrases: Annotated[bool, typer.Option("--phrases", help="List the sentences that it understands.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Ask about services, hosts, containers, locks, faults and news in plain English.
+    """Ask about services, containers, locks, faults and news in plain English.
 
     A lexicon (TOML) translates each sentence into ordinary calls. You can add phrases with --lexicon.
 

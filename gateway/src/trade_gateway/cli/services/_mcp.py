@@ -27,10 +27,10 @@ def mcp(
     ] = None,
     lexicon: Annotated[Path | None, typer.Option(help="TOML file of phrases for the tool ask.")] = None,
 ) -> None:
-    """Serve the system to an agent over MCP; the agent's client starts this command.
+    """Serve the system to an agent over the Model Context Protocol (MCP).
 
-    The agent can read, and can move under locks what the policy allows. Its identity is that of this process.
-    When the client disconnects, the agent's motion stops.
+    The agent's client starts this command. The agent can read, and can move under locks what the policy allows.
+    Its identity is that of this process. When the client disconnects, the agent's motion stops.
 
     For example: trade mcp --twin rosie.toml --ask-first rosie.legs
     """

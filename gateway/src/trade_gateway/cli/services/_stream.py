@@ -24,7 +24,7 @@ def stream(
     container: Annotated[str | None, typer.Option(help="Stream the service of this container.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Print the samples of a service as they arrive; with --json one object per line.
+    """Print the samples of a service as they arrive.
 
     For example: trade stream rosie.head.state --hz 20 --json
     """

@@ -34,7 +34,7 @@ Folder = Annotated[
 
 app = typer.Typer(
     cls=FirstByDefault,
-    help="Show and verify the audit record: calls, locks, stops, refusals, configuration changes. Default: show.",
+    help="Show and verify the audit record. Default: show.",
 )
 
 
@@ -92,9 +92,10 @@ def verify_command(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check that no row was changed, removed, added or moved. The exit code is 1, with the first bad row, if one was.
+    """Check that no row was changed, removed, added or moved.
 
-    With --against, the exit code is 3 if a record cannot be compared because all noted rows were dropped since.
+    The exit code is 1 if one was, and the first such row is printed.
+    With --against, it is 3 if a record cannot be compared because all noted rows were dropped since.
 
     For example: trade audit verify /var/lib/trade/audit --against /media/stick/heads
     """

@@ -155,9 +155,10 @@ def profile(
     container: Name = "*",
     as_json: Json = False,
 ) -> None:
-    """Show how often services were called and how long they took, from traced calls.
+    """Show how often services were called, and how long they took.
 
-    --learn records, for each service, what the same caller called next. Run `trade tracing on` first.
+    Only traced calls count, so run `trade tracing on` first.
+    --learn records, for each service, what the same caller called next.
 
     For example: trade profile --learn usual.json, and later trade profile --against usual.json
     """

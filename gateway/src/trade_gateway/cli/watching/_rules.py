@@ -36,7 +36,7 @@ def run(
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
-    """Run the rules of a file until Ctrl-C or SIGTERM; print a line for every firing.
+    """Run the rules of a file until Ctrl-C or SIGTERM; print every firing.
 
     The file is read again when it changes, and on SIGHUP.
     If the new file has an error, it is reported and the rules continue as before.
@@ -117,7 +117,7 @@ def _reload(out: Output, rules: Rules, file: Path) -> None:
 
 @app.command("test")
 def test(context: typer.Context, file: File, as_json: Json = False) -> None:
-    """Check a rules file, and show when each rule fires and what it would call now.
+    """Check a rules file, and show what each rule would call now.
 
     Only the services of conditions are called, with your own rights.
 

@@ -65,7 +65,7 @@ def top(
     count: Annotated[int | None, typer.Option(min=1, help="Number of refreshes; by default until Ctrl-C.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show the load of each container, locks and unhealthy providers, refreshed periodically.
+    """Show load, locks and unhealthy providers, refreshed periodically.
 
     Rates are averages since the last refresh. With --json, each refresh is an object.
 

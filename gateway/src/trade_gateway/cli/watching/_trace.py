@@ -24,7 +24,9 @@ def tracing(
     container: Name = "*",
     as_json: Json = False,
 ) -> None:
-    """Switch tracing of calls on or off. For containers that start later, set TRADE_TRACE=1.
+    """Switch tracing of calls on or off in running containers.
+
+    For containers that start later, set TRADE_TRACE=1.
 
     For example: trade tracing on
     """
@@ -45,7 +47,7 @@ def trace(
     call_id: Annotated[int | None, typer.Argument(help="Id of a call; by default the latest calls are listed.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show the tree of a traced call with times, containers, callers, events and logs.
+    """Show the tree of a traced call with times, events and logs.
 
     Times are those of the hosts' clocks, and only as accurate as these agree. Run `trade tracing on` first.
 

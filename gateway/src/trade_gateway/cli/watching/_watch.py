@@ -60,7 +60,7 @@ def watch(
     everything: Annotated[bool, typer.Option("--all", help="Also watch the middleware's own services.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Print events until Ctrl-C: services that come, go or fail, locks, e-stops.
+    """Print changes of services, locks and e-stops until Ctrl-C.
 
     Locks and e-stops are polled every second, so shorter ones may be missed. With --json, each line is an object.
 
