@@ -273,7 +273,7 @@ def test_S03_what_a_node_that_nobody_knows_moves_stops_with_its_silence(bridged:
     wait_until(lambda: trade.locks() == [], "its lock falls")
     success, said = bridged.ros.node("owner").set_bool("/rosie/neck/pan/lock", True)
     assert not success
-    assert "does not say who asks" in said
+    assert "does not identify the caller" in said
     again_at = time.monotonic()
     bridged.ros.node("teleop").repeat("/pan_by_hand", FAR_RAD, 20)
     bridged.begun(again_at)
@@ -326,7 +326,7 @@ def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: 
         try:
             voltage()
         except errors.TradeError as error:
-            return "s ago" in str(error) or "nothing" in str(error)
+            return "s ago" in str(error) or "no message" in str(error)
         return False
 
     wait_until(stale, "it is stale")

@@ -122,7 +122,7 @@ def test_a_lock_is_taken_and_given_back_and_serves_the_calls_of_its_node(stand: 
     assert stand.set_bool(node, "/rosie/head/lock", True) == {"success": True, "message": "it has head"}
     assert stand.set_bool(node, "/rosie/head/power", True)["success"]
     assert len(stand.container.locks()) == 1
-    assert stand.set_bool(node, "/rosie/head/lock", False) == {"success": True, "message": "given back"}
+    assert stand.set_bool(node, "/rosie/head/lock", False) == {"success": True, "message": "released"}
     assert stand.container.locks() == []
     assert stand.set_bool(node, "/rosie/head/lock", False)["message"] == "it had none"
 
@@ -143,7 +143,7 @@ def test_nobody_knows_whom_a_lock_would_belong_to_that_an_unknown_node_takes(sta
     stand.ros.anonymous = True
     answer = stand.set_bool(stand.node(), "/rosie/head/lock", True)
     assert not answer["success"]
-    assert "ROS does not say who asks" in answer["message"]
+    assert "ROS does not identify the caller" in answer["message"]
     assert stand.trigger(stand.node(), "/rosie/head/state")["success"]
 
 
@@ -161,7 +161,7 @@ def test_nodes_that_ros_does_not_tell_apart_are_one_client(stand: Stand) -> None
     stand.ros.anonymous = True
     assert stand.set_bool(stand.node("/one"), "/rosie/head/power", True)["success"]
     assert stand.trigger(stand.node("/other"), "/rosie/head/stop")["success"]
-    assert bridge.bridged().nodes == ["a node of ROS that is not known"]
+    assert bridge.bridged().nodes == ["an unknown node of ROS"]
 
 
 def test_while_a_node_moves_something_it_is_locked_against_others(stand: Stand) -> None:
@@ -237,7 +237,7 @@ def test_when_ros_is_lost_all_that_its_nodes_move_stops_and_that_is_said(stand: 
     [tells] = stand.container.services(where(name="bridged", group="ros"))
     wait_until(lambda: tells.health.startswith("ROS is lost: no router"))
     answer = stand.trigger(node, "/rosie/head/spin")
-    assert "nobody would see /teleop die" in answer["message"]
+    assert "the end of /teleop would be invisible" in answer["message"]
     assert not stand.robot.head.goes.is_set()
     assert stand.trigger(node, "/rosie/head/stop")["success"]
     stand.ros.problem = ""
@@ -258,14 +258,14 @@ def test_a_short_loss_within_the_grace_ends_nothing(stand: Stand) -> None:
 
 def test_of_two_that_want_one_name_the_first_has_it_and_that_is_said(stand: Stand) -> None:
     stand.up(TRIGGERS + TRIGGERS.replace('"rosie"', '"rosie.head"'))
-    wait_until(lambda: any("rosie.head.stop is not there as /rosie/head/stop" in line for line in stand.said))
+    wait_until(lambda: any("rosie.head.stop cannot be mapped to /rosie/head/stop" in line for line in stand.said))
     assert stand.trigger(stand.node(), "/rosie/head/stop")["success"]
 
 
 def test_what_does_not_fit_is_said_with_a_remedy(stand: Stand) -> None:
     bridge = stand.up('[[to_ros.service]]\nservice = "rosie.head.turn"\ntype = "std_srvs/srv/SetBool"\n')
     [problem] = bridge.bridged().problems
-    assert "'data' is bool, which is nothing for 'angle_rad'; it is turn(angle_rad: float" in problem
+    assert "'data' is bool, which does not fit 'angle_rad'; it is turn(angle_rad: float" in problem
     assert stand.ros.services == {}
 
 

@@ -47,7 +47,7 @@ def test_silence_stops_and_gives_the_lock_back(stand: Stand) -> None:
     stick.say(0.1)
     assert stand.robot.head.stopped.wait(PATIENCE_S)
     wait_until(lambda: stand.container.locks() == [])
-    wait_until(lambda: any("nothing was heard on /head for 0.5 s; rosie.head.go was stopped" in x for x in stand.said))
+    wait_until(lambda: any("no message on /head for 0.5 s; rosie.head.go was stopped" in x for x in stand.said))
     stand.robot.head.stopped.clear()
     stick.say(0.2)
     wait_until(lambda: stand.robot.head.commands == [0.1, 0.2])
@@ -81,7 +81,7 @@ def test_while_one_node_commands_another_one_is_not_heard(stand: Stand) -> None:
     Stick(stand).say(0.1)
     assert stand.robot.head.goes.wait(PATIENCE_S)
     Stick(stand, "/other").say(0.9)
-    wait_until(lambda: any("/other is not heard on /head: /teleop commands there" in line for line in stand.said))
+    wait_until(lambda: any("/other is refused on /head: /teleop commands there" in line for line in stand.said))
     assert stand.robot.head.commands == [0.1]
 
 
@@ -142,7 +142,7 @@ def test_when_ros_is_lost_commands_end(stand: Stand) -> None:
     assert stand.robot.head.stopped.wait(PATIENCE_S)
     wait_until(lambda: stand.container.locks() == [])
     stick.say(0.2)
-    wait_until(lambda: any("nobody would see /teleop die" in line for line in stand.said))
+    wait_until(lambda: any("the end of /teleop would be invisible" in line for line in stand.said))
     assert stand.robot.head.commands == [0.1]
 
 

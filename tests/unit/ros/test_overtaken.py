@@ -59,7 +59,7 @@ def test_S03_what_waited_for_its_turn_when_its_node_died_does_not_begin(stand: S
 
 def test_a_topic_is_no_way_to_a_stop(stand: Stand) -> None:
     stand.up('[[to_ros.command]]\ntopic = "/halt"\ntype = "std_msgs/msg/Empty"\nservice = "rosie.head.stop"\n')
-    wait_until(lambda: any("say [[to_ros.service]]" in line for line in stand.said))
+    wait_until(lambda: any("Use [[to_ros.service]]" in line for line in stand.said))
 
 
 def test_S14_what_stops_is_owed_while_ros_is_lost_and_what_it_moves_counts_as_moving(stand: Stand) -> None:
@@ -69,7 +69,7 @@ def test_S14_what_stops_is_owed_while_ros_is_lost_and_what_it_moves_counts_as_mo
     found(stand, "base", "drive")({"x": 0.5}, {})
     wait_until(lambda: heard == [0.5])
     stand.ros.problem = "no master"
-    with pytest.raises(RosUnreachable, match="as soon as it is back"):
+    with pytest.raises(RosUnreachable, match="as soon as ROS is back"):
         found(stand, "base", "stop")()
     me = stand.robot.container
     with pytest.raises(TradeError):
@@ -108,5 +108,5 @@ def test_S08_a_stop_that_overtook_a_call_on_its_way_is_told_again(stand: Stand) 
 def test_nothing_begins_for_a_node_once_the_bridge_is_leaving(stand: Stand) -> None:
     bridge = stand.up(TRIGGERS)
     bridge.close()
-    with pytest.raises(RosUnreachable, match="leaving"):
+    with pytest.raises(RosUnreachable, match="shutting down"):
         bridge._nodes.guest("/late", time.monotonic())

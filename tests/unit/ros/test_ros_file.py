@@ -32,22 +32,22 @@ def test_the_example_is_right_and_says_what_it_maps() -> None:
         ("[ros]\nversion = 3\n", "Invalid enum value 3"),
         (HEAD + "colour = 1\n", "ros.colour: unknown key"),
         ("[ros\n", "cannot be read"),
-        (HEAD + SERVICE, r"to_ros.service\[0\]: say what"),
-        (HEAD + SERVICE + 'group = "a"\nservice = "a.b"\n', "say what"),
+        (HEAD + SERVICE, r"to_ros.service\[0\]: needs either group"),
+        (HEAD + SERVICE + 'group = "a"\nservice = "a.b"\n', "needs either group"),
         (HEAD + SERVICE + 'group = "a"\nname = "/x"\n', "names one service"),
-        (HEAD + SERVICE + 'service = "a.b"\nname = "x y"\n', "is no name of ROS"),
-        (HEAD + SERVICE + 'service = "a.b"\nnames = ["b"]\n', "chooses among those of a group"),
+        (HEAD + SERVICE + 'service = "a.b"\nname = "x y"\n', "is not a ROS name"),
+        (HEAD + SERVICE + 'service = "a.b"\nnames = ["b"]\n', "selects services of a group"),
         (HEAD + SERVICE.replace("std_srvs/srv/Trigger", "Trigger") + 'group = "a"\n', "a type is written"),
-        (HEAD + COMMAND.replace("/go", "/g o"), "is no name of ROS"),
+        (HEAD + COMMAND.replace("/go", "/g o"), "is not a ROS name"),
         (HEAD + COMMAND + "deadman_s = 60\n", "<= 10"),
-        (HEAD + COMMAND + COMMAND, "/go is there twice"),
+        (HEAD + COMMAND + COMMAND, "/go occurs twice"),
         (HEAD + FROM, "effect: is missing"),
         (HEAD + FROM + 'effect = "actuate"\n', r"stop: is missing: what moves something needs"),
         (HEAD + FROM + 'effect = "read"\nstop = "/stop"\n', "does not go with effect"),
         (HEAD + FROM + 'effect = "stop"\n', "Invalid enum value 'stop'"),
         (HEAD + PUBLISH + 'effect = "actuate"\n', "needs a message that stops it"),
         (HEAD + PUBLISH + 'effect = "note"\nstop = {}\n', "does not go with effect"),
-        (HEAD + PUBLISH + 'effect = "note"\n' + COMMAND, "would command our own service again"),
+        (HEAD + PUBLISH + 'effect = "note"\n' + COMMAND, "would command the bridge's own service again"),
     ],
 )
 def test_what_is_wrong_is_named_with_what_would_be_right(tmp_path: Path, text: str, says: str) -> None:
@@ -63,8 +63,8 @@ def test_what_is_wrong_is_named_with_what_would_be_right(tmp_path: Path, text: s
     [
         (HEAD + SERVICE.replace("Trigger", "Tricker") + 'group = "a"\n', "Tricker is not known"),
         (HEAD + COMMAND.replace("std_msgs/msg/Float64", "std_srvs/srv/Trigger"), "is not known"),
-        (HEAD + 'master = "http://localhost:11311"\n', "is of ROS 1, and version is 2"),
-        ('[ros]\nversion = 1\nrouter = "tcp/localhost:7447"\n', "is of ROS 2, and version is 1"),
+        (HEAD + 'master = "http://localhost:11311"\n', "is a key for ROS 1, but version is 2"),
+        ('[ros]\nversion = 1\nrouter = "tcp/localhost:7447"\n', "is a key for ROS 2, but version is 1"),
         (HEAD + 'types = ["nowhere"]\n', "there is no such folder"),
     ],
 )
@@ -75,7 +75,7 @@ def test_what_cannot_be_mapped_is_told_before_anything_is_joined(stand: Stand, t
 
 def test_a_ros_that_this_installation_cannot_speak_with_is_named(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "trade_gateway.ros.ros2", None)
-    with pytest.raises(ConfigurationError, match="cannot speak with ROS 2"):
+    with pytest.raises(ConfigurationError, match="cannot communicate with ROS 2"):
         join(stand.read("", HEAD), stand.folder / "ros.toml")
 
 

@@ -1,4 +1,4 @@
-"""ROS beside TRADE: topics, services, actions and joints of either, for the other."""
+"""A bridge between TRADE and ROS: topics, services, actions and joints of each side, offered on the other."""
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.ros._bridge import Bridge, Bridged

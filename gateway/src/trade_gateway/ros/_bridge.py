@@ -1,4 +1,4 @@
-"""The bridge: one container of ours that is one node of theirs, with what a file says mapped between the two."""
+"""The ROS bridge: a TRADE container that is also a ROS node, and maps the services that its file lists."""
 
 import contextlib
 import logging
@@ -34,36 +34,36 @@ __all__ = ["GROUP", "Bridge", "Bridged"]
 _logger = logging.getLogger("trade")
 
 _LONGEST: Final = 400
-"""Characters of a health."""
+"""Most characters of a health text."""
 HEALTHY: Final = "healthy"
 GROUP: Final = "ros"
-"""Of what the bridge tells of itself."""
+"""Group of the bridge's own service."""
 
 
 class Bridged(Struct, frozen=True):
-    """What a bridge has up."""
+    """What a bridge maps now."""
 
     to_ros: dict[str, str]
-    """By kind and name in ROS (``service /rosie/head/stop``), the service of ours."""
+    """By kind and name in ROS (``service /rosie/head/stop``), the TRADE service."""
     from_ros: dict[str, list[str]]
-    """By what it is in ROS, the groups it is offered in."""
+    """By its name in ROS, the groups in which it is offered."""
     nodes: list[str]
-    """Those of ROS that have a session here now."""
+    """Nodes of ROS that have a session here now."""
     problems: list[str]
-    """What is not up, and why."""
+    """Entries that are not mapped, and why."""
 
 
 class Bridge:
-    """Maps until it is closed.
+    """Maps services in both directions until it is closed.
 
     Args:
-        container: ours; it is the bridge's identity.
-        graph: theirs.
-        file: what is mapped.
-        say: told in a line what comes up, goes, or cannot be.
+            container: the bridge's container and identity in TRADE.
+            graph: the ROS system.
+            file: the entries to map.
+            say: receives one line for each entry that is mapped, ends or fails.
 
     Raises:
-        ConfigurationError: a type is not known, or does not fit.
+            ConfigurationError: a type is not known, or does not fit.
         AccessDenied: the policy does not let this container register group ``ros``, or one that the file names.
     """
 
@@ -81,7 +81,7 @@ class Bridge:
             self._offer(graph, file)
             self._following = Following(container, self._mappings(graph, file), say)
             self._leaving.callback(self._following.close)
-            self._leaving.callback(self._nodes.close)  # before all else: what they move stops, and nothing begins
+            self._leaving.callback(self._nodes.close)  # first of all: motion of ROS nodes stops, and no call begins
             failing.pop_all()
 
     def _mappings(self, graph: Graph, file: RosFile) -> list[Mapping]:
@@ -111,20 +111,20 @@ class Bridge:
             self._say(f"{offered.where} is in {', '.join(offered.groups)}")
 
     def settled(self, timeout_s: float) -> bool:
-        """Wait until what is there already was mapped. Returns whether it was."""
+        """Waits until the services present now are mapped. Returns whether they are."""
         return self._following.settled(timeout_s)
 
     @service(effect="read")
     def bridged(self) -> Bridged:
-        """What is up, for whom, and what is not."""
+        """What is mapped, for which nodes, and what is not."""
         offered = {one.where: one.groups for one in self._offered}
         return Bridged(self._following.opened(), offered, self._nodes.names(), self._following.problems())
 
     def _heard(self, problem: str) -> None:
-        """ROS is lost, or back."""
+        """Handles the loss and the return of ROS."""
         if problem:
             self._health(f"ROS is lost: {problem}"[:_LONGEST])
-            self._say(f"ROS is lost: {problem}; what its nodes moved stops, and their locks fall")
+            self._say(f"ROS is lost: {problem}; motion of its nodes stops, and their locks are released")
         else:
             self._health(HEALTHY)
             self._say("ROS is back")
@@ -133,9 +133,9 @@ class Bridge:
         for one in (self, *(offered.provider for offered in self._offered)):
             try:
                 self._container.set_health(one, text)
-            except TradeError as error:  # it leaves, or is not there yet
-                _logger.info("the health of %s could not be told: %s", type(one).__name__, error)
+            except TradeError as error:  # it ends, or is not registered yet
+                _logger.info("the health of %s could not be set: %s", type(one).__name__, error)
 
     def close(self) -> None:
-        """What nodes of ROS move stops, and nothing is mapped any more. Idempotent."""
+        """Stops motion of ROS nodes and ends all mappings. Idempotent."""
         self._leaving.close()

@@ -1,4 +1,4 @@
-"""Which ROS a file means, and what it maps there."""
+"""Connects to the ROS system that a file names, and lists the file's mappings."""
 
 from collections.abc import Iterable
 from importlib import import_module
@@ -18,7 +18,7 @@ class _Side(NamedTuple):
     module: str
     kind: str
     says: tuple[str, ...]
-    """Keys of ``[ros]`` that are its own; empty texts are left to its defaults."""
+    """Keys of ``[ros]`` for this version only; empty texts mean its defaults."""
 
 
 _SIDES: Final = {
@@ -28,11 +28,11 @@ _SIDES: Final = {
 
 
 def join(read: RosFile, path: Path) -> Graph:
-    """Be a node of the ROS system that the file means.
+    """Joins the ROS system that the file names, as a node.
 
     Raises:
-        ConfigurationError: this installation cannot speak with that ROS, or the file says something of the other one.
-        RosUnreachable: it is not there.
+            ConfigurationError: support for that ROS is not installed, or the file has keys of the other version.
+            RosUnreachable: the system does not answer.
     """
     side = _SIDES[read.ros.version]
     _refuse_others(read, path)
@@ -42,7 +42,7 @@ def join(read: RosFile, path: Path) -> Graph:
     try:
         kind = getattr(import_module(side.module), side.kind)
     except ImportError as missing:
-        problem = f"this installation cannot speak with ROS {read.ros.version}: {missing}"
+        problem = f"this installation cannot communicate with ROS {read.ros.version}: {missing}"
         raise ConfigurationError(where=f"{path}: ros.version", problem=problem) from None
     return kind(node=f"/{read.ros.node.strip('/')}", folders=tuple(read.folders(path)), **options)
 
@@ -51,15 +51,15 @@ def _refuse_others(read: RosFile, path: Path) -> None:
     for version, side in _SIDES.items():
         for name in side.says if version != read.ros.version else ():
             if getattr(read.ros, name):
-                problem = f"is of ROS {version}, and version is {read.ros.version}; leave it out"
+                problem = f"is a key for ROS {version}, but version is {read.ros.version}. Remove the key"
                 raise ConfigurationError(where=f"{path}: ros.{name}", problem=problem)
 
 
 def planned(read: RosFile, path: Path) -> list[str]:
-    """What a file maps, a line each.
+    """Returns one line for each mapping of a file.
 
     Raises:
-        ConfigurationError: a type is not known, or not of the right kind.
+            ConfigurationError: a type is not known, or has the wrong kind.
     """
     _refuse_others(read, path)
     types = Types(read.ros.version, read.folders(path))

@@ -1,4 +1,4 @@
-"""Messages of ROS as arguments of ours, what ours answer as messages, and whether the two fit each other."""
+"""Conversion of ROS messages to arguments, and of results to ROS messages, with a check that the two types match."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -13,13 +13,13 @@ from trade_gateway.ros._types import Field, Message, Types
 __all__ = ["RequestMapping", "ResponseMapping", "failure", "ros_path", "ros_stamp", "seconds"]
 
 _BARE: Final = "data"
-"""What messages with one value call it."""
+"""Common names of the only field of a message."""
 _STAMPED: Final = "std_msgs/msg/Header"
 _VERDICT: Final = ("success", "message")
 
 
 class RequestMapping:
-    """How a message becomes the arguments of a service."""
+    """Converts a message to the arguments of a service."""
 
     def __init__(
         self,
@@ -30,14 +30,14 @@ class RequestMapping:
         fixed: Mapping[str, Any] | None = None,
     ) -> None:
         """Args:
-            types: those of the ROS side.
-            type_name: of the message: a topic's, or of a service's request.
+                types: the types of the ROS side.
+                type_name: of the message: a topic's, or of a service's request.
             handle: the service.
-            args: by its parameter, the field; those of one name, and a lone one called ``data``, need no word.
-            fixed: arguments that no message says.
+                args: for each parameter, its field; not needed for equal names, or for a single field called ``data``.
+                fixed: arguments that do not come from the message.
 
         Raises:
-            ConfigurationError: they do not fit.
+                ConfigurationError: the message and the service do not match.
         """
         self._fixed = dict(fixed or {})
         fields = {field.name: field for field in types.fields(type_name)}
@@ -55,14 +55,14 @@ class RequestMapping:
         if missing and _BARE in fields and _BARE not in used:
             self._from[missing.pop(0)] = _BARE
         if missing:
-            problem = f"nothing says {missing[0]!r}; name its field in args = {{ {missing[0]} = ... }}"
+            problem = f"no field provides {missing[0]!r}. Name its field in args = {{ {missing[0]} = ... }}"
             raise ConfigurationError(where=where, problem=problem)
         used = {path.partition(".")[0] for path in self._from.values()}
         for name in used - set(fields):
             problem = f"the type has no field {name!r}; it has {', '.join(fields) or 'none'}"
             raise ConfigurationError(where=where, problem=problem)
         self.unused: Final = [name for name in fields if name not in used]
-        """Fields that nothing is made of."""
+        """Fields that no argument uses."""
         self._check_kinds(where, handle, fields)
 
     def _check_kinds(self, where: str, handle: Handle, fields: Mapping[str, Field]) -> None:
@@ -70,25 +70,25 @@ class RequestMapping:
         for name, path in self._from.items():
             field = fields.get(path)
             if field is not None and not _takes(properties.get(name, {}), field):
-                problem = f"{path!r} is {_said(field)}, which is nothing for {name!r}; it is {handle.signature}"
+                problem = f"{path!r} is {_said(field)}, which does not fit {name!r}; it is {handle.signature}"
                 raise ConfigurationError(where=where, problem=problem)
 
     def __call__(self, message: Message) -> dict[str, Any]:
-        """The arguments, by name."""
+        """Returns the arguments by name."""
         return {**self._fixed, **{name: _at(message, path) for name, path in self._from.items()}}
 
 
 class ResponseMapping:
-    """How what a service answers becomes a message."""
+    """Converts the result of a service to a message."""
 
     def __init__(self, types: Types, type_name: str, fields: Mapping[str, str] | None = None) -> None:
         """Args:
-            types: those of the ROS side.
+                types: the types of the ROS side.
             type_name: of the message.
-            fields: by its field, ours; by default those of one name, or the only one there is.
+                fields: for each field, the part of the result; by default by equal names, or the only field.
 
         Raises:
-            ConfigurationError: it has no such field.
+                ConfigurationError: the type has no such field.
         """
         self._type = type_name
         known = {field.name: field.type for field in types.fields(type_name)}
@@ -99,20 +99,20 @@ class ResponseMapping:
                 raise ConfigurationError(where=type_name, problem=problem)
         self._stamped = next((name for name, kind in known.items() if kind == _STAMPED), "")
         self.judges: Final = known.get("success") == "bool"
-        """Whether it says itself how it went."""
+        """Whether the message has a field for success or failure."""
         self._says = known.get("message") == "string"
         self._names = [name for name in known if name != self._stamped]
         self._free = [name for name in self._names if not (self.judges and name in _VERDICT)]
 
     def __call__(self, value: Any, at_s: float | None = None) -> Message:
-        """The message.
+        """Returns the message.
 
         Args:
-            value: what the service answered.
-            at_s: when, in seconds since the epoch, for types that have a header.
+                value: the result of the service.
+                at_s: its time, in seconds since the epoch, for types with a header.
 
         Raises:
-            ConfigurationError: nothing of the value fits the type.
+                ConfigurationError: no part of the value fits the type.
         """
         plain: Any = msgspec.to_builtins(value, enc_hook=str)
         message = self._filled(plain)
@@ -139,30 +139,30 @@ class ResponseMapping:
             return {}
         if len(self._free) == 1:
             return {self._free[0]: plain}
-        problem = f"no field of it ({', '.join(self._free)}) is in {_text(plain)[:80]}; say which is what with fields"
+        problem = f"no field of it ({', '.join(self._free)}) is in {_text(plain)[:80]}. Assign its fields with `fields`"
         raise ConfigurationError(where=self._type, problem=problem)
 
     def failed(self, error: BaseException) -> Message:
-        """What says that it went wrong; raises the error if the type cannot say that."""
+        """Returns the message for a failure; raises the error if the type cannot express one."""
         if not self.judges:
             raise error
         return {"success": False, "message": failure(error)} if self._says else {"success": False}
 
 
 def failure(error: BaseException) -> str:
-    """An error as ROS is told of it."""
+    """The text of an error for ROS."""
     return f"{type(error).__name__}: {error}"
 
 
 def ros_path(group: str, *names: str) -> str:
-    """A group and names in it, as a name of ROS: ``/rosie/left_arm/stop``."""
+    """A group and names in it as a name of ROS: ``/rosie/left_arm/stop``."""
     words = [word for text in (group, *names) for word in text.split(".") if word]
     clean = [re.sub(r"\W", "_", word, flags=re.ASCII) for word in words]
     return "/" + "/".join(f"_{word}" if word[0].isdigit() else word for word in clean)
 
 
 def ros_stamp(at_s: float) -> Message:
-    """A time, in seconds since the epoch, as ROS has it."""
+    """A time, in seconds since the epoch, as a ROS message."""
     whole = int(at_s // 1)
     return {"sec": whole, "nanosec": min(999_999_999, int((at_s - whole) * 1e9))}
 
@@ -211,12 +211,12 @@ def _kind(field: Field) -> str:
 
 
 def _takes(schema: Mapping[str, Any], field: Field) -> bool:
-    """Whether a parameter of that JSON Schema takes a field."""
+    """Whether a parameter with this JSON Schema accepts a field."""
     options: Sequence[Mapping[str, Any]] = schema.get("anyOf", (schema,))
     kind = _kind(field)
     for one in options:
         known = one.get("type")
-        if known is None and "enum" not in one:  # anything, or a record, which is looked at when it comes
+        if known is None and "enum" not in one:  # anything, or a record, which is checked on arrival
             return "$ref" not in one or kind in ("object", "string", "integer")
         if kind == known or (kind, known) == ("integer", "number"):
             return True

@@ -1,4 +1,4 @@
-"""The file of a ROS bridge: which ROS system it joins, and what of each side the other one has. Checked as a whole."""
+"""The file of a ROS bridge: the ROS system to join and the mappings in both directions, checked as a whole."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -45,7 +45,7 @@ Effect = Literal["read", "note", "actuate"]
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file: what it does not know it refuses."""
+    """A table of the file; unknown keys are errors."""
 
 
 class Link(_Strict, frozen=True, kw_only=True):
@@ -53,21 +53,21 @@ class Link(_Strict, frozen=True, kw_only=True):
 
     version: Literal[1, 2]
     node: _RosName = "/trade"
-    """What the bridge is called there."""
+    """Name of the bridge's node."""
     types: list[str] = []
-    """Folders of definitions beyond those that come along, beside the file."""
+    """Further folders of type definitions, relative to the file."""
     master: str = ""
-    """ROS 1: its URI; by default that of ROS_MASTER_URI."""
+    """ROS 1: the master's URI; by default ROS_MASTER_URI."""
     ip: str = ""
-    """ROS 1: where this host is reached by others; by default that of ROS_IP."""
+    """ROS 1: the address under which others reach this host; by default ROS_IP."""
     python: str = ""
     """ROS 1: the Python that has rospy; by default the system's."""
     router: str = ""
-    """ROS 2: the endpoint of its router (rmw_zenoh); by default the one of this host."""
+    """ROS 2: the endpoint of its router (rmw_zenoh); by default the one on this host."""
     domain_id: Annotated[int, Meta(ge=0, le=232)] = 0
-    """ROS 2."""
+    """ROS 2: its ROS_DOMAIN_ID."""
     grace_s: Annotated[float, Meta(ge=0, le=10)] = 1.0
-    """So long after ROS is lost, what its nodes move stops and their locks fall: nobody sees any more who dies."""
+    """Time from a loss of ROS until motion of its nodes stops and their locks are released: their end is invisible."""
 
 
 # --- to ROS
@@ -75,58 +75,58 @@ class Link(_Strict, frozen=True, kw_only=True):
 
 class _Of(_Strict, frozen=True, kw_only=True):
     group: str = ""
-    """All services of it, and of those beneath it."""
+    """All services of this group, and beneath it."""
     service: str = ""
-    """Or this one: ``rosie.head.stop``."""
+    """One service instead: ``rosie.head.stop``."""
 
 
 class ServiceEntry(_Of, frozen=True, kw_only=True):
-    """``[[to_ros.service]]``: services of ours as services of ROS."""
+    """``[[to_ros.service]]``: TRADE services as ROS services."""
 
     type: _Type
     name: str = ""
-    """With ``service``: what it is called there; by default its group as a path, and its name."""
+    """With ``service``: its name in ROS; by default its group as a path, and its name."""
     names: list[str] = []
-    """With ``group``: only services of these names."""
+    """With ``group``: only services with these names."""
     args: Fields = {}
-    """By our parameter, their field; those of one name need no word."""
+    """For each parameter of the service, the field of the request; not needed for equal names."""
     deadline_s: _Seconds = 10.0
 
 
 class LockService(_Strict, frozen=True, kw_only=True):
-    """``[[to_ros.lock]]``: a node takes (True) and gives back (False) a lock over a group."""
+    """``[[to_ros.lock]]``: a ROS service by which a node takes (True) and releases (False) a lock over a group."""
 
     group: _Text
     name: str = ""
-    """By default the group as a path, and ``lock``."""
+    """Its name; by default the group as a path, and ``lock``."""
     wait_s: Annotated[float, Meta(ge=0, le=60)] = 2.0
 
 
 class Command(_Strict, frozen=True, kw_only=True):
-    """``[[to_ros.command]]``: messages of theirs as calls of a service of ours, the newest wins."""
+    """``[[to_ros.command]]``: messages of a ROS topic as calls of a TRADE service; the newest counts."""
 
     topic: _RosName
     type: _Type
     service: _Text
     args: Fields = {}
-    """By our parameter, their field."""
+    """For each parameter of the service, the field of the message."""
     fixed: dict[str, Any] = {}
     """Further arguments: ``{ valid_s = 0.3 }``."""
     deadman_s: _Deadman = 0.5
-    """Silence for longer than this stops it."""
+    """Longest silence in seconds; after it, the motion is stopped."""
     deadline_s: _Seconds = 10.0
-    """Of each call."""
+    """Deadline of each call in seconds."""
 
 
 class StreamEntry(_Strict, frozen=True, kw_only=True):
-    """``[[to_ros.stream]]``: what a service of ours reads, as a topic."""
+    """``[[to_ros.stream]]``: the result of a TRADE service as a ROS topic."""
 
     service: _Text
     topic: _RosName
     type: _Type
     hz: _Hz = 10.0
     fields: Fields = {}
-    """By their field, ours: ``{ data = "position_rad" }``; by default those of one name, or ``data``."""
+    """For each field, the part of the result: ``{ data = "position_rad" }``; by default by equal names, or ``data``."""
 
 
 class JointStates(_Strict, frozen=True, kw_only=True):
@@ -138,7 +138,7 @@ class JointStates(_Strict, frozen=True, kw_only=True):
     names: _Names = "last"
     """``last``: ``pan``; ``full``: ``rosie.head.pan``."""
     joints: Fields = {}
-    """By their name, ours, where they differ otherwise."""
+    """For each name in ROS, the TRADE joint, where they differ otherwise."""
 
 
 class TrajectoryEntry(_Strict, frozen=True, kw_only=True):
@@ -148,11 +148,11 @@ class TrajectoryEntry(_Strict, frozen=True, kw_only=True):
     action: _RosName
     names: _Names = "last"
     joints: Fields = {}
-    """By their name, ours."""
+    """For each name in ROS, the TRADE joint."""
 
 
 class ToRos(_Strict, frozen=True, kw_only=True):
-    """What ROS has of ours."""
+    """What ROS receives from TRADE."""
 
     service: list[ServiceEntry] = []
     lock: list[LockService] = []
@@ -167,72 +167,72 @@ class ToRos(_Strict, frozen=True, kw_only=True):
 
 class _Offered(_Strict, frozen=True, kw_only=True):
     groups: Annotated[list[_Text], Meta(min_length=1)]
-    """In which it is offered; the first one settles who may call it."""
+    """Groups in which it is offered; access rules apply to the first one."""
     name: str = ""
-    """Of our service; by default the last word of theirs."""
+    """Name of the TRADE service; by default the last part of the ROS name."""
 
 
 class FromService(_Offered, frozen=True, kw_only=True):
-    """``[[from_ros.service]]``: a service of theirs as one of ours."""
+    """``[[from_ros.service]]``: a ROS service as a TRADE service."""
 
     service: _RosName
     type: _Type
     effect: Effect
-    """What a call of it does: nothing (read), writes something down (note), may move something (actuate)."""
+    """Its effect: none (read), records something (note), or may move something (actuate)."""
     stop: str = ""
-    """With ``actuate``: the service of theirs, of std_srvs/srv/Trigger or Empty, that ends it."""
+    """With ``actuate``: the ROS service, of std_srvs/srv/Trigger or Empty, that stops the motion."""
     stop_type: _Type = "std_srvs/srv/Trigger"
     deadline_s: _Seconds = 10.0
 
 
 class FromTopic(_Offered, frozen=True, kw_only=True):
-    """``[[from_ros.topic]]``: the latest message of a topic of theirs as a service of ours that reads."""
+    """``[[from_ros.topic]]``: the latest message of a ROS topic as a TRADE service that reads."""
 
     topic: _RosName
     type: _Type
     stale_after_s: _Seconds = 1.0
     latched: bool = False
-    """Its publisher keeps the last message for who comes later, such as a map: that is told however old it is."""
+    """Whether the publisher keeps the last message, e.g. a map, for later subscribers. Its age is then not checked."""
 
 
 class FromPublish(_Offered, frozen=True, kw_only=True):
-    """``[[from_ros.publish]]``: a service of ours that publishes."""
+    """``[[from_ros.publish]]``: a TRADE service that publishes."""
 
     topic: _RosName
     type: _Type
     effect: Literal["note", "actuate"]
     stop: dict[str, Any] | None = None
-    """With ``actuate``: the message that ends what it moves."""
+    """With ``actuate``: the message that stops the motion."""
     valid_s: Annotated[float, Meta(ge=0, le=1)] = 0.5
-    """So long each holds, then ``stop`` is published, unless another one comes before; 0: what it asks for has an end
-    of its own, and ``stop`` is published when its session ends."""
+    """Validity of each message in seconds, unless another follows; then ``stop`` is published. 0: the motion ends by
+    itself, and ``stop`` is published when its session ends."""
 
 
 class FromJoints(_Strict, frozen=True, kw_only=True):
-    """``[[from_ros.joints]]``: joints of theirs, by a topic and an action, as a provider of ours."""
+    """``[[from_ros.joints]]``: joints of ROS, by a topic and an action, as a TRADE provider."""
 
     groups: Annotated[list[_Text], Meta(min_length=1)]
     action: _RosName
     joints: Annotated[list[_Text], Meta(min_length=1)]
-    """Their names there; here each is ``GROUP.NAME``."""
+    """Their names in ROS; in TRADE each is ``GROUP.NAME``."""
     topic: _RosName = "/joint_states"
     stale_after_s: _Seconds = 0.5
     max_speed_rad_s: Annotated[float, Meta(gt=0)] = 0.5
-    """The greatest speed of ``move_to``."""
+    """Greatest speed of ``move_to`` in rad/s."""
 
 
 class FromParameters(_Strict, frozen=True, kw_only=True):
-    """``[[from_ros.parameters]]``: what a node of theirs has as parameters."""
+    """``[[from_ros.parameters]]``: the parameters of a ROS node."""
 
     groups: Annotated[list[_Text], Meta(min_length=1)]
     node: _RosName
     set: bool = False
-    """Whether they may be set, too."""
+    """Whether clients may also set them."""
     deadline_s: _Seconds = 5.0
 
 
 class FromRos(_Strict, frozen=True, kw_only=True):
-    """What ours have of ROS."""
+    """What TRADE receives from ROS."""
 
     service: list[FromService] = []
     topic: list[FromTopic] = []
@@ -249,15 +249,15 @@ class RosFile(_Strict, frozen=True, kw_only=True):
     from_ros: FromRos = FromRos()
 
     def folders(self, path: Path) -> list[Path]:
-        """Of definitions."""
+        """Folders of type definitions."""
         return [path.parent / folder for folder in self.ros.types]
 
 
 def read_ros_file(path: Path) -> RosFile:
-    """Read it.
+    """Reads and checks a file.
 
     Raises:
-        ConfigurationError: it cannot be read, or something in it is wrong: says where, and what would be right.
+            ConfigurationError: the file cannot be read, or an entry is wrong; the error says where, and what is valid.
     """
     try:
         raw = read_toml_text(path.read_text(encoding="utf-8"))
@@ -278,22 +278,22 @@ def _explained(path: Path, said: str) -> ConfigurationError:
     if missing := _MISSING.search(problem):
         place, problem = f"{place}.{missing.group(1)}".lstrip("."), "is missing"
     elif unknown := _UNKNOWN.search(problem):
-        place, problem = f"{place}.{unknown.group(1)}".lstrip("."), "unknown key; docs/ros.md says which there are"
+        place, problem = f"{place}.{unknown.group(1)}".lstrip("."), "unknown key; docs/ros.md lists the valid ones"
     elif "matching regex" in problem and "msg|srv|action" in problem:
-        problem = "a type is written std_msgs/msg/Float64: package/msg/NAME, package/srv/NAME or package/action/NAME"
+        problem = "a type is written package/msg/NAME, package/srv/NAME or package/action/NAME: std_msgs/msg/Float64"
     elif "matching regex" in problem:
-        problem = "is no name of ROS: words of letters, digits and _, joined by /, such as /head/command"
+        problem = "is not a ROS name: words of letters, digits and _, joined by /, such as /head/command"
     return ConfigurationError(where=f"{path}: {place}" if place else str(path), problem=problem)
 
 
 def _problems(read: RosFile) -> Iterable[tuple[str, str]]:
-    """Where something contradicts something else, and what."""
+    """Yields contradictions between entries: where, and what."""
     for number, entry in enumerate(read.to_ros.service):
         yield from _of_one(f"to_ros.service[{number}]", entry)
     for number, offered in enumerate(read.from_ros.service):
         place = f"from_ros.service[{number}].stop"
         if offered.effect == "actuate" and not offered.stop:
-            yield place, 'is missing: what moves something needs a service of theirs that stops it, or effect = "note"'
+            yield place, 'is missing: what moves something needs a ROS service that stops it, or effect = "note"'
         if offered.effect != "actuate" and offered.stop:
             yield place, f'does not go with effect = "{offered.effect}", which moves nothing'
     for number, published in enumerate(read.from_ros.publish):
@@ -311,26 +311,26 @@ def _problems(read: RosFile) -> Iterable[tuple[str, str]]:
 
 def _of_one(place: str, entry: ServiceEntry) -> Iterable[tuple[str, str]]:
     if bool(entry.group) == bool(entry.service):
-        yield place, 'say what: group = "rosie.head" or service = "rosie.head.stop", one of them'
+        yield place, 'needs either group = "rosie.head" or service = "rosie.head.stop"'
     if entry.name and not entry.service:
-        yield f"{place}.name", "names one service; say service instead of group"
+        yield f"{place}.name", "names one service. Use service instead of group"
     if entry.name and not _NAME.fullmatch(entry.name):
-        yield f"{place}.name", "is no name of ROS: words of letters, digits and _, joined by /"
+        yield f"{place}.name", "is not a ROS name: words of letters, digits and _, joined by /"
     if entry.names and not entry.group:
-        yield f"{place}.names", "chooses among those of a group; leave it out with service"
+        yield f"{place}.names", "selects services of a group. Remove it, or use group instead of service"
 
 
 def _twice(place: str, names: Sequence[str]) -> Iterable[tuple[str, str]]:
     for name in sorted({name for name in names if names.count(name) > 1}):
-        yield place, f"{name} is there twice; one name, one entry"
+        yield place, f"{name} occurs twice. Keep one entry for each name"
 
 
 def _circles(read: RosFile) -> Iterable[tuple[str, str]]:
-    """What would come back to where it came from."""
+    """Yields mappings that would return to their origin."""
     ours = {entry.topic for entry in (*read.to_ros.stream, *read.to_ros.joint_states)}
     for name in sorted(ours & {entry.topic for entry in read.from_ros.topic}):
-        yield "from_ros.topic", f"{name} is what this bridge publishes itself; leave one of the two out"
+        yield "from_ros.topic", f"{name} is published by this bridge itself. Remove one of the two entries"
     for name in sorted({one.action for one in read.to_ros.trajectory} & {one.action for one in read.from_ros.joints}):
-        yield "from_ros.joints", f"{name} is what this bridge serves itself; leave one of the two out"
+        yield "from_ros.joints", f"{name} is served by this bridge itself. Remove one of the two entries"
     for name in sorted({one.topic for one in read.to_ros.command} & {one.topic for one in read.from_ros.publish}):
-        yield "from_ros.publish", f"{name} would command our own service again; leave one of the two out"
+        yield "from_ros.publish", f"{name} would command the bridge's own service again. Remove one of the two entries"

@@ -1,4 +1,4 @@
-"""Services, topics and parameters of ROS as providers of ours."""
+"""Services, topics and parameters of ROS as TRADE providers."""
 
 import threading
 import time
@@ -17,21 +17,21 @@ __all__ = ["Offered", "parameters_from_ros", "publisher_from_ros", "service_from
 _STOPPED_WITHIN_S: Final = 2.0
 _STOPS_OWED: Final = 10
 _STOP_AGAIN_S: Final = 0.2
-"""As long as nodes take to connect again."""
+"""Stop messages after ROS is back, for as long as nodes take to reconnect."""
 
 
 class Offered:
-    """Something of theirs that is offered here."""
+    """Something of ROS that is offered in TRADE."""
 
     def __init__(self, where: str, groups: list[str], provider: object, close: Callable[[], object]) -> None:
         self.where: Final = where
-        """What it is in ROS."""
+        """Its kind and name in ROS."""
         self.groups: Final = groups
         self.provider: Final = provider
         self._close = close
 
     def offer(self, container: Container) -> "Offered":
-        """Register it. Raises what `Container.register` does; then nothing of it is left."""
+        """Registers it. Raises what `Container.register` does, and then leaves nothing behind."""
         try:
             container.register(self.provider, self.groups, meta={"ros": self.where})
         except BaseException:
@@ -40,7 +40,7 @@ class Offered:
         return self
 
     def withdraw(self, container: Container) -> None:
-        """What it moves stops first."""
+        """Stops its motion, then withdraws it."""
         container.deregister(self.provider)
         self._close()
 
@@ -69,7 +69,7 @@ def service_from_ros(entry: FromService, graph: Graph, records: Records) -> Offe
 
 
 class _Motion:
-    """What a service of theirs moves, until it has answered or the one that stops it has."""
+    """The motion of a ROS service, from its call until its response or that of the service that stops it."""
 
     def __init__(
         self, entry: FromService, graph: Graph, resource: Resource, call: Callable[[dict[str, Any]], Any]
@@ -82,7 +82,7 @@ class _Motion:
         self._stops = 0
 
     def begin(self, args: dict[str, Any]) -> Any:
-        """Call it. A stop that comes meanwhile may arrive there before, so it is then told again."""
+        """Calls the service. A stop meanwhile may arrive there first, so it is then repeated."""
         with permit([self.resource]) as permitted:
             with self._guard:
                 permitted.gate()
@@ -90,7 +90,7 @@ class _Motion:
                 self.resource.moving = True
             try:
                 result = self._call(args)
-            except RosUnreachable:  # it may have begun all the same
+            except RosUnreachable:  # the service may have begun
                 self._tell_stop()
                 raise
             except BaseException:
@@ -105,7 +105,7 @@ class _Motion:
         return result
 
     def stop(self, _: dict[str, Any]) -> None:
-        """Call the service that stops."""
+        """Calls the service that stops."""
         with self._guard:
             self._stops += 1
         self._tell_stop()
@@ -119,7 +119,7 @@ class _Motion:
 
 
 def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
-    """``[[from_ros.topic]]``: what is older than it may be is an error. Raises ConfigurationError."""
+    """``[[from_ros.topic]]``: a message that is too old is an error. Raises ConfigurationError."""
     kind = records.of(entry.type)
     latest: list[tuple[Message, float]] = []
     began = time.monotonic()
@@ -131,12 +131,12 @@ def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
         message, at = (latest or [({}, began)])[0]
         silent_s = time.monotonic() - at
         if not latest or (silent_s > entry.stale_after_s and not entry.latched):
-            problem = f"nothing was heard for {silent_s:.3g} s; is the node up that publishes it?"
+            problem = f"no message for {silent_s:.3g} s. Is the node that publishes it running?"
             raise RosUnreachable(what=entry.topic, problem=problem)
         return records.record(entry.type, message)
 
     name = entry.name or entry.topic.rpartition("/")[2]
-    age = "however old" if entry.latched else f"{entry.stale_after_s:g} s old at most"
+    age = "of any age" if entry.latched else f"at most {entry.stale_after_s:g} s old"
     doc = f"The latest message of {entry.topic} in ROS ({entry.type}), {age}."
     made = provider("RosTopic", [Method(name, doc, {}, frozenset(), kind, "read", read)])
     subscription = graph.subscribe(entry.topic, entry.type, heard, latched=entry.latched)
@@ -146,7 +146,7 @@ def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
 def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Offered:
     """``[[from_ros.publish]]``. Raises ConfigurationError."""
     parameters, optional = records.parameters(entry.type)
-    graph.types.to_bytes(entry.type, entry.stop or {})  # wrong is wrong before it is needed
+    graph.types.to_bytes(entry.type, entry.stop or {})  # raises now, not when the stop is needed
     name = entry.name or entry.topic.rpartition("/")[2]
     publisher = graph.advertise(entry.topic, entry.type)
     doc = f"Publish on {entry.topic} in ROS ({entry.type})."
@@ -161,7 +161,7 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
     holds = f" It holds for {entry.valid_s:g} s." if entry.valid_s else ""
     methods = [
         Method(name, doc + holds, parameters, optional, None, "actuate", setpoint.send, "stop"),
-        Method("stop", f"Publish on {entry.topic} what stops.", {}, frozenset(), None, "stop", setpoint.stop),
+        Method("stop", f"Publish the stop message on {entry.topic}.", {}, frozenset(), None, "stop", setpoint.stop),
     ]
     made = provider("RosPublisher", methods, [setpoint.resource])
 
@@ -173,10 +173,10 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
 
 
 class _SetPoint:
-    """What is published and moves something, until the message that stops it.
+    """A published set-point that moves something, until its stop message.
 
-    While ROS is lost nobody hears that message. It is then owed: published again and again until ROS has been back for
-    some time; until then what it moves counts as moving.
+    While ROS is lost, no node receives that message. It is then pending: published again and again until ROS has been
+    back for some time. Until then the resource counts as moving.
     """
 
     def __init__(self, resource: Resource, send: Callable[[Message], object], entry: FromPublish, graph: Graph) -> None:
@@ -191,7 +191,7 @@ class _SetPoint:
         self._owed = 0
 
     def send(self, args: dict[str, Any]) -> None:
-        """Publish it, and what stops when its time is over, unless another one comes before."""
+        """Publishes a set-point, and the stop message when it expires without another one."""
         with permit([self.resource]) as permitted, self._guard:
             permitted.gate()
             self._still()
@@ -202,22 +202,22 @@ class _SetPoint:
                 self._later(self._valid_s)
 
     def stop(self, _: dict[str, Any]) -> None:
-        """Publish what stops; RosUnreachable while ROS is lost: it is published as soon as that is back."""
+        """Publishes the stop message. RosUnreachable: ROS is lost; the message is published as soon as it is back."""
         with self._guard:
             self._still()
             problem = self._halted()
         if problem:
-            told = f"{problem}; what stops is published as soon as it is back"
+            told = f"{problem}; the stop message is published as soon as ROS is back"
             raise RosUnreachable(what=self._topic, problem=told)
 
     def _over(self) -> None:
         with self._guard:
-            if threading.current_thread() is self._timer:  # no other came meanwhile
+            if threading.current_thread() is self._timer:  # no other set-point followed
                 self._timer = None
                 self._halted()
 
     def _halted(self) -> str:
-        """Publish what stops; what is wrong with ROS, if nobody may have heard that. Under the guard."""
+        """Publishes the stop message; returns ROS's problem if it may not have arrived. Call under the guard."""
         self._send(self._stop)
         problem = self._graph.healthy
         self._owed = _STOPS_OWED if problem else max(0, self._owed - 1)
@@ -238,7 +238,7 @@ class _SetPoint:
             timer.cancel()
 
     def close(self) -> None:
-        """Nothing is published any more."""
+        """Ends the timer."""
         with self._guard:
             self._still()
 
@@ -252,7 +252,7 @@ def parameters_from_ros(entry: FromParameters, graph: Graph) -> Offered:
     def write(args: dict[str, Any]) -> None:
         graph.set_parameter(entry.node, args["name"], args["value"], _left_s(entry.deadline_s))
 
-    methods = [Method("parameters", f"Those of {entry.node} in ROS.", {}, frozenset(), dict[str, Any], "read", read)]
+    methods = [Method("parameters", f"Parameters of {entry.node}.", {}, frozenset(), dict[str, Any], "read", read)]
     if entry.set:
         kinds = {"name": str, "value": Any}
         doc = f"Set a parameter of {entry.node} in ROS."
@@ -261,7 +261,7 @@ def parameters_from_ros(entry: FromParameters, graph: Graph) -> Offered:
 
 
 def _left_s(longest_s: float) -> float:
-    """What the running call has left for it, at most so much, and never nothing."""
+    """The time that the running call has left, at most `longest_s`, and always above 0."""
     call = current_call()
     return longest_s if call is None else max(0.01, call.patience_s(longest_s))
 

@@ -1,4 +1,4 @@
-"""Joints of theirs, which a topic tells of and an action moves, as a provider of ours."""
+"""Joints of ROS, which a topic reports and an action moves, as a TRADE provider."""
 
 import threading
 import time
@@ -21,30 +21,30 @@ __all__ = ["RosJoint", "RosJoints", "joints_from_ros"]
 
 _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 _STOPPED_WITHIN_S: Final = 1.8
-"""Within what the end of a session allows (S05)."""
+"""Within the time that the end of a session allows (S05)."""
 _LONGEST_S: Final = 3600.0
 _PEAK: Final = 1.5
-"""How much quicker than its mean a cubic curve from rest to rest is at its quickest."""
+"""Ratio of the peak to the mean speed of a cubic curve from rest to rest."""
 _SHORTEST_S: Final = 0.2
 
 Position = Annotated[float, Meta(description="joint angle in rad")]
 
 
 class RosJoint(Struct, frozen=True, kw_only=True):
-    """What was last heard of one joint."""
+    """The last received state of one joint."""
 
     name: str
     """Ours: ``lab.arm.shoulder``."""
     position_rad: float
     velocity_rad_s: float | None
-    """None: the topic does not tell."""
+    """None: the topic does not include it."""
     effort_nm: float | None
     age_s: float
-    """How long ago that was heard."""
+    """The age of this state in seconds."""
 
 
 class RosJoints:
-    """Joints of ROS; values are in the order of ``joints()``. Their limits are known to ROS alone."""
+    """Joints of ROS; values are in the order of ``joints()``. Only ROS knows their limits."""
 
     def __init__(self, entry: FromJoints, graph: Graph) -> None:
         self._entry = entry
@@ -54,11 +54,11 @@ class RosJoints:
         self._heard: dict[str, tuple[float, float | None, float | None, float]] = {}
         self._began = time.monotonic()
         self._news = threading.Condition()
-        """Something was heard."""
+        """Notified of each message."""
         self._guard = threading.Condition()
         self._active: Pursuit | None = None
         self._sending = 0
-        """Goals that are on their way to the action."""
+        """Goals that are being sent to the action."""
         self._stops = 0
         self._subscription = graph.subscribe(entry.topic, _JOINT_STATE, self._hear)
 
@@ -77,13 +77,13 @@ class RosJoints:
 
     @service(effect="read")
     def state(self) -> list[RosJoint]:
-        """What was last heard of every joint; RosUnreachable if that is too old for one of them."""
+        """The last state of every joint; RosUnreachable if one is too old."""
         now, told = time.monotonic(), list[RosJoint]()
         for theirs, own in zip(self._entry.joints, self._names, strict=True):
             position, velocity, effort, at = self._heard.get(theirs, (0.0, None, None, None))
             silent_s = now - (self._began if at is None else at)
             if at is None or silent_s > self._entry.stale_after_s:
-                problem = f"nothing was heard of {theirs} for {silent_s:.3g} s; is the node up that publishes it?"
+                problem = f"no state of {theirs} for {silent_s:.3g} s. Is the node that publishes it running?"
                 raise RosUnreachable(what=self._entry.topic, problem=problem)
             told.append(
                 RosJoint(name=own, position_rad=position, velocity_rad_s=velocity, effort_nm=effort, age_s=silent_s)
@@ -92,15 +92,15 @@ class RosJoints:
 
     @service(cancel="stop")
     def move_to(self, positions_rad: list[Position], speed_rad_s: float | None = None) -> list[float]:
-        """Move all joints to angles, so that they arrive together; the angles heard after the end.
+        """Move all joints to angles, arriving together; return the angles after the end.
 
         Raises:
-            InvalidArgument: not as many as there are joints, or no speed.
-            RosUnreachable: nobody knows where they are, or nobody serves the action, or they have arrived, and nothing
-                was heard of them since.
-            RosRefused: it was rejected.
-            DeviceFault: it was aborted, or nobody heard whether it has ended.
-            MotionStopped: it was stopped, or its call's deadline came first.
+                InvalidArgument: the number of angles is wrong, or the speed is invalid.
+                RosUnreachable: the angles are unknown, or no node serves the action, or the joints have arrived, but no
+                        state was received since.
+                RosRefused: the goal was rejected.
+                DeviceFault: the goal was aborted, or whether it has ended is unknown.
+                MotionStopped: it was stopped, or the call's deadline expired first.
         """
         if len(positions_rad) != len(self._names):
             problem = f"{len(positions_rad)} for {len(self._names)} joints"
@@ -117,7 +117,7 @@ class RosJoints:
 
     @service(cancel="stop")
     def follow(self, trajectory: Trajectory) -> list[float]:
-        """Go through angles at given times; the angles heard after it. Limits are kept by ROS. Raises like move_to.
+        """Go through angles at given times; return the angles after it. ROS enforces limits. Raises like move_to.
 
         Args:
             trajectory: of all joints, in any order.
@@ -141,9 +141,9 @@ class RosJoints:
 
     @service(effect="stop")
     def stop(self) -> None:
-        """Cancel what this bridge asked of the action; DeviceFault if its end is not heard.
+        """Cancel the goals that this bridge sent to the action; DeviceFault if their end is not confirmed.
 
-        What others in ROS ask of it goes on.
+        Goals of other ROS nodes continue.
         """
         with self._guard:
             self._stops += 1
@@ -153,25 +153,25 @@ class RosJoints:
             self._rest(active)
         with self._guard:
             if not self._guard.wait_for(lambda: not self._sending, _STOPPED_WITHIN_S):
-                fault = "a goal is on its way there; it is canceled as soon as it has arrived"
+                fault = "a goal is being sent to it; it is canceled as soon as it has arrived"
                 raise DeviceFault(device=self._entry.groups[0], bus=self._entry.action, fault=fault)
 
     def _cancel(self, pursuit: Pursuit) -> None:
-        """Raises DeviceFault: its end was not heard; it counts as moving then."""
+        """Raises DeviceFault: its end was not confirmed, so it counts as moving."""
         pursuit.cancel()
         try:
             pursuit.wait(_STOPPED_WITHIN_S)
-        except RosRefused:  # it has never begun
+        except RosRefused:  # it never began
             return
         except RosUnreachable as silent:
-            fault = f"told to stop, but its end was not heard: {silent}"
+            fault = f"canceled, but its end was not confirmed: {silent}"
             raise DeviceFault(device=self._entry.groups[0], bus=self._entry.action, fault=fault) from None
 
     def _pursue(self, points: Sequence[Mapping[str, Any]]) -> list[float]:
         goal = goal_of(self._entry.joints, points)
         with permit(self.resources) as permitted:
             before = self._active
-            if before is not None:  # ours: another move takes over, and its end is awaited by who asked for it
+            if before is not None:  # our own: another move replaces it, and its caller waits for its end
                 before.cancel()
             pursuit = self._sent(goal, permitted)
             outcome = self._ended(pursuit)
@@ -180,22 +180,22 @@ class RosJoints:
         return [one.position_rad for one in self.state()]
 
     def _await_news(self, ended_at: float) -> None:
-        """What was heard before the end is where they were on their way. Raises RosUnreachable: nothing was heard."""
+        """Waits for states after the end, as earlier ones were on the way. Raises RosUnreachable: there were none."""
         call, longest_s = current_call(), self._entry.stale_after_s
         wait_s = longest_s if call is None else call.patience_s(longest_s)
         with self._news:
             if self._news.wait_for(lambda: not self._unheard(ended_at), wait_s):
                 return
         silent = ", ".join(self._unheard(ended_at))
-        problem = f"the motion has ended, but for {wait_s:.3g} s nothing was heard of {silent}, so nobody knows where"
+        problem = f"the motion has ended, but for {wait_s:.3g} s no state of {silent} arrived: its angle is unknown"
         raise RosUnreachable(what=self._entry.topic, problem=problem)
 
     def _unheard(self, since: float) -> list[str]:
-        """Joints of which nothing was heard since then."""
+        """Joints without a state since then."""
         return [name for name in self._entry.joints if name not in self._heard or self._heard[name][3] <= since]
 
     def _sent(self, goal: Message, permitted: Permit) -> Pursuit:
-        """Nobody waits for it who stops: a stop that comes meanwhile cancels it as soon as it has arrived."""
+        """Sends a goal. A stop does not wait for this: it cancels the goal as soon as the goal has arrived."""
         with self._guard:
             permitted.gate()
             stops, self._sending = self._stops, self._sending + 1
@@ -256,7 +256,7 @@ class RosJoints:
                     resource.moving = False
 
     def close(self) -> None:
-        """Hear nothing any more."""
+        """Ends the subscription."""
         self._subscription.close()
 
 

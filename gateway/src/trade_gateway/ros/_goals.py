@@ -1,4 +1,4 @@
-"""Goals of FollowJointTrajectory in our words, and our errors in theirs. No input or output.
+"""Goals of FollowJointTrajectory as TRADE trajectories, and TRADE errors as its error codes. No input or output.
 
 Fields, units and error codes are those of control_msgs (``FollowJointTrajectory.action``, ``JointTolerance.msg``).
 """
@@ -38,7 +38,7 @@ PATH_TOLERANCE_VIOLATED: Final = -4
 GOAL_TOLERANCE_VIOLATED: Final = -5
 
 _CLOCKS_S: Final = 1.0
-"""So far may the clock of who stamps a goal be from ours."""
+"""Greatest difference between the clock of a goal's sender and ours."""
 
 
 class Unacceptable(Exception):
@@ -47,43 +47,43 @@ class Unacceptable(Exception):
     def __init__(self, code: int, problem: str) -> None:
         super().__init__(problem)
         self.code = code
-        """As in its result."""
+        """The error code of its result."""
 
 
 def starts_late(goal: Message, now_s: float) -> None:
-    """A goal begins now. Raises Unacceptable: its header says that it began long ago, or begins later."""
+    """Checks that a goal begins now. Raises Unacceptable: its header says that it began long ago, or begins later."""
     stamp = goal["trajectory"]["header"]["stamp"]
     if not (stamp["sec"] or stamp["nanosec"]):
         return
     late_s = now_s - seconds(stamp)
     if late_s > _CLOCKS_S:
-        problem = f"it was to begin {late_s:.3g} s ago; stamp it 0 to begin at once"
+        problem = f"it should have begun {late_s:.3g} s ago. Stamp it 0 to begin at once"
         raise Unacceptable(OLD_HEADER_TIMESTAMP, problem)
     if late_s < -_CLOCKS_S:
-        problem = f"it is to begin in {-late_s:.3g} s, and nothing is kept until later; stamp it 0 to begin at once"
+        problem = f"it should begin in {-late_s:.3g} s, but goals cannot be scheduled. Stamp it 0 to begin at once"
         raise Unacceptable(INVALID_GOAL, problem)
 
 
 def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | None) -> dict[str, Any]:
-    """A goal's trajectory as ours.
+    """Converts a goal's trajectory to one of TRADE.
 
     Args:
-        goal: the whole of it.
-        names: of the joints there are.
-        here: where they are, by our name: put first where the first point comes later. None: it must not.
+            goal: the whole goal.
+            names: the joints' names.
+            here: the current angles, by TRADE name, prepended if the first point is later. None: it must be at 0 s.
 
     Raises:
-        Unacceptable: other joints, or points that lack angles.
+            Unacceptable: it has other joints, or points without angles.
     """
     said: Sequence[str] = goal["trajectory"]["joint_names"]
     if sorted(said) != sorted(names.ours):
-        problem = f"it is for {', '.join(said) or 'no joints'}; all of {', '.join(names.ours)} belong in it"
+        problem = f"it is for {', '.join(said) or 'no joints'}, but must include exactly {', '.join(names.ours)}"
         raise Unacceptable(INVALID_JOINTS, problem)
     if goal.get("multi_dof_trajectory", {}).get("points"):
-        raise Unacceptable(INVALID_GOAL, "multi_dof_trajectory has points; joints of one degree of freedom are moved")
+        raise Unacceptable(INVALID_GOAL, "multi_dof_trajectory has points, but only joints of one axis are supported")
     points = [_point(point, said) for point in goal["trajectory"]["points"]]
     if not points:
-        raise Unacceptable(INVALID_GOAL, "it has no points; cancel a goal to stop, or call the stop service")
+        raise Unacceptable(INVALID_GOAL, "it has no points. To stop, cancel a goal or call the stop service")
     joints = [names.ours[name] for name in said]
     if points[0]["time_from_start_s"] > 0:
         if here is None:
@@ -108,14 +108,14 @@ def _point(point: Message, names: Sequence[str]) -> dict[str, Any]:
 
 
 def lasts_s(trajectory: Mapping[str, Any]) -> float:
-    """Of ours, to its last point, in seconds."""
+    """Duration of a TRADE trajectory, in seconds."""
     return trajectory["points"][-1]["time_from_start_s"]
 
 
 def tolerances_of(goal: Message) -> dict[str, float]:
-    """How far joints may be off, by our words: the tightest of a goal's holds for all; what it leaves out is default.
+    """Tolerances in TRADE's terms: the tightest of a goal applies to all; those it omits are default.
 
-    Those of speed and acceleration are not looked at, and none can be switched off (-1).
+    Tolerances of speed and acceleration are ignored, and none can be disabled (-1).
     """
     told: dict[str, float] = {}
     for ours, theirs in (("path_rad", "path_tolerance"), ("goal_rad", "goal_tolerance")):
@@ -127,7 +127,7 @@ def tolerances_of(goal: Message) -> dict[str, float]:
 
 
 def code_of(error: BaseException) -> int:
-    """The error code that says most of an error; what it is stands in the text beside it."""
+    """The error code that describes an error best; the text beside it has the details."""
     if isinstance(error, Unacceptable):
         return error.code
     if isinstance(error, ToleranceExceeded):
@@ -138,16 +138,16 @@ def code_of(error: BaseException) -> int:
 
 
 def text_of(error: BaseException) -> str:
-    """The text beside it."""
+    """The text of an error, for the result."""
     return str(error) if isinstance(error, Unacceptable) else failure(error)
 
 
 def goal_of(joints: Sequence[str], points: Sequence[Mapping[str, Any]]) -> Message:
-    """A goal for joints of theirs.
+    """Builds a goal for joints of ROS.
 
     Args:
         joints: their names.
-        points: as in our trajectories, in the order of the joints.
+            points: as in TRADE trajectories, in the order of the joints.
     """
     return {
         "trajectory": {

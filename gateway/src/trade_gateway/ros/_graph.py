@@ -1,11 +1,11 @@
-"""A ROS system as the bridge sees it; what differs between ROS 1 and ROS 2 is behind this.
+"""The interface of a ROS system to the bridge; it hides the differences between ROS 1 and ROS 2.
 
 Names are ROS names (``/arm/joint_states``); types are written ``package/msg/Name``, ``package/srv/Name`` and
 ``package/action/Name`` for both; messages are dicts, see `Types`.
 
-Callbacks are called on threads of the graph, one at a time for each subscription or service; they may wait. What a
-graph has open it opens again by itself when its peer (the master, the router) was gone; nothing needs to be asked for
-twice.
+Callbacks run on threads of the graph, one at a time for each subscription or service; they may wait. After its peer
+(the master, the router) was unreachable, a graph reopens everything that was open by itself; callers need not repeat
+anything.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,17 +32,17 @@ __all__ = [
 ]
 
 Heard = Callable[[Message, str], object]
-"""Told of a message, and of the name of the node that sent it (``/teleop``; empty if ROS does not say)."""
+"""Receives a message and the name of the node that sent it (``/teleop``; empty if ROS does not say)."""
 Answer = Callable[[Message, str, float], Message]
-"""Given a request, the caller's name and when it came (``time.monotonic()``, before it waited for anything), returns
-the response; what it raises is told to the caller as a failure."""
+"""Takes a request, the caller's name and its time of arrival (``time.monotonic()``, before any wait), returns
+the response; an exception is reported to the caller as a failure."""
 NodeTold = Callable[[str, bool], object]
-"""Told of a node by name, and whether it is there (or is gone, or can no longer be seen)."""
+"""Receives a node's name, and whether it is present (False: it is gone, or not visible any more)."""
 
 
 @dataclass(kw_only=True, eq=False)
 class RosUnreachable(CallError, ConnectionError):
-    """What was asked for is not there: no master, no router, no server; or it did not answer in time."""
+    """A master, router or server does not exist, or did not answer in time."""
 
     what: str
     problem: str
@@ -53,7 +53,7 @@ class RosUnreachable(CallError, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class RosRefused(CallerError):
-    """The other side of ROS was asked and said no."""
+    """The other side of ROS refused the request."""
 
     what: str
     problem: str
@@ -80,23 +80,23 @@ class Outcome:
 
 
 class Closes(Protocol):
-    """Something open."""
+    """Something open that can be closed."""
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """Closes it. Idempotent."""
         ...
 
 
 class Publisher(Closes, Protocol):
-    """A topic that is published."""
+    """A published topic."""
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """Publish; fields left out are zero. Does not wait. Raises ConfigurationError: it does not fit the type."""
+        """Publishes a message; missing fields are zero. Does not wait. Raises ConfigurationError: it does not fit."""
         ...
 
 
 class Goal(Protocol):
-    """A goal that somebody has sent to an action of ours."""
+    """A goal that a client has sent to an action of TRADE."""
 
     @property
     def message(self) -> Message: ...
@@ -108,94 +108,94 @@ class Goal(Protocol):
 
     @property
     def came_at(self) -> float:
-        """When it came, by ``time.monotonic()``, before it waited for anything."""
+        """Its time of arrival by ``time.monotonic()``, before any wait."""
         ...
 
     def feedback(self, message: Mapping[str, Any]) -> None:
-        """Tell how far it is."""
+        """Sends feedback to the client."""
         ...
 
     def when_canceled(self, tell: Callable[[], object]) -> None:
-        """Have this called when its client asks for its end, or another goal takes its place; at once if it has."""
+        """Registers a callback for a cancel by its client or a replacement; it runs at once if that has happened."""
         ...
 
 
 class Pursuit(Protocol):
-    """A goal of ours at an action of theirs."""
+    """A goal that TRADE sent to an action of ROS."""
 
     def wait(self, timeout_s: float) -> Outcome:
-        """Its end.
+        """Waits for its end.
 
         Raises:
-            RosRefused: it was rejected.
-            RosUnreachable: its server is gone, or nothing was heard of its end in time.
+                RosRefused: it was rejected.
+                RosUnreachable: its server is gone, or no end was received in time.
         """
         ...
 
     def cancel(self) -> None:
-        """Ask for its end; does not wait for it."""
+        """Requests its end; does not wait for it."""
         ...
 
 
 class Graph(Protocol):
-    """See the module."""
+    """A ROS system. See the module."""
 
     @property
     def types(self) -> Types: ...
 
     def advertise(self, topic: str, type_name: str, *, latched: bool = False) -> Publisher:
-        """Publish a topic; latched: who comes later is given the last message."""
+        """Publishes a topic; latched: later subscribers receive the last message."""
         ...
 
     def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
-        """Hear a topic; latched: also what was published before, if its publisher keeps that.
+        """Subscribes to a topic; latched: also receives earlier messages, if the publisher keeps them.
 
-        Otherwise that is not told: an old command would be taken for a new one.
+        Otherwise earlier messages are dropped: an old command would be taken for a new one.
         """
         ...
 
     def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
-        """Offer a service; stops: each request is answered at once, on a thread of its own, and waits for no other."""
+        """Serves a service; stops: each request is answered at once, on its own thread, without a queue."""
         ...
 
     def call(
         self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float, *, stops: bool = False
     ) -> Message:
-        """Call a service of theirs; stops: however many other calls are under way.
+        """Calls a ROS service; stops: regardless of the number of pending calls.
 
         Raises:
-            RosUnreachable: it is not there, or did not answer in time.
+                RosUnreachable: it does not exist, or did not answer in time.
             RosRefused: it failed.
         """
         ...
 
     def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
-        """Offer an action; each goal on a thread of its own, a later one cancels the one before."""
+        """Serves an action; each goal has its own thread, and a later one cancels the one before."""
         ...
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
     ) -> Pursuit:
-        """Send a goal to an action of theirs. Raises RosUnreachable: nobody serves it."""
+        """Sends a goal to a ROS action. Raises RosUnreachable: no node serves it."""
         ...
 
     def parameters(self, node: str, timeout_s: float) -> dict[str, Any]:
-        """What a node (ROS 1: a namespace) has as parameters, by name. Raises RosUnreachable, RosRefused."""
+        """Returns the parameters of a node (ROS 1: a namespace) by name. Raises RosUnreachable, RosRefused."""
         ...
 
     def set_parameter(self, node: str, name: str, value: Any, timeout_s: float) -> None:
-        """Set one. Raises RosUnreachable, RosRefused."""
+        """Sets a parameter. Raises RosUnreachable, RosRefused."""
         ...
 
     def watch_nodes(self, told: NodeTold) -> Closes:
-        """Have nodes told of that come and go, first those that are there. A node that dies is told gone in seconds."""
+        """Reports nodes that come and go, the present ones first. A node that dies is reported within seconds."""
         ...
 
     @property
     def healthy(self) -> str:
-        """Empty, or what is wrong: ``no master at http://...`` ."""
+        """Empty if the system is reachable, else why not: ``no master at http://...`` ."""
         ...
 
     def close(self) -> None:
-        """End all. Idempotent."""
+        """Closes everything. Idempotent."""
         ...

@@ -1,4 +1,4 @@
-"""Joints of ours by the names that ROS has for them, and where they are."""
+"""Joints of TRADE under their names in ROS, and their measured positions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple, cast
@@ -15,25 +15,25 @@ _TOLD_WITHIN_S: Final = 5.0
 
 
 class Measured(NamedTuple):
-    """Where joints were, in the order of their names."""
+    """Positions of joints, in the order of their names."""
 
     names: Sequence[str]
     positions_rad: Sequence[float]
     velocities_rad_s: Sequence[float]
     age_s: float
-    """How long ago the oldest of it was read."""
+    """Age of the oldest reading in seconds."""
 
 
 class JointNames:
-    """Their names and ours.
+    """The names of joints in ROS and in TRADE.
 
     Args:
-        joints: ours, full.
-        short: whether theirs are the last words of ours.
-        named: by their name ours, where they differ from that.
+            joints: full names in TRADE.
+            short: whether the ROS names are the last parts of the TRADE names.
+            named: for each other ROS name, the TRADE name.
 
     Raises:
-        ConfigurationError: two joints would have one name, or a name is of no joint.
+            ConfigurationError: two joints would have the same name, or a name belongs to no joint.
     """
 
     def __init__(self, joints: Sequence[str], *, short: bool, named: Mapping[str, str]) -> None:
@@ -43,22 +43,22 @@ class JointNames:
                 raise ConfigurationError(where="joints", problem=problem)
         said = {own: theirs for theirs, own in named.items()}
         self.theirs: Final = [said.get(own, own.rpartition(".")[2] if short else own) for own in joints]
-        """In the order of ours."""
+        """In the order of the TRADE names."""
         if len(set(self.theirs)) < len(joints):
-            problem = f'two of {", ".join(joints)} would have one name; say names = "full", or name them in joints'
+            problem = f'two of {", ".join(joints)} would have one name. Set names = "full", or name them in joints'
             raise ConfigurationError(where="joints", problem=problem)
         self.ours: Final = dict(zip(self.theirs, joints, strict=True))
 
 
 def limbs(found: Sequence[Handle], group: str, name: str) -> list[Handle]:
-    """Of services of a name those of the joint group or arm that is exactly this group; else of all motors and arms."""
+    """Services with a name in the joint group or arm that is exactly this group; else those of all motors and arms."""
     named = [handle for handle in found if handle.name == name]
     exact = [one for one in named if group in one.groups and {"JointGroup", "Arm"} & set(one.kinds)]
     return exact or [one for one in named if {"Motor", "Arm"} & set(one.kinds)]
 
 
 def beside(container: Container, handle: Handle, name: str) -> Handle:
-    """Another service of the same provider. Raises ConfigurationError: it has none of that name."""
+    """Another service of the same provider. Raises ConfigurationError: the provider has no service of that name."""
     key = handle.key
     for one in container.services(where(name=name, container=handle.container)):
         if (one.key.address, one.key.domain, one.key.provider) == (key.address, key.domain, key.provider):
@@ -67,7 +67,7 @@ def beside(container: Container, handle: Handle, name: str) -> Handle:
 
 
 def joints_of(container: Container, handle: Handle) -> list[str]:
-    """Full names of the joints a service is about, in the order of its values. Raises what asking for them does."""
+    """Full names of the joints of a service, in the order of its values. Raises what the call for them raises."""
     told = beside(container, handle, "limits").with_(deadline_s=_TOLD_WITHIN_S)()
     limits: Any = msgspec.to_builtins(told)
     if isinstance(limits, dict):  # of an arm, or of one joint
@@ -77,7 +77,7 @@ def joints_of(container: Container, handle: Handle) -> list[str]:
 
 
 def measured(joints: Sequence[str], state: Any) -> Measured:
-    """What a motor, joint group or arm says of itself."""
+    """Reads the positions from the state of a motor, joint group or arm."""
     told: Any = msgspec.to_builtins(state)
     if isinstance(told, dict) and "positions_rad" in told:
         arm = cast("dict[str, Any]", told)

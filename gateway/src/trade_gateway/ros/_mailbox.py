@@ -1,4 +1,4 @@
-"""Callbacks on threads of their own: one after another (`Mailbox`), or each at once (`AtOnce`), for stops."""
+"""Queues whose callbacks run on their own threads: in turn (`Mailbox`), or all at once (`AtOnce`), for stops."""
 
 import logging
 import threading
@@ -11,13 +11,13 @@ __all__ = ["AtOnce", "Mailbox"]
 
 _T = TypeVar("_T")
 _END_S: Final = 2.0
-"""How long closing waits for what is being told; it may go on after that."""
+"""How long closing waits for running callbacks; they may last longer."""
 
 _log: Final = logging.getLogger("trade")
 
 
 class Mailbox(Generic[_T]):
-    """Nobody who puts something in waits; the oldest goes if it is full, and what waited too long is not told."""
+    """A queue whose `put` never waits. When full, it drops the oldest item; items that waited too long expire."""
 
     def __init__(
         self,
@@ -31,11 +31,11 @@ class Mailbox(Generic[_T]):
     ) -> None:
         """Args:
         name: of the thread.
-        tell: called with each; what it raises is logged.
-        most: how many wait at most; None: any number.
-        longest_s: how long one waits at most, in seconds.
-        drop: called with each that is not told after all.
-        end_s: how long closing waits for what is being told, in seconds.
+            tell: called with each item; its exceptions are logged.
+            most: how many items wait at most; None: any number.
+            longest_s: how long an item waits at most, in seconds.
+            drop: called with each dropped item.
+            end_s: how long closing waits for running callbacks, in seconds.
         """
         self._tell = tell
         self._most = most
@@ -49,7 +49,7 @@ class Mailbox(Generic[_T]):
         self._thread.start()
 
     def put(self, item: _T) -> None:
-        """Have it told; after the end it is dropped."""
+        """Queues an item; after the end it is dropped."""
         dropped: list[_T] = []
         with self._changed:
             if self._closed:
@@ -62,7 +62,7 @@ class Mailbox(Generic[_T]):
         self._leave(dropped)
 
     def close(self) -> None:
-        """Tell no more. Idempotent; may be called by who is told."""
+        """Ends the queue. Idempotent; a callback may call it."""
         with self._changed:
             self._closed = True
             left = [item for _, item in self._waiting]
@@ -92,17 +92,17 @@ class Mailbox(Generic[_T]):
 
 
 class AtOnce(Generic[_T]):
-    """Nobody who puts something in waits, and nothing waits for another; never too late to be told.
+    """A pool whose `put` never waits and whose items do not wait for one another, nor expire.
 
-    Only when all threads there may be are busy one waits, for the first that is free.
+    An item waits only when all threads are busy, for the first that is free.
     """
 
     def __init__(self, name: str, tell: Callable[[_T], object], *, most: int, drop: Callable[[_T], object]) -> None:
         """Args:
         name: of the threads.
-        tell: called with each; what it raises is logged.
-        most: how many are told at a time.
-        drop: called with each that is not told after all.
+        tell: called with each item; its exceptions are logged.
+        most: how many callbacks run at a time.
+        drop: called with each dropped item.
         """
         self._name = name
         self._tell = tell
@@ -114,7 +114,7 @@ class AtOnce(Generic[_T]):
         self._closed = False
 
     def put(self, item: _T) -> None:
-        """Have it told; after the end it is dropped."""
+        """Runs the callback for an item; after the end the item is dropped."""
         thread = threading.Thread(target=self._run, args=(item,), name=self._name, daemon=True)
         with self._changed:
             closed = self._closed
@@ -129,7 +129,7 @@ class AtOnce(Generic[_T]):
             self._start(thread, item)
 
     def close(self) -> None:
-        """Tell no more. Idempotent; may be called by who is told."""
+        """Ends the pool. Idempotent; a callback may call it."""
         with self._changed:
             self._closed = True
             left = list(self._waiting)
@@ -144,7 +144,7 @@ class AtOnce(Generic[_T]):
     def _start(self, thread: threading.Thread, item: _T) -> None:
         try:
             thread.start()
-        except RuntimeError:  # the system has no more threads
+        except RuntimeError:  # the thread limit is reached
             _log.exception("%s has no thread", self._name)
             with self._changed:
                 self._threads.discard(thread)
@@ -164,5 +164,5 @@ class AtOnce(Generic[_T]):
 def _quietly(name: str, call: Callable[[_T], object], item: _T) -> None:
     try:
         call(item)
-    except Exception:  # noqa: BLE001 - what comes next is to be told, too
+    except Exception:  # noqa: BLE001 - the callbacks of later items must still run
         _log.exception("%s failed", name)

@@ -1,4 +1,4 @@
-"""What of ours ROS has, as providers come and go: opened when a service is there, closed when it is gone."""
+"""Keeps mappings to ROS in step with TRADE's services: opens them for new services, and closes them for lost ones."""
 
 import logging
 import threading
@@ -16,36 +16,36 @@ __all__ = ["Following", "Mapping", "Place", "named_services", "of_name"]
 _logger = logging.getLogger("trade")
 
 _OWN: Final = "trade"
-"""Group of the middleware's own functions: for nobody in ROS."""
+"""Group of the middleware's own services, which are never mapped."""
 _LOOK_EVERY_S: Final = 1.0
 _AGAIN_S: Final = 2.0
-"""After which what could not be opened is tried again."""
+"""Pause before a failed mapping is retried, in seconds."""
 
 
 class Place(NamedTuple):
-    """Where something is in ROS."""
+    """The kind and name of a mapping in ROS."""
 
     kind: str
-    """``service``, ``action``, ``command`` or ``topic``; of all but the last there is one of a name."""
+    """``service``, ``action``, ``command`` or ``topic``; except for topics, names are unique."""
     name: str
     what: str = ""
-    """For people, if it is more than one service of ours."""
+    """A description for people, if the mapping covers several services of TRADE."""
 
 
 class Mapping(Protocol):
-    """One entry of the file, for ROS to have."""
+    """One entry of the file that maps services to ROS."""
 
     @property
     def of(self) -> Constraint:
-        """Among which services it looks."""
+        """The constraint of the services that it selects from."""
         ...
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
-        """Where which of those go. Raises ConfigurationError: it is not clear which is meant."""
+        """Pairs of places and services. Raises ConfigurationError: the selection is ambiguous."""
         ...
 
     def open(self, place: Place, handle: Handle) -> Closes:
-        """Have it there. Raises ConfigurationError: it does not fit."""
+        """Opens the mapping. Raises ConfigurationError: the types do not match."""
         ...
 
 
@@ -56,17 +56,17 @@ class _Key(NamedTuple):
 
     @property
     def what(self) -> str:
-        """What is there, for people."""
+        """A description for people."""
         return self.place.what or self.handle.label
 
 
 class Following:
-    """Keeps open what can be.
+    """Opens and closes mappings as services come and go.
 
     Args:
-        container: whose system.
-        mappings: the entries; of two that want the same name the first has it.
-        say: told in a line what comes up, goes, or cannot be.
+            container: its system has the services.
+            mappings: the entries; the first one that wants a name gets it.
+            say: receives one line for each mapping that opens, closes or fails.
     """
 
     def __init__(self, container: Container, mappings: Sequence[Mapping], say: Callable[[str], object]) -> None:
@@ -75,25 +75,25 @@ class Following:
         self._say = say
         self._open: dict[_Key, Closes] = {}
         self._failed: dict[tuple[int, Place | None, Handle | None], tuple[str, float]] = {}
-        """Why, and when."""
+        """For each failed mapping, why and when."""
         self._look_now = threading.Event()
         self._closing = False
         self._first = threading.Event()
         hear = _Heard(self._look_now.set)
-        self._told = [ask(where(), hear.told) for ask in (container.joined, container.left, container.changed)]
+        self._notifications = [ask(where(), hear.told) for ask in (container.joined, container.left, container.changed)]
         self._thread = threading.Thread(target=self._follow, name="trade-ros-following", daemon=True)
         self._thread.start()
 
     def settled(self, timeout_s: float) -> bool:
-        """Wait until what is there already was opened. Returns whether it was."""
+        """Waits until the mappings of present services are open. Returns whether they are."""
         return self._first.wait(timeout_s)
 
     def opened(self) -> dict[str, str]:
-        """What is open, by kind and name: what it is here."""
+        """Open mappings, by kind and name: the TRADE service."""
         return {f"{key.place.kind} {key.place.name}": key.what for key in list(self._open)}
 
     def problems(self) -> list[str]:
-        """What is not, and why."""
+        """Failed mappings, and why."""
         return [text for text, _ in list(self._failed.values())]
 
     def _follow(self) -> None:
@@ -102,7 +102,7 @@ class Following:
             try:
                 self._look()
             except Exception:
-                _logger.exception("what ROS has of ours could not be brought up to date")
+                _logger.exception("the mappings to ROS could not be updated")
             self._first.set()
             self._look_now.wait(_LOOK_EVERY_S)
 
@@ -110,7 +110,7 @@ class Following:
         wanted = self._wanted()
         for key in [key for key in self._open if key not in wanted]:
             self._open.pop(key).close()
-            self._say(f"{key.place.kind} {key.place.name} is gone, as {key.what} is")
+            self._say(f"{key.place.kind} {key.place.name} is gone, because {key.what} is gone")
         present = {(key.entry, key.place, key.handle) for key in wanted}
         for failed in [one for one in self._failed if one[1] is not None and one not in present]:
             del self._failed[failed]
@@ -133,7 +133,7 @@ class Following:
                 key = _Key(number, place, handle)
                 holder = claimed.get(place[:2])
                 if place.kind != "topic" and holder is not None and holder != key and holder.handle.alive:
-                    self._note(key, f"{key.what} is not there as {place.name}, which {holder.what} is")
+                    self._note(key, f"{key.what} cannot be mapped to {place.name}: {holder.what} has this name")
                     continue
                 if place.kind != "topic":
                     claimed[place[:2]] = key
@@ -141,7 +141,7 @@ class Following:
         return wanted
 
     def _is_for_ros(self, handle: Handle) -> bool:
-        """What the bridge itself offers came from ROS."""
+        """Whether a service is not the bridge's own, as those came from ROS."""
         return handle.key.domain != _OWN and handle.key.address != self._container.address
 
     def _try(self, key: _Key) -> None:
@@ -150,8 +150,8 @@ class Following:
             return
         try:
             self._open[key] = self._mappings[key.entry].open(key.place, key.handle)
-        except Exception as error:  # noqa: BLE001 - one that cannot be mapped keeps no other from it
-            self._note(key, f"{key.what} is not there as {key.place.name}: {failure(error)}")
+        except Exception as error:  # noqa: BLE001 - a failed mapping must not prevent others
+            self._note(key, f"{key.what} cannot be mapped to {key.place.name}: {failure(error)}")
             return
         self._failed.pop(key, None)
         self._say(f"{key.place.kind} {key.place.name} is {key.what}")
@@ -163,10 +163,10 @@ class Following:
             self._say(text)
 
     def close(self) -> None:
-        """Close all. Idempotent."""
+        """Closes all mappings. Idempotent."""
         self._closing = True
-        for told in self._told:
-            told.cancel()
+        for each in self._notifications:
+            each.cancel()
         self._look_now.set()
         self._thread.join()
         for key in list(self._open):
@@ -174,10 +174,10 @@ class Following:
 
 
 class _Heard:
-    """Hears of services that come, go and change."""
+    """Receives notifications of services that come, go and change."""
 
-    told_as = "look what ROS has (the ROS bridge)"
-    """In lists of notifications."""
+    told_as = "update the mappings to ROS (the ROS bridge)"
+    """Its text in lists of notifications."""
 
     def __init__(self, look: Callable[[], object]) -> None:
         self._look = look
@@ -187,21 +187,21 @@ class _Heard:
 
 
 def of_name(service: str) -> Constraint:
-    """What a mapped service is found by: its group, if it names one, and its name."""
+    """The constraint that finds a mapped service: its group, if given, and its name."""
     group, _, name = service.rpartition(".")
     return where(group=group or None, name=name)
 
 
 def named_services(service: str, found: Sequence[Handle]) -> list[Handle]:
-    """Of some services the one of a group and name; one of exactly this group goes before those beneath it.
+    """Selects services by group and name; those of exactly this group have priority over those beneath it.
 
     Raises:
-        ConfigurationError: there are several.
+            ConfigurationError: there are several.
     """
     group, _, name = service.rpartition(".")
     inside = [handle for handle in found if handle.name == name]
     exact = [handle for handle in inside if group in (handle.key.domain, *handle.groups)] or inside
     if len(exact) > 1:
         several = ", ".join(f"{one.label} in {one.container}" for one in exact)
-        raise ConfigurationError(where=service, problem=f"which one? There is {several}")
+        raise ConfigurationError(where=service, problem=f"is ambiguous. There is {several}")
     return exact

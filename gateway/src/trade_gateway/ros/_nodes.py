@@ -1,6 +1,6 @@
-"""Nodes of ROS as clients: each has a session of its own, which ends when the node does (S03).
+"""ROS nodes as clients of TRADE: each has its own session, which ends when the node does (S03).
 
-ROS tells of nodes that go. If it is lost itself nobody does, and then all of them count as gone after a short grace.
+ROS reports nodes that end. If ROS itself is lost, no reports arrive, and all nodes count as gone after a short grace.
 """
 
 import logging
@@ -25,7 +25,7 @@ class _HeldLock:
 
 
 class NodeLocks:
-    """Of one node. What it has locked itself is used and stays its own."""
+    """The locks of one node. Locks that the node took itself are used and kept."""
 
     def __init__(self, container: Container, client: Client) -> None:
         self._container = container
@@ -35,15 +35,15 @@ class NodeLocks:
 
     @contextmanager
     def hold(self, handles: Sequence[Handle], purpose: str, wait_s: float) -> Generator[None]:
-        """Have services for the node alone inside.
+        """Holds locks on services for the node inside the context.
 
         Args:
-            handles: those that move something.
-            purpose: as others are told.
-            wait_s: how long to wait for others.
+                handles: the services that move something.
+                purpose: the purpose shown to others.
+                wait_s: how long to wait for other owners, in seconds.
 
         Raises:
-            LockedByOther: somebody else has one of them, or moves it.
+                LockedByOther: another client has locked one of them, or moves it.
             TradeError: see `trade.Container.lock`.
         """
         taken = self._take(handles, purpose, wait_s)
@@ -82,40 +82,40 @@ class NodeLocks:
 _logger = logging.getLogger("trade")
 
 UNKNOWN: Final = ""
-"""Whoever ROS does not tell apart: they are one client together."""
+"""The name of all clients that ROS does not identify; they share one client of TRADE."""
 _LOOK_EVERY_S: Final = 0.1
 _UNSEEN_S: Final = 5.0
-"""Who was heard but is not among the nodes that ROS tells of is gone so long after it was heard last."""
+"""Time after the last message until a node that ROS does not list counts as gone."""
 _FORGOTTEN_S: Final = 2.0
-"""So long nothing is done for a node that has ended: what comes then was sent before."""
+"""Time during which requests of an ended node are refused, as they were sent before its end."""
 _REMEMBERED_S: Final = 60.0
-"""What came before a node ended is refused for so long; nothing waits longer for its turn."""
+"""How long the end of a node is remembered; no request waits longer for its turn."""
 _WAIT_S: Final = 0.5
-"""For a lock: what somebody has just let go of."""
+"""Wait for a lock that another client has just released."""
 _LATE_S: Final = 5.0
-"""Beyond a call's deadline, when its end must have been told."""
+"""Time after a call's deadline by which its end must be known."""
 
 
 class Guest:
-    """One node of ROS; its methods wait."""
+    """The client that represents one ROS node; its methods wait."""
 
     def __init__(self, container: Container, client: Client, who: str) -> None:
         self._container = container
         self.client: Final = client
         self.who: Final = who
-        """Its name; empty: nobody knows."""
+        """Its name; empty if unknown."""
         self.grips: Final = NodeLocks(container, client)
         self.heard_at = time.monotonic()
         self.stopped_at = 0.0
-        """When its last stop came: what came before that must not begin any more (S08)."""
+        """When its last stop arrived; earlier requests must not begin any more (S08)."""
 
     @property
     def named(self) -> str:
-        """For people."""
-        return self.who or "a node of ROS that is not known"
+        """Its name for people."""
+        return self.who or "an unknown node of ROS"
 
     def call(self, handle: Handle, args: dict[str, Any], deadline_s: float, came_at: float) -> Any:
-        """Call a service of ours and wait; what moves is under a lock meanwhile. Raises as `begin`, and as the call."""
+        """Calls a TRADE service and waits, with locks for what moves. Raises as `begin`, and as the call."""
         if handle.effect != "actuate":
             return self._ended(self.begin(handle, args, deadline_s, came_at), deadline_s)
         admitted = self.client.admit(handle)
@@ -130,19 +130,19 @@ class Guest:
         came_at: float | None,
         admitted: int | None = None,
     ) -> Run:
-        """Call without waiting, under the locks there are.
+        """Starts a call without waiting, under the current locks.
 
         Args:
             handle: what to call.
             args: by name.
-            deadline_s: how long it may take.
-            came_at: when the node asked for it (``time.monotonic()``), before it waited for anything; None: the bridge
-                itself asks.
-            admitted: what `Client.admit` said when it was asked for; by default that is now.
+                deadline_s: the call's deadline in seconds.
+                came_at: arrival of the node's request (``time.monotonic()``), before any wait; None: the bridge itself
+                        makes the call.
+                admitted: what `Client.admit` returned on arrival; by default it is called now.
 
         Raises:
-            Cancelled: a stop was asked for meanwhile.
-            SessionEnded: the node is gone.
+                Cancelled: a stop was requested meanwhile.
+                SessionEnded: the node is gone.
         """
         client = self.client
         if handle.effect == "stop" and came_at is not None:
@@ -175,13 +175,13 @@ class Guest:
 
 
 class Nodes:
-    """Those that have asked for something.
+    """The nodes that have made a request.
 
     Args:
         container: the bridge's.
         graph: the ROS system.
-        grace_s: how long that may be lost before all nodes count as gone.
-        told: called with what is wrong with the ROS system, or nothing, whenever that changes.
+            grace_s: how long ROS may be lost before all nodes count as gone, in seconds.
+            told: receives ROS's problem, or an empty text, at each change.
     """
 
     def __init__(self, container: Container, graph: Graph, grace_s: float, told: Callable[[str], object]) -> None:
@@ -192,7 +192,7 @@ class Nodes:
         self._guests: dict[str, Guest] = {}
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}
-        """When which has ended, lately."""
+        """When recently ended nodes ended."""
         self._guard = threading.Lock()
         self._lost = ""
         self._lost_at: float | None = None
@@ -202,24 +202,24 @@ class Nodes:
         self._thread.start()
 
     def guest(self, who: str, came_at: float, *, stops: bool = False) -> Guest:
-        """The client that a node is.
+        """Returns the client that represents a node.
 
         Args:
-            who: its name, as ROS says it.
-            came_at: when it asked for something, by ``time.monotonic()``.
-            stops: it wants to stop something, which it always may.
+                who: its name, from ROS.
+                came_at: arrival of its request, by ``time.monotonic()``.
+                stops: whether it wants to stop something, which is always allowed.
 
         Raises:
-            RosUnreachable: nobody would see it die, or it has since; or the bridge is leaving.
+                RosUnreachable: the node's end would be invisible, or it has ended, or the bridge is shutting down.
         """
         with self._guard:
             if self._closing.is_set() and not stops:
-                raise RosUnreachable(what="the bridge", problem="it is leaving; nothing is begun any more")
+                raise RosUnreachable(what="the bridge", problem="it is shutting down and begins no calls")
             if self._lost and not stops:
-                problem = f"{self._lost}; nobody would see {who or 'a node'} die, so nothing is done for it until then"
+                problem = f"{self._lost}; the end of {who or 'a node'} would be invisible, so its request is refused"
                 raise RosUnreachable(what="ROS", problem=problem)
             if self._is_of_the_dead(who, came_at) and not stops:
-                raise RosUnreachable(what=who, problem="it has ended; what was still under way from it is not done")
+                raise RosUnreachable(what=who, problem="it has ended; its pending requests are not executed")
             guest = self._guests.get(who)
             if guest is None or guest.client.closed:
                 guest = self._guests[who] = self._opened(who)
@@ -237,11 +237,11 @@ class Nodes:
         return Guest(self._container, Client(self._container.address.identity, session, lambda _: None), who)
 
     def names(self) -> list[str]:
-        """Of the nodes that have a session now."""
+        """Names of the nodes that have a session now."""
         with self._guard:
             return sorted(guest.named for guest in self._guests.values() if not guest.client.closed)
 
-    # --- who is gone
+    # --- nodes that are gone
 
     def _node(self, name: str, there: bool) -> None:
         with self._guard:
@@ -250,7 +250,7 @@ class Nodes:
             if not there:
                 self._gone[name] = time.monotonic()
         if gone is not None:
-            _logger.info("%s is gone: what it moved stops, its locks fall", name)
+            _logger.info("%s is gone: its motion stops, and its locks are released", name)
             gone.client.close()
 
     def _look_on(self) -> None:
@@ -258,7 +258,7 @@ class Nodes:
             try:
                 self._look()
             except Exception:
-                _logger.exception("nodes of ROS could not be looked after")
+                _logger.exception("the check of ROS nodes failed")
 
     def _look(self) -> None:
         problem, now = self._graph.healthy, time.monotonic()
@@ -267,7 +267,7 @@ class Nodes:
         with self._guard:
             self._gone = {name: at for name, at in self._gone.items() if now - at < _REMEMBERED_S}
             changed, self._lost = bool(lost) != bool(self._lost), lost
-            all_of_them = changed and bool(lost)  # later there are only some that stop something
+            all_of_them = changed and bool(lost)  # later only nodes that stop something are left
             gone = [one for one in self._guests.values() if all_of_them or self._unseen(one, now)]
             for guest in gone:
                 del self._guests[guest.who]
@@ -281,7 +281,7 @@ class Nodes:
         return unseen and now - guest.heard_at > _UNSEEN_S
 
     def close(self) -> None:
-        """All count as gone. Idempotent."""
+        """Ends the sessions of all nodes. Idempotent."""
         self._closing.set()
         self._watch.close()
         self._thread.join()

@@ -1,4 +1,4 @@
-"""Providers of ours made from what ROS says: services whose parameters and results are the fields of messages."""
+"""TRADE providers built from ROS types: services whose parameters and results are the fields of messages."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -17,28 +17,28 @@ _OCTETS: Final = ("uint8", "byte", "octet", "char")
 
 
 class Method(NamedTuple):
-    """A service to be."""
+    """The description of a service to build."""
 
     name: str
     doc: str
     parameters: Mapping[str, Any]
-    """Types by name."""
+    """Types by parameter name."""
     optional: frozenset[str]
-    """Those that may be left out."""
+    """Optional parameters."""
     returns: Any
     effect: str
     do: Callable[[dict[str, Any]], Any]
-    """Given the arguments by name."""
+    """Takes the arguments by name."""
     cancel: str | None = None
 
 
 def provider(kind: str, methods: Sequence[Method], resources: Sequence[Resource] = ()) -> object:
-    """An object with these services.
+    """Builds an object with these services.
 
     Args:
-        kind: name of its class.
+            kind: name of its class.
         methods: the services.
-        resources: what those that actuate use.
+            resources: what the services that actuate use.
     """
     members: dict[str, Any] = {method.name: _made(method) for method in methods}
     return type(kind, (), {**members, "resources": tuple(resources)})()
@@ -69,14 +69,14 @@ def _made(method: Method) -> Any:
 
 
 class Records:
-    """Messages as structs, made once for each type."""
+    """Message types as structs, built once for each type."""
 
     def __init__(self, types: Types) -> None:
         self._types = types
         self._made: dict[str, type[msgspec.Struct]] = {}
 
     def of(self, type_name: str) -> type[msgspec.Struct]:
-        """The struct of a message type; its fields may be left out, and are zero then."""
+        """Returns the struct of a message type; its fields are optional, and zero by default."""
         made = self._made.get(type_name)
         if made is None:
             fields = [self._field(field) for field in self._types.fields(type_name)]
@@ -88,10 +88,10 @@ class Records:
         return made
 
     def parameters(self, type_name: str) -> tuple[dict[str, Any], frozenset[str]]:
-        """The fields as parameters of a service, and those that may be left out: headers.
+        """Returns the fields as parameters of a service, and which are optional: headers.
 
         Raises:
-            ConfigurationError: one is called what no parameter can be.
+                ConfigurationError: the name of a field cannot be one of a parameter.
         """
         fields = self._types.fields(type_name)
         for field in fields:
@@ -102,7 +102,7 @@ class Records:
         return {name: kind | None if name in headers else kind for name, kind in kinds.items()}, headers
 
     def record(self, type_name: str, message: Message) -> Any:
-        """A message as the struct of its type; None if it has no fields."""
+        """Converts a message to the struct of its type; None if it has no fields."""
         return msgspec.convert(message, self.of(type_name)) if message else None
 
     def _field(self, field: Field) -> tuple[str, Any, Any]:
@@ -130,7 +130,7 @@ def _plain_kind(kind: str) -> type:
 
 
 def plain(args: Mapping[str, Any]) -> Message:
-    """Arguments as a message; what was left out, or is an empty list, is left to the type."""
+    """Converts arguments to a message; the type provides omitted arguments and empty lists."""
     told = msgspec.to_builtins(dict(args), builtin_types=(bytes,))
     return _without_empty(told)
 

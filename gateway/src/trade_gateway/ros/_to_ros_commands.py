@@ -1,7 +1,7 @@
-"""Messages of a ROS node as calls of ours: the newest counts, and silence stops what they move.
+"""Messages of a ROS node as calls of TRADE services: the newest counts, and silence stops the motion.
 
-A node that commands has the lock of what it moves from its first message on. It is given back when nothing was heard of
-it for the deadman's time, when it is gone, and when a call of it fails: in each case the stop is called before.
+A commanding node holds the lock of what it moves from its first message on. The lock is released when the node is
+silent for the deadman's time, when it ends, and when a call fails: in each case after the stop is called.
 """
 
 import logging
@@ -26,7 +26,7 @@ __all__ = ["CommandsToRos", "stops_of"]
 _logger = logging.getLogger("trade")
 
 _MOST_UNDER_WAY: Final = 2
-"""A command and the one that takes over from it; a newer one waits in the only place there is."""
+"""The running call and the one that replaces it; a newer command waits in a queue of one."""
 _STOPPED_WITHIN_S: Final = 5.0
 _SAID_AGAIN_S: Final = 10.0
 
@@ -56,12 +56,12 @@ class CommandsToRos:
     def open(self, place: Place, handle: Handle) -> Closes:
         entry = self._entry
         if handle.effect == "stop":
-            problem = "a stop is for everybody at any time, a topic hears one node at a time: say [[to_ros.service]]"
+            problem = "is a stop, which any node may call at any time; a topic accepts one node. Use [[to_ros.service]]"
             raise ConfigurationError(where=handle.label, problem=problem)
         asked = RequestMapping(self._graph.types, entry.type, handle, entry.args, entry.fixed)
         stops = stops_of(self._container, handle) if handle.effect == "actuate" else []
         if handle.effect == "actuate" and not stops:
-            problem = "has no stop, so silence could not end what a command begins"
+            problem = "has no stop, so silence could not end a command's motion"
             raise ConfigurationError(where=handle.label, problem=problem)
         taking = _Taking(entry, handle, asked, stops, self._nodes, self._say)
         try:
@@ -73,17 +73,17 @@ class CommandsToRos:
 
 
 class _Commanded(NamedTuple):
-    """A message that waits."""
+    """A waiting message."""
 
     message: Message
     who: str
     at: float
     admitted: int | None
-    """How often its node has asked for a stop before."""
+    """The number of stops that its node had requested before."""
 
 
 class _Taking:
-    """Takes the messages of one topic, of one node at a time."""
+    """Executes the messages of one topic, from one node at a time."""
 
     def __init__(
         self,
@@ -106,8 +106,8 @@ class _Taking:
         self._heard_at = 0.0
         self._closing = False
         self._guest: Guest | None = None
-        self._told_by: Client | None = None
-        """Who tells it that it has ended."""
+        self._watched: Client | None = None
+        """The client whose end wakes the thread."""
         self._grip = ExitStack()
         self._runs: list[Run] = []
         self._problem = ("", 0.0)
@@ -116,14 +116,14 @@ class _Taking:
         self._thread.start()
 
     def hears(self, subscription: Closes) -> None:
-        """What gives it its messages."""
+        """Sets the subscription that delivers the messages."""
         self._subscription = subscription
 
     def heard(self, message: Message, who: str) -> None:
-        """One came. Does not wait."""
+        """Queues a message. Does not wait."""
         with self._news:
             if self._owner not in (None, who):
-                self._told(f"{who or 'another node'} is not heard on {self._entry.topic}: {self._owner} commands there")
+                self._report(f"{who or 'another node'} is refused on {self._entry.topic}: {self._owner} commands there")
                 return
             self._owner, self._heard_at = who, time.monotonic()
             guest = self._guest
@@ -147,7 +147,7 @@ class _Taking:
                     self._end(reason)
                 elif newest is not None:
                     self._begin(newest)
-            except Exception as error:  # noqa: BLE001 - whatever went wrong, what was begun has to end
+            except Exception as error:  # noqa: BLE001 - whatever went wrong, the motion must end
                 self._end(f"{self._entry.topic}: {failure(error)}")
         self._end(f"{self._entry.topic} is not mapped any more")
 
@@ -155,7 +155,7 @@ class _Taking:
         return self._closing or bool(self._over()) or (self._newest is not None and self._may_begin())
 
     def _left_s(self) -> float | None:
-        """Until silence is too long."""
+        """Remaining time until the silence is too long."""
         if self._owner is None:
             return None
         return max(0.0, self._heard_at + self._entry.deadman_s - time.monotonic())
@@ -165,11 +165,11 @@ class _Taking:
         return sum(not run.done() for run in self._runs) < _MOST_UNDER_WAY
 
     def _over(self) -> str:
-        """Why it is over with the one who commands; empty if it is not."""
+        """Why the commanding node's turn ends; empty if it continues."""
         if self._owner is None:
             return ""
         if time.monotonic() - self._heard_at >= self._entry.deadman_s:
-            return f"nothing was heard on {self._entry.topic} for {self._entry.deadman_s:g} s"
+            return f"no message on {self._entry.topic} for {self._entry.deadman_s:g} s"
         if self._guest is not None and self._guest.client.closed:
             return f"{self._guest.named} is gone"
         if self._runs and self._runs[-1].done() and (error := self._runs[-1].exception(0)) is not None:
@@ -177,7 +177,7 @@ class _Taking:
         return ""
 
     def _begin(self, command: _Commanded) -> None:
-        """Make a call of it; whatever it raises ends all."""
+        """Calls the service with a command; an error ends the node's turn."""
         if time.monotonic() - command.at >= self._entry.deadman_s:
             return
         guest = self._nodes.guest(command.who, command.at)
@@ -187,8 +187,8 @@ class _Taking:
             self._grip.enter_context(hold)
         if self._guest is not guest:
             self._guest = guest
-            if self._told_by is not guest.client:
-                self._told_by = guest.client
+            if self._watched is not guest.client:
+                self._watched = guest.client
                 guest.client.when_closed(self._wake)
         words, deadline_s = self._asked(command.message), self._entry.deadline_s
         run = guest.begin(self._handle, words, deadline_s, command.at, command.admitted)
@@ -200,7 +200,7 @@ class _Taking:
             self._news.notify()
 
     def _end(self, reason: str) -> None:
-        """Stop, then give the lock back."""
+        """Stops the motion, then releases the lock."""
         with self._news:
             guest, self._guest, self._owner = self._guest, None, None
             moved, self._runs, self._newest = bool(self._runs), [], None
@@ -209,9 +209,9 @@ class _Taking:
         try:
             self._grip.close()
         except TradeError as error:
-            _logger.warning("the lock for %s could not be given back: %s", self._entry.topic, error)
+            _logger.warning("the lock for %s could not be released: %s", self._entry.topic, error)
         if not self._closing:
-            self._told(reason if not moved or guest is None else f"{reason}; {self._handle.label} was stopped")
+            self._report(reason if not moved or guest is None else f"{reason}; {self._handle.label} was stopped")
 
     def _stop(self, guest: Guest, reason: str) -> None:
         runs: list[Run] = []
@@ -227,15 +227,15 @@ class _Taking:
                 _logger.exception("%s; it was not stopped", reason)
                 guest.client.close()
 
-    def _told(self, problem: str) -> None:
-        """Say it; the same again not before some seconds have passed."""
+    def _report(self, problem: str) -> None:
+        """Reports a problem; repeats it only after some seconds."""
         before, said_at = self._problem
         if problem != before or time.monotonic() - said_at > _SAID_AGAIN_S:
             self._problem = (problem, time.monotonic())
             self._say(problem)
 
     def close(self) -> None:
-        """Stop what it moves. Idempotent."""
+        """Stops its motion and ends. Idempotent."""
         if self._subscription is not None:
             self._subscription.close()
         with self._news:
@@ -245,7 +245,7 @@ class _Taking:
 
 
 def stops_of(container: Container, handle: Handle) -> list[Handle]:
-    """The stops of the provider that a service is of."""
+    """The stops of a service's provider."""
     key = handle.key
     beside = container.services(where(container=handle.container))
     own = [one for one in beside if one.effect == "stop" and one.key.address == key.address]

@@ -1,4 +1,4 @@
-"""Services of ours, and locks over them, as services of ROS."""
+"""TRADE services, and locks over them, as ROS services."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
@@ -19,17 +19,17 @@ _SET_BOOL: Final = "std_srvs/srv/SetBool"
 
 
 class _Taken(NamedTuple):
-    """A lock of a node."""
+    """The lock of a node."""
 
     client: Client
-    """The session it is of."""
+    """The session that holds it."""
     lock: Lock
     name: str
-    """What the client calls it."""
+    """Its name at the client."""
 
 
 class ServicesToRos:
-    """``[[to_ros.service]]``: a call in ROS is one of ours, in the session of the node that makes it."""
+    """``[[to_ros.service]]``: a call in ROS becomes a call in the session of the calling node."""
 
     def __init__(self, entry: ServiceEntry, graph: Graph, nodes: Nodes) -> None:
         """Raises ConfigurationError: the type is not known."""
@@ -37,7 +37,7 @@ class ServicesToRos:
         self._graph = graph
         self._nodes = nodes
         self._request, response = graph.types.parts(entry.type)
-        self._told = ResponseMapping(graph.types, response)
+        self._response = ResponseMapping(graph.types, response)
 
     @property
     def of(self) -> Constraint:
@@ -64,12 +64,12 @@ class ServicesToRos:
     def _asked(self, handle: Handle) -> RequestMapping:
         asked = RequestMapping(self._graph.types, self._request, handle, self._entry.args)
         if asked.unused:
-            problem = f"says {', '.join(asked.unused)}, and nothing is made of that; it is {handle.signature}"
+            problem = f"has the unused fields {', '.join(asked.unused)}; the service is {handle.signature}"
             raise ConfigurationError(where=f"{self._entry.type} for {handle.label}", problem=problem)
         return asked
 
     def open(self, place: Place, handle: Handle) -> Closes:
-        asked, told, deadline_s = self._asked(handle), self._told, self._entry.deadline_s
+        asked, told, deadline_s = self._asked(handle), self._response, self._entry.deadline_s
 
         stops = handle.effect == "stop"
 
@@ -81,7 +81,7 @@ class ServicesToRos:
 
 
 class LocksToRos:
-    """``[[to_ros.lock]]``: a node takes a lock in its session and gives it back; it falls when the node is gone."""
+    """``[[to_ros.lock]]``: a node takes and releases a lock in its session; the end of the node releases it."""
 
     def __init__(self, entry: LockService, graph: Graph, nodes: Nodes, container: Container) -> None:
         self._entry = entry
@@ -101,7 +101,7 @@ class LocksToRos:
             name = self._entry.name or ros_path(self._entry.group, "lock")
             yield Place("service", name, f"a lock over {self._entry.group}"), first
 
-    def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - it is of a whole group
+    def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - the lock covers a whole group
         told = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
         def answer(request: Message, who: str, came_at: float) -> Message:
@@ -112,7 +112,7 @@ class LocksToRos:
 
     def _take(self, who: str, came_at: float) -> str:
         if who == UNKNOWN:
-            problem = "ROS does not say who asks, so nobody would see its owner die; a lock needs a node that is known"
+            problem = "ROS does not identify the caller, so its end would be invisible. A lock needs a known node"
             raise RosRefused(what=f"lock of {self._entry.group}", problem=problem)
         guest, before = self._nodes.guest(who, came_at), self._taken.get(who)
         client, wanted = guest.client, where(group=self._entry.group)
@@ -136,16 +136,16 @@ class LocksToRos:
     def _give_back(self, who: str) -> str:
         taken = self._taken.pop(who, None)
         given_back = taken is not None and not taken.client.closed and taken.client.unlock(taken.name)
-        return "given back" if given_back else "it had none"
+        return "released" if given_back else "it had none"
 
 
 def answering(told: ResponseMapping, answer: Answer) -> Answer:
-    """The same, with what goes wrong said in the response where that has words for it."""
+    """Wraps an answer to report errors in the response, if its type can."""
 
     def guarded(request: Message, who: str, came_at: float) -> Message:
         try:
             return answer(request, who, came_at)
-        except Exception as error:  # noqa: BLE001 - whatever a provider raises is what the node is told
+        except Exception as error:  # noqa: BLE001 - reported to the node, whatever it is
             return told.failed(error)
 
     return guarded

@@ -1,4 +1,4 @@
-"""What services of ours read, as topics of ROS."""
+"""Results of TRADE services as ROS topics."""
 
 import logging
 import threading
@@ -23,7 +23,7 @@ _HEALTHY: Final = "healthy"
 
 
 class Topics:
-    """Topics that are published, each once however many entries fill it."""
+    """Published topics, each opened once for all entries that use it."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
@@ -31,7 +31,7 @@ class Topics:
         self._shared: dict[tuple[str, str], tuple[Publisher, int]] = {}
 
     def take(self, topic: str, type_name: str) -> Publisher:
-        """Publish it from now on. Raises what `Graph.advertise` does."""
+        """Publishes a topic from now on. Raises what `Graph.advertise` does."""
         with self._guard:
             shared = self._shared.get((topic, type_name))
             publisher, users = shared or (self._graph.advertise(topic, type_name), 0)
@@ -39,7 +39,7 @@ class Topics:
             return publisher
 
     def leave(self, topic: str, type_name: str) -> None:
-        """One less fills it; with the last it ends."""
+        """Removes one user of a topic; the last one closes it."""
         with self._guard:
             publisher, users = self._shared.pop((topic, type_name))
             if users > 1:
@@ -56,7 +56,7 @@ class StreamsToRos:
         self._entry = entry
         self._topics = topics
         self._container = container
-        self._told = ResponseMapping(graph.types, entry.type, entry.fields)
+        self._response = ResponseMapping(graph.types, entry.type, entry.fields)
 
     @property
     def of(self) -> Constraint:
@@ -67,13 +67,13 @@ class StreamsToRos:
             yield Place("topic", self._entry.topic), handle
 
     def open(self, place: Place, handle: Handle) -> Closes:
-        entry, told = self._entry, self._told
+        entry, told = self._entry, self._response
         stream = self._container.stream(handle, hz=entry.hz)
         return _Pump(stream, self._topics, place.name, entry.type, lambda sample: told(sample.value, sample.at))
 
 
 class JointStatesToRos:
-    """``[[to_ros.joint_states]]``: what is old, silent or not healthy is not published."""
+    """``[[to_ros.joint_states]]``: old, missing or unhealthy values are not published."""
 
     def __init__(self, entry: JointStates, topics: Topics, container: Container) -> None:
         self._entry = entry
@@ -110,7 +110,7 @@ class JointStatesToRos:
 
 
 class _Pump:
-    """Publishes what a stream brings; what cannot be read is left out, and said once."""
+    """Publishes the samples of a stream; drops what cannot be read, and logs that once."""
 
     def __init__(
         self,
@@ -141,11 +141,11 @@ class _Pump:
                 if message is not None:
                     self._publisher.send(message)
                 self._problem = ""
-            except Exception as error:  # noqa: BLE001 - what a service raises ends no topic
+            except Exception as error:  # noqa: BLE001 - an error of a service must not end the topic
                 self._note(error)
 
     def _note(self, error: Exception) -> None:
-        if self._closing or type(error) is TimeoutError:  # nothing came for a moment
+        if self._closing or type(error) is TimeoutError:  # no sample for a moment
             return
         if type(error).__name__ != self._problem:  # its text has times in it
             _logger.warning("nothing is published on %s: %s", self._place[0], failure(error))

@@ -1,4 +1,4 @@
-"""Joints and arms of ours as an action FollowJointTrajectory: what MoveIt and others move robots by."""
+"""Joints and arms of TRADE as a FollowJointTrajectory action, which MoveIt and others use to move robots."""
 
 import logging
 import threading
@@ -35,10 +35,10 @@ __all__ = ["TrajectoriesToRos"]
 _logger = logging.getLogger("trade")
 
 _MORE_S: Final = 15.0
-"""A call has so much more time than what it moves takes."""
+"""Time of a call beyond the duration of its trajectory."""
 _READ_WITHIN_S: Final = 2.0
 _WAIT_S: Final = 2.0
-"""For a lock: as long as a joint may take to come to rest."""
+"""Wait for a lock: the time in which a joint comes to rest."""
 _TURN_WITHIN_S: Final = 5.0
 _LATE_S: Final = 5.0
 
@@ -69,7 +69,7 @@ class TrajectoriesToRos:
 
 
 class _Limb:
-    """Carries out goals, one at a time."""
+    """Executes goals, one at a time."""
 
     def __init__(self, follow: Handle, state: Handle, names: JointNames, nodes: Nodes) -> None:
         self._follow = follow
@@ -79,9 +79,9 @@ class _Limb:
         self._turn = threading.Lock()
 
     def pursue(self, goal: Goal) -> Outcome:
-        """See it to its end. What is wrong with it is in its result."""
+        """Executes a goal to its end. Its result contains any error."""
         canceling = _Canceling(goal)
-        # the goal before was told to end: what stops that must not stop this one
+        # the previous goal was canceled, and its stop must not stop this one
         if not self._turn.acquire(timeout=_TURN_WITHIN_S):
             return _outcome(Ended.ABORTED, INVALID_GOAL, "the goal before it does not end")
         try:
@@ -106,14 +106,14 @@ class _Limb:
                 run.on_progress(lambda told: _try(lambda: self._tell(goal, told)))
                 canceling.ends(lambda: guest.client.cancel(run))
                 _wait(run, deadline_s, canceling)
-        except Exception as error:  # noqa: BLE001 - whatever went wrong, its client is told
+        except Exception as error:  # noqa: BLE001 - reported to its client, whatever it is
             if canceling.asked and not isinstance(error, Unacceptable):
                 return _outcome(Ended.CANCELED, SUCCESSFUL, text_of(error))
             return _outcome(Ended.ABORTED, code_of(error), text_of(error))
         return _outcome(Ended.SUCCEEDED, SUCCESSFUL, "")
 
     def _here(self, goal: Goal) -> dict[str, float] | None:
-        """Where the joints are, if the goal does not say where they begin."""
+        """The current angles, unless the goal says where the joints begin."""
         points = goal.message["trajectory"]["points"]
         if not points or points[0]["time_from_start"] == {"sec": 0, "nanosec": 0}:
             return None
@@ -127,13 +127,13 @@ class _Limb:
             {
                 "header": {"stamp": ros_stamp(time.time())},
                 "joint_names": self._names.theirs,
-                "error": {"positions": [-error for error in errors]},  # theirs: desired minus actual
+                "error": {"positions": [-error for error in errors]},  # in ROS: desired minus actual
             }
         )
 
 
 class _Canceling:
-    """Whether the client of a goal wants its end, and what to do then."""
+    """Whether the client canceled a goal, and the callback for that."""
 
     def __init__(self, goal: Goal) -> None:
         self.asked = False
@@ -142,13 +142,13 @@ class _Canceling:
         goal.when_canceled(self.ask)
 
     def ask(self) -> None:
-        """It is to end."""
+        """Cancels the goal."""
         with self._guard:
             self.asked, end = True, self._end
         _try(end)
 
     def ends(self, end: Callable[[], object]) -> None:
-        """This ends it."""
+        """Registers the callback that cancels; it runs at once if the goal is canceled already."""
         with self._guard:
             self._end, now = end, self.asked
         if now:
@@ -158,10 +158,10 @@ class _Canceling:
 def _try(end: Callable[[], object]) -> None:
     try:
         end()
-    except SessionEnded:  # and with it what it moved
+    except SessionEnded:  # it has ended, and its motion too
         pass
     except Exception:
-        _logger.exception("a goal could not be told of, or ended")
+        _logger.exception("the feedback or the cancellation of a goal failed")
 
 
 def _wait(run: Run, deadline_s: float, canceling: _Canceling) -> None:

@@ -23,7 +23,7 @@ Message = dict[str, Any]
 
 _SHIPPED: Final = Path(__file__).parent / "definitions"
 _FILLER: Final = "structure_needs_at_least_one_member"
-"""What ROS 2 puts into a message without fields."""
+"""Placeholder field of ROS 2 in a message without fields."""
 _PARTS: Final = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
 _TEXTS: Final = ("string", "wstring")
 _MALFORMED: Final = (
@@ -36,7 +36,7 @@ _MALFORMED: Final = (
     ValueError,
     struct.error,
 )
-"""What reading and writing raise, whatever is wrong."""
+"""Exceptions of reading and writing any malformed data."""
 _OCTETS: Final = ("uint8", "byte", "octet", "char")
 
 
@@ -45,18 +45,18 @@ class Field(NamedTuple):
 
     name: str
     type: str
-    """``float64``, ``string``, ``std_msgs/msg/Header``: of one element, if there are several."""
+    """``float64``, ``string``, ``std_msgs/msg/Header``: the type of one element, for arrays too."""
     many: bool
     length: int
-    """Of an array of fixed length; 0: any."""
+    """Length of a fixed array; 0: any."""
 
 
 class Types:
-    """The types one side of the bridge knows: the standard ones, those shipped here, those in the folders given."""
+    """The types of one side of the bridge: the standard ones, those shipped here, and those in further folders."""
 
     def __init__(self, ros: Literal[1, 2], folders: Iterable[Path] = ()) -> None:
         """Args:
-            ros: whose bytes.
+                ros: the version whose encoding applies.
             folders: each with packages as ROS lays them out: ``PACKAGE/msg/NAME.msg``, ``srv``, ``action``.
 
         Raises:
@@ -69,14 +69,14 @@ class Types:
             self._read(folder)
         self._fields = cache(self._look_up)
 
-    # --- what there is
+    # --- lookup
 
     def fields(self, type_name: str) -> tuple[Field, ...]:
-        """Of a message type. Raises ConfigurationError: it is not known."""
+        """Returns the fields of a message type. Raises ConfigurationError: it is not known."""
         return self._fields(type_name)
 
     def parts(self, type_name: str) -> tuple[str, ...]:
-        """The message types that a service (request, response) or an action (goal, result, feedback) is made of.
+        """Returns the message types of a service (request, response) or an action (goal, result, feedback).
 
         Raises:
             ConfigurationError: it is not known.
@@ -87,26 +87,26 @@ class Types:
         return found
 
     def definition(self, type_name: str) -> tuple[str, str]:
-        """Text of a message type with all it contains, and its MD5 sum, both as ROS 1 has them."""
+        """Returns the definition of a message type with all it contains, and its MD5 sum, both in the form of ROS 1."""
         self.fields(type_name)
         return self._store.generate_msgdef(type_name, ros_version=1)
 
     def hash(self, type_name: str) -> str:
-        """What ROS 2 names a message type's content by: ``RIHS01_...``."""
+        """Returns the type hash of ROS 2: ``RIHS01_...``."""
         self.fields(type_name)
         return self._store.hash_rihs01(type_name)
 
     # --- values
 
     def zero(self, type_name: str) -> Message:
-        """A message with nothing in it."""
+        """Returns a message with zero in every field."""
         return self.message(self.object(type_name, {}))
 
     def to_bytes(self, type_name: str, message: Mapping[str, Any]) -> bytes:
-        """A message as it travels; fields left out are zero.
+        """Encodes a message; missing fields are zero.
 
         Raises:
-            ConfigurationError: it has a field that the type has not, or a value that does not fit.
+                ConfigurationError: it has a field that is not in the type, or a value that does not fit.
         """
         made = self.object(type_name, message)
         write = self._store.serialize_ros1 if self.ros == 1 else self._store.serialize_cdr
@@ -116,10 +116,10 @@ class Types:
             raise ConfigurationError(where=type_name, problem=f"does not fit: {error}") from None
 
     def from_bytes(self, type_name: str, data: bytes | memoryview) -> Message:
-        """A message that came.
+        """Decodes a message.
 
         Raises:
-            ValueError: these are not the bytes of one.
+                ValueError: the bytes are not a message of this type.
         """
         self.fields(type_name)
         read = self._store.deserialize_ros1 if self.ros == 1 else self._store.deserialize_cdr
@@ -129,7 +129,7 @@ class Types:
             raise ValueError(f"{len(data)} bytes are no {type_name}: {error}") from None
 
     def object(self, type_name: str, message: Mapping[str, Any]) -> Any:
-        """The library's own object of a message."""
+        """Returns the library's object for a message."""
         fields = self.fields(type_name)
         if unknown := set(message) - {field.name for field in fields}:
             known = ", ".join(field.name for field in fields)
@@ -139,10 +139,10 @@ class Types:
         return self._store.types[type_name](**values, **filled)
 
     def message(self, made: Any) -> Message:
-        """The dict of such an object."""
+        """Returns the dict of such an object."""
         return {field.name: self._take(field, getattr(made, field.name)) for field in self.fields(made.__msgtype__)}
 
-    # ---
+    # --- conversion
 
     def _put(self, of: str, field: Field, value: Any) -> Any:
         try:
@@ -189,7 +189,7 @@ class Types:
         for field in fields:
             if field.many and not field.length and self._is_nothing(field.type):
                 problem = (
-                    f"{field.name} is an array of {field.type}, which has no bytes: no message tells how many come"
+                    f"{field.name} is an array of {field.type}, which has no bytes, so its length cannot be checked"
                 )
                 raise ConfigurationError(where=type_name, problem=problem)
             if field.type in self._store.fielddefs:
@@ -197,7 +197,7 @@ class Types:
         return fields
 
     def _is_nothing(self, type_name: str) -> bool:
-        """Whether it is a message that takes no bytes, so that any number may be claimed of it; in ROS 2 none is."""
+        """Whether a message takes no bytes, so that an array could claim any length; in ROS 2 none does."""
         if self.ros == 2 or type_name not in self._store.fielddefs:
             return False
         fields = [_field(name, kind) for name, kind in self._store.fielddefs[type_name][1] if name != _FILLER]
@@ -215,11 +215,11 @@ class Types:
         names = [f"{type_name}_{part}" for part in _PARTS.get(kind, ())]
         texts = _sections(path.read_text()) if names else [path.read_text()]
         if names and len(texts) != len(names):
-            raise ConfigurationError(where=str(path), problem=f"has {len(texts)} parts of {len(names)}, between ---")
+            raise ConfigurationError(where=str(path), problem=f"needs {len(names)} parts between ---, not {len(texts)}")
         try:
             for name, text in zip(names or [type_name], texts, strict=True):
                 if name not in self._store.fielddefs:
-                    # the library puts all below msg; in ROS 2 the name is part of the hash
+                    # the library puts all types below msg; in ROS 2 the name is part of the hash
                     ((_, read),) = get_types_from_msg(
                         text or _nothing(self.ros), name.replace(f"/{kind}/", "/msg/")
                     ).items()
@@ -231,7 +231,7 @@ class Types:
 
 
 def _nothing(ros: int) -> str:
-    """The text of a message without fields; in ROS 2 it is a byte long."""
+    """The definition of a message without fields; in ROS 2 it takes one byte."""
     return f"uint8 {_FILLER}\n" if ros == 2 else "\n"
 
 
@@ -256,7 +256,7 @@ def _field(name: str, kind: Any) -> Field:
         case (_, (inner, _)):
             return Field(name, _field(name, inner).type, many=True, length=0)
         case _:
-            raise ConfigurationError(where=name, problem=f"is of a kind that is not known: {kind!r}")
+            raise ConfigurationError(where=name, problem=f"has an unknown kind: {kind!r}")
 
 
 def _dtype(kind: str) -> Any:
@@ -265,17 +265,17 @@ def _dtype(kind: str) -> Any:
 
 def _whole(kind: str, value: Any) -> int:
     if isinstance(value, float) and not value.is_integer():
-        raise ValueError("it is no whole number")
+        raise ValueError("it is not a whole number")
     number = int(value)
     limits = np.iinfo(_dtype(kind))
     if not limits.min <= number <= limits.max:
-        raise ValueError(f"it goes from {limits.min} to {limits.max}")
+        raise ValueError(f"it must be from {limits.min} to {limits.max}")
     return number
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise TypeError("it is no text")
+        raise TypeError("it is not text")
     return value
 
 

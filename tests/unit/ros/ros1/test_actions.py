@@ -69,14 +69,14 @@ def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
 
 def test_an_action_that_nobody_serves_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_action_client, "_THERE_S", 0.2)
-    with pytest.raises(RosUnreachable, match="/move: nobody serves this action"):
+    with pytest.raises(RosUnreachable, match="/move: no node serves this action"):
         pursue(graph, 1)
 
 
 def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_yet(graph: Ros1, stand: Stand) -> None:
     server(stand)
     goal = pursue(graph, FOR_EVER)
-    with pytest.raises(RosUnreachable, match="nothing was heard of its end within"):
+    with pytest.raises(RosUnreachable, match="its end was not received within"):
         goal.wait(0.05)
     goal.cancel()
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
@@ -142,7 +142,7 @@ def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
     monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 1))
     peer.freeze()
     monkeypatch.setattr(_action_client, "_SILENT_S", 1.0)
-    with pytest.raises(RosUnreachable, match="has told nothing of it"):
+    with pytest.raises(RosUnreachable, match="has sent no status of it"):
         goal.wait(PATIENCE_S)
     os.kill(peer.pid, signal.SIGCONT)
     peer.wait_for("preempted")

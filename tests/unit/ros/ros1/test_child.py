@@ -89,7 +89,7 @@ def test_our_node_that_stands_still_is_ended_at_once_and_started_again(graph: Ro
     before = our_node()
     began = time.monotonic()
     before.send_signal(signal.SIGSTOP)
-    wait_until(lambda: "stood still" in graph.healthy, "it is told")
+    wait_until(lambda: "froze" in graph.healthy, "it is reported")
     assert time.monotonic() - began < 12
     wait_until(lambda: not before.is_running(), "it is ended")
     wait_until(lambda: not graph.healthy, "all is well again")

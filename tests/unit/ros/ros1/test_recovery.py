@@ -206,7 +206,7 @@ def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: S
     first.close()
     first.close()
     assert first.healthy
-    with pytest.raises(RosUnreachable, match="nobody offers it"):
+    with pytest.raises(RosUnreachable, match="no node offers it"):
         second.call("/lights", TRIGGER, {}, PATIENCE_S)
 
 
@@ -237,11 +237,11 @@ def test_a_python_without_rospy_says_what_to_install(tmp_path: Path) -> None:
     python.chmod(0o755)
     graph = Ros1("http://127.0.0.1:1", python=str(python))
     try:
-        wait_until(lambda: "install python3-rospy" in graph.healthy, "it says so")
+        wait_until(lambda: "Install python3-rospy" in graph.healthy, "it says so")
     finally:
         graph.close()
 
 
 def test_a_node_name_that_is_none_of_ros_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="is no global name"):
+    with pytest.raises(ConfigurationError, match="is not a global name"):
         Ros1(node="trade")

@@ -42,7 +42,7 @@ def test_a_service_of_another_type_is_refused(graph: Ros1, stand: Stand) -> None
 
 
 def test_a_service_that_nobody_offers_is_unreachable(graph: Ros1) -> None:
-    with pytest.raises(RosUnreachable, match="/close: nobody offers it"):
+    with pytest.raises(RosUnreachable, match="/close: no node offers it"):
         graph.call("/close", TRIGGER, {}, 30)
 
 
@@ -185,7 +185,7 @@ def test_a_service_that_stops_is_called_however_many_other_calls_are_under_way(g
     pool = ThreadPoolExecutor(_link._AT_ONCE)
     calls = [pool.submit(graph.call, "/hang", TRIGGER, {}, PATIENCE_S) for _ in range(_link._AT_ONCE)]
     wait_until(lambda: len(graph._link._asked) == _link._AT_ONCE, "all turns are taken")
-    with pytest.raises(RosUnreachable, match="others are being asked"):
+    with pytest.raises(RosUnreachable, match="other requests are pending"):
         graph.call("/stop", TRIGGER, {}, 0.1)
     assert graph.call("/stop", TRIGGER, {}, PATIENCE_S, stops=True)["success"]
     assert not any(call.done() for call in calls)

@@ -164,7 +164,7 @@ def test_what_does_not_fit_is_refused_where_it_is_sent(graph: Ros1) -> None:
 
 def test_a_name_that_is_none_of_ros_is_refused(graph: Ros1) -> None:
     for name in ("text", "/", "/a b", "/1st", "/a/", "", "/a\n"):
-        with pytest.raises(ConfigurationError, match="is no global name"):
+        with pytest.raises(ConfigurationError, match="is not a global name"):
             graph.advertise(name, TEXT)
 
 

@@ -227,5 +227,5 @@ def test_a_goal_that_does_not_fit_is_not_sent(graph: Ros2) -> None:
 
 
 def test_a_service_is_no_action(graph: Ros2) -> None:
-    with pytest.raises(ConfigurationError, match="is no action"):
+    with pytest.raises(ConfigurationError, match="is not an action"):
         graph.act("/wrong", "example_interfaces/srv/AddTwoInts", Doing())

@@ -162,14 +162,14 @@ def test_S05_a_goal_that_may_have_begun_can_be_canceled_by_who_sent_it_too(
 @pytest.mark.parametrize(
     ("name", "answers", "end"),
     [
-        ("unheard", {"send_goal": None}, "it was told to end, but its end is not known"),
+        ("unheard", {"send_goal": None}, "it was canceled, but whether it has ended is unknown"),
         (
             "unknown",
             {"send_goal": None, "cancel_goal": b"\2" + bytes(7)},
-            "it could not be canceled, and its end is not known",
+            "it could not be canceled, and whether it has ended is unknown",
         ),
         ("ended", {"send_goal": None, "cancel_goal": b"\3" + bytes(7)}, "it was canceled, and has ended"),
-        ("dropped", {"send_goal": b""}, "it was told to end, but its end is not known"),
+        ("dropped", {"send_goal": b""}, "it was canceled, but whether it has ended is unknown"),
     ],
     ids=["unheard", "unknown_there", "ended_there", "server_ended"],
 )

@@ -90,7 +90,7 @@ def test_what_is_no_address_of_a_router_is_refused(router: str) -> None:
 
 @pytest.mark.parametrize("node", ["trade", "/a b", "/"])
 def test_what_is_no_name_of_a_node_is_refused(own_router: Router, node: str) -> None:
-    with pytest.raises(ConfigurationError, match="must be written /like/this_1"):
+    with pytest.raises(ConfigurationError, match="must be absolute, such as /like/this_1"):
         Ros2(own_router.endpoint, node=node)
 
 

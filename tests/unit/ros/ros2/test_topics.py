@@ -130,5 +130,5 @@ def test_a_message_that_does_not_fit_is_refused(graph: Ros2) -> None:
 
 @pytest.mark.parametrize("name", ["relative", "/a//b", "/a/*", "/1st", "/two__underscores", "/ends/", "", "/"])
 def test_a_topic_that_ros_has_no_name_for_is_refused(graph: Ros2, name: str) -> None:
-    with pytest.raises(ConfigurationError, match="must be written /like/this_1"):
+    with pytest.raises(ConfigurationError, match="must be absolute, such as /like/this_1"):
         graph.advertise(name, STRING)

@@ -1,6 +1,6 @@
-"""Goals of ours at an action of theirs: five topics, as the wire description of actionlib has them.
+"""A ROS 1 action client: goals of TRADE at an action of ROS, over five topics as actionlib specifies.
 
-A cancel may be lost on its way, so a goal that is not wanted any more is canceled until its server says that it heard.
+A cancel message may be lost, so an unwanted goal is canceled repeatedly until its server has acknowledged.
 
 Source: "actionlib/DetailedDescription" on wiki.ros.org, and the constants of actionlib_msgs/GoalStatus.
 """
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 __all__ = ["ActionClient"]
 
 _THERE_S: Final = 5.0
-"""For an action to show up, as its client meets it for the first time."""
+"""Timeout for an action to appear at its client's first use."""
 _LOOK_S: Final = 0.05
 _SILENT_S: Final = 10.0
-"""Servers tell the state of their goals several times a second."""
+"""Timeout for a server's status; servers publish it several times a second."""
 _RESULT_S: Final = 5.0
-"""From the state that says the end to the result; they travel on connections of their own."""
+"""Time from the final state to the result, as they travel on separate connections."""
 _EVERY_S: Final = 0.5
-"""Goals are looked at, as their servers may be silent."""
+"""Period of the checks of goals, as their servers may be silent."""
 _AGAIN_S: Final = 0.2
-"""From a cancel to the next one of the same goal."""
+"""Pause between two cancels of the same goal."""
 _END_S: Final = 2.0
-"""For goals to end that are canceled as we close."""
+"""Time for canceled goals to end while this client closes."""
 _MOST: Final = 100
-"""Goals that are remembered as unwanted."""
+"""Number of unwanted goals that are remembered."""
 _QUEUE: Final = 100
 _GOES_ON: Final = frozenset({Status.PENDING, Status.ACTIVE})
-"""States of a goal whose server has heard of no cancel."""
+"""States of a goal whose server has not received a cancel."""
 _HOW: Final = {
     Status.SUCCEEDED: Ended.SUCCEEDED,
     Status.PREEMPTED: Ended.CANCELED,
@@ -53,7 +53,7 @@ _HOW: Final = {
 
 
 class _Goal:
-    """One goal of ours. See `Pursuit`."""
+    """A goal that this client sent. See `Pursuit`."""
 
     def __init__(self, client: "ActionClient", number: str, feedback: Callable[[Message], object] | None) -> None:
         self._client = client
@@ -69,24 +69,24 @@ class _Goal:
         try:
             return self.end.result(max(timeout_s, 0))
         except NotYet:
-            raise self._client.unreachable(f"nothing was heard of its end within {timeout_s:.3g} s") from None
+            raise self._client.unreachable(f"its end was not received within {timeout_s:.3g} s") from None
 
     def cancel(self) -> None:
         self._client.cancel(self.number)
 
     def fail(self, error: Exception) -> None:
-        """It is known to have no result."""
+        """Ends it without a result."""
         with suppress(InvalidStateError):
             self.end.set_exception(error)
 
     def give_up(self, problem: str) -> None:
-        """Nobody here follows it any more; should it go on over there, it is to end."""
+        """Stops following it and cancels it, as it may still run."""
         self.cancel()
         self.fail(self._client.unreachable(problem))
 
 
 class ActionClient:
-    """All our goals at one action; its topics stay open until `close`."""
+    """All goals of TRADE at one action; its topics stay open until `close`."""
 
     def __init__(self, graph: "Ros1", name: str, type_name: str) -> None:
         types = action_types(graph.types, type_name)
@@ -112,7 +112,7 @@ class ActionClient:
         threading.Thread(target=self._look_often, name=f"trade-ros1{name}/goals", daemon=True).start()
 
     def pursue(self, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None) -> _Goal:
-        """Send a goal. Raises RosUnreachable: nobody serves it."""
+        """Sends a goal. Raises RosUnreachable: no node serves the action."""
         number = f"{self._graph.node}-{next(self._numbers)}-{time.time():.9f}"
         sent = {"header": {"stamp": now()}, "goal_id": {"id": number, "stamp": now()}, "goal": goal}
         pursued = _Goal(self, number, feedback)
@@ -131,7 +131,7 @@ class ActionClient:
         return pursued
 
     def cancel(self, number: str) -> None:
-        """Ask for the end of a goal, and remember that it is not wanted."""
+        """Requests the end of a goal, and remembers that it is unwanted."""
         with self._lock:
             self._unwanted[number] = time.monotonic()
             while len(self._unwanted) > _MOST:
@@ -139,11 +139,11 @@ class ActionClient:
             self._cancel.send({"id": number})
 
     def unreachable(self, problem: str) -> RosUnreachable:
-        """An error of this action."""
+        """Returns an error of this action."""
         return RosUnreachable(what=self._name, problem=problem)
 
     def cancel_all(self) -> None:
-        """Take no more goals, and ask for the end of those that go on."""
+        """Accepts no more goals, and requests the end of those that still run."""
         with self._lock:
             self._closing = True
             numbers = list({**self._unwanted, **self._goals})
@@ -151,7 +151,7 @@ class ActionClient:
             self.cancel(number)
 
     def close(self) -> None:
-        """Cancel what goes on, give it two seconds to end, and leave. Idempotent."""
+        """Cancels running goals, waits up to two seconds for their end, and closes. Idempotent."""
         self.cancel_all()
         wait_for([goal.end for goal in self._all()], _END_S)
         self._closed.set()
@@ -161,7 +161,7 @@ class ActionClient:
             goal.fail(self.unreachable("it was closed here"))
 
     def _server(self) -> str:
-        """The node that has all five topics."""
+        """Returns the node that has all five topics."""
         deadline = time.monotonic() + _THERE_S
         while True:
             left_s = deadline - time.monotonic()
@@ -169,14 +169,14 @@ class ActionClient:
             if servers := ends[0].intersection(*ends[1:]):
                 return min(servers)
             if left_s <= 0:
-                raise self.unreachable("nobody serves this action")
+                raise self.unreachable("no node serves this action")
             threading.Event().wait(_LOOK_S)
 
     def _all(self) -> list[_Goal]:
         with self._lock:
             return list(self._goals.values())
 
-    # --- what is not heard
+    # --- timeouts
 
     def _look_often(self) -> None:
         while not self._closed.wait(_EVERY_S):
@@ -186,21 +186,21 @@ class ActionClient:
     def _look(self, goal: _Goal) -> None:
         silent_s = time.monotonic() - goal.heard_at
         if silent_s > _SILENT_S:
-            goal.give_up(f"its server {goal.server} has told nothing of it for {_SILENT_S:g} s")
+            goal.give_up(f"its server {goal.server} has sent no status of it for {_SILENT_S:g} s")
         elif silent_s > _EVERY_S:
             self._cancel_again(goal.number)
 
     def _cancel_again(self, number: str) -> None:
-        """Where it is not wanted; the cancel before may be lost."""
+        """Cancels an unwanted goal again, as the previous cancel may be lost."""
         with self._lock:
             sent_at = self._unwanted.get(number)
         if sent_at is not None and time.monotonic() - sent_at > _AGAIN_S:
             self.cancel(number)
 
-    # --- what is heard
+    # --- messages
 
     def gone(self, name: str) -> None:
-        """A node is gone. That our own one is says nothing of theirs, and is not told here."""
+        """Handles the end of a node. The end of the bridge's own node is not reported here; it concerns no server."""
         for goal in self._all():
             if goal.server == name:
                 goal.give_up(f"its server {name} is gone")
@@ -219,13 +219,13 @@ class ActionClient:
 
     def _judge(self, goal: _Goal, state: Status | None, at: float) -> None:
         if state is None and goal.known:
-            goal.fail(self.unreachable(f"its server {goal.server} knows of it no more"))
+            goal.fail(self.unreachable(f"its server {goal.server} does not know it any more"))
         elif state is not None:
             goal.known, goal.heard_at = True, at
             if state in ENDED:
                 goal.ended_at = goal.ended_at or at
                 if at - goal.ended_at > _RESULT_S:
-                    goal.fail(self.unreachable(f"it has ended ({state.name}), and its result was not heard"))
+                    goal.fail(self.unreachable(f"it has ended ({state.name}), but its result was not received"))
 
     def _feedback(self, message: Message, _: str, __: float) -> None:
         goal = self._goals.get(message["status"]["goal_id"]["id"])
@@ -244,4 +244,4 @@ class ActionClient:
         elif state is Status.REJECTED:
             goal.fail(RosRefused(what=self._name, problem=status["text"] or "the goal was rejected"))
         else:
-            goal.fail(self.unreachable(f"its server calls it {state.name}: {status['text']}"))
+            goal.fail(self.unreachable(f"its server reports {state.name}: {status['text']}"))

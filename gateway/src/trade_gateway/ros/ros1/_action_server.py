@@ -1,8 +1,8 @@
-"""An action of ours: five topics, as the wire description of actionlib has them.
+"""A ROS 1 action server: five topics, as actionlib specifies.
 
-One goal runs, one waits for its end; who comes later takes the waiting one's place and has the running one canceled.
-Source: "actionlib/DetailedDescription" on wiki.ros.org; there, too, what a cancel without an id or with a time means.
-As with actionlib's own servers, a goal without a time has that of its arrival, so that a cancel with a time meets it.
+One goal runs and one waits for its end. A later goal replaces the waiting one and cancels the running one.
+Source: "actionlib/DetailedDescription" on wiki.ros.org, also for a cancel without an id or with a time.
+As in actionlib's own servers, a goal without a time gets that of its arrival, so that a cancel with a time matches it.
 """
 
 import itertools
@@ -25,11 +25,11 @@ __all__ = ["ActionServer"]
 
 _EVERY_S: Final = 0.2
 _KEPT_S: Final = 5.0
-"""States of goals that have ended, and of cancels whose goal has not come, are told for so long."""
+"""How long the state of an ended goal, and a cancel whose goal has not arrived, are kept and published."""
 _END_S: Final = 2.0
 _QUEUE: Final = 100
 _MOST: Final = 100
-"""Goals whose state is told."""
+"""Number of goals whose state is published."""
 _HOW: Final = {
     Ended.SUCCEEDED: Status.SUCCEEDED,
     Ended.CANCELED: Status.PREEMPTED,
@@ -40,7 +40,7 @@ _log: Final = logging.getLogger("trade.ros1")
 
 
 class _Taken:
-    """A goal that came. See `Goal`; changed under the server's lock."""
+    """A received goal. See `Goal`; changed under the server's lock."""
 
     def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str, at: float) -> None:
         self._server = server
@@ -65,7 +65,7 @@ class _Taken:
         tell()
 
     def cancel(self) -> None:
-        """It is to end."""
+        """Requests its end."""
         with self._server.lock:
             tells, self._tells, self._canceled = self._tells, [], True
             if self.status is Status.ACTIVE:
@@ -73,17 +73,17 @@ class _Taken:
         for tell in tells:
             try:
                 tell()
-            except Exception:  # noqa: BLE001 - it is somebody else's
+            except Exception:  # noqa: BLE001 - the callback is the user's
                 _log.exception("the cancel of a goal failed")
 
     @property
     def state(self) -> Message:
-        """As its client is told."""
+        """The state that its client receives."""
         return {"goal_id": self.goal_id, "status": int(self.status), "text": self.text}
 
 
 class ActionServer:
-    """See the module."""
+    """Receives goals and runs them. See the module."""
 
     def __init__(self, graph: "Ros1", name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
         types = action_types(graph.types, type_name)
@@ -99,25 +99,25 @@ class ActionServer:
         self._cancels_until = (0, 0)
         self._closed = threading.Event()
         self._idle = threading.Condition(self.lock)
-        # who connects while a result is on its way, as after a restart of our node, hears it yet
+        # a client that connects while a result is on its way, e.g. after a restart of our node, still receives it
         self._result = graph.publish(f"{name}/result", types.result, latched=True, most=_QUEUE)
         self._feedback = graph.publish(f"{name}/feedback", types.feedback, latched=False, most=_QUEUE)
         self._status = graph.publish(f"{name}/status", "actionlib_msgs/msg/GoalStatusArray", latched=True, most=_QUEUE)
         _, cancels = graph.hear(f"{name}/cancel", "actionlib_msgs/msg/GoalID", self._cancel_came, most=_QUEUE)
-        # what was published before is no goal: it may be as old as its publisher
+        # a latched message is not a goal: it may be as old as its publisher
         _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE, latched=False)
         self._ends = (*cancels, *goals, self._result.close, self._feedback.close, self._status.close)
         threading.Thread(target=self._tell_often, name=f"trade-ros1{name}/status", daemon=True).start()
 
     def feedback(self, goal: _Taken, message: Mapping[str, Any]) -> None:
-        """Tell the client how far its goal is."""
+        """Sends feedback to the client of a goal."""
         with self.lock:
             state = goal.state
         if goal.status not in ENDED:
             self._feedback.send({"header": {"stamp": now()}, "status": state, "feedback": message})
 
     def close(self) -> None:
-        """Cancel what runs, give it two seconds to end, and withdraw. Idempotent."""
+        """Cancels the running goal, waits up to two seconds for its end, and withdraws the action. Idempotent."""
         with self.lock:
             self._closed.set()
             running, waiting, self._waiting = self._running, self._waiting, None
@@ -130,7 +130,7 @@ class ActionServer:
         for end in self._ends:
             end()
 
-    # --- what comes
+    # --- arrival
 
     def _goal_came(self, message: Message, who: str, at: float) -> None:
         number = message["goal_id"]["id"] or f"{self._node}-{next(self._numbers)}-{time.time():.9f}"
@@ -146,10 +146,10 @@ class ActionServer:
             if not recalled:
                 replaced, self._waiting = self._waiting, taken
         if recalled:
-            self._end(taken, Status.RECALLED, {}, "it was canceled before it came")
+            self._end(taken, Status.RECALLED, {}, "it was canceled before it arrived")
             return
         if replaced is not None:
-            self._end(replaced, Status.RECALLED, {}, "another goal took its place")
+            self._end(replaced, Status.RECALLED, {}, "another goal replaced it")
         if before is not None:
             before.cancel()
         self._next()
@@ -180,7 +180,7 @@ class ActionServer:
             goal.cancel()
             self._tell()
 
-    # --- what is done
+    # --- execution
 
     def _next(self) -> None:
         with self.lock:
@@ -196,7 +196,7 @@ class ActionServer:
         try:
             outcome = self._do(goal)
             self._end(goal, _HOW[outcome.how], outcome.result, outcome.text)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the client must hear of an end
+        except Exception as error:  # noqa: BLE001 - whatever it is, the client must receive a result
             self._end(goal, Status.ABORTED, {}, str(error) or type(error).__name__)
         finally:
             with self._idle:
@@ -210,13 +210,13 @@ class ActionServer:
         try:
             self._result.send(made)
         except ConfigurationError as error:
-            status, text = Status.ABORTED, f"its result cannot be told: {error}"
+            status, text = Status.ABORTED, f"its result cannot be sent: {error}"
             self._result.send({**made, "status": {**state, "status": int(status), "text": text}, "result": {}})
         with self.lock:
             goal.status, goal.text, goal.ended_at = status, text, time.monotonic()
         self._tell()
 
-    # --- what is told
+    # --- status
 
     def _tell_often(self) -> None:
         while not self._closed.wait(_EVERY_S):
@@ -237,7 +237,7 @@ class ActionServer:
 
 
 def _is_meant(goal: _Taken, number: str, until: tuple[int, int]) -> bool:
-    """A cancel with an id means that goal; with a time, all of that time and before; with neither, all."""
+    """Whether a cancel matches a goal: by its id; by its time, this and all goals before; with neither, always."""
     if not number and until == (0, 0):
         return True
     return goal.goal_id["id"] == number or (0, 0) < _of(goal.goal_id["stamp"]) <= until

@@ -1,4 +1,4 @@
-"""Our node as a process: started, read, and started again whenever it ends."""
+"""Supervises the ROS 1 node in a child process: starts it, reads its frames, and restarts it when it ends."""
 
 import logging
 import os
@@ -20,19 +20,19 @@ _log: Final = logging.getLogger("trade.ros1")
 _HERE: Final = str(Path(__file__).parent)
 _START: Final = "import runpy, sys; sys.path.append(sys.argv.pop(1)); runpy.run_module('_node', run_name='__main__')"
 _SILENT_S: Final = 3.0
-"""It tells twice a second that it lives; one that is silent for so long is ended."""
+"""Timeout of its sign of life, which it sends twice a second; a silent child is killed."""
 _START_S: Final = 15.0
-"""For its first sign of life."""
+"""Timeout of its first sign of life."""
 _END_S: Final = 4.0
-"""For unregistering."""
+"""Time for unregistering."""
 _FIRST_PAUSE_S: Final = 0.2
 _LAST_PAUSE_S: Final = 5.0
 _STEADY_S: Final = 10.0
-"""One that lived so long is started again at once."""
+"""A child that lived this long is restarted at once."""
 
 
 class Child:
-    """The process. `came` is told of the channel of each new one, `gone` of its end, `heard` of its frames."""
+    """The child process. `came` receives the channel of each new one, `gone` reports its end, `heard` gets frames."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Child:
         self._command = [python, "-B", "-c", _START, _HERE]
         self._arguments = [master, node]
         self._environment = environment(master, ip)
-        self._told = came, gone, heard
+        self._callbacks = came, gone, heard
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._channel: Channel | None = None
@@ -58,7 +58,7 @@ class Child:
         self._thread.start()
 
     def close(self) -> None:
-        """Idempotent; waits for its end, which unregisters it."""
+        """Ends the child and waits until it has unregistered. Idempotent."""
         self._closed.set()
         with self._lock:
             if self._channel is not None:
@@ -83,8 +83,8 @@ class Child:
             self._closed.wait(pause_s)
 
     def _live(self) -> str:
-        """One life; returns how it ended."""
-        came, gone, heard = self._told
+        """Runs one child process; returns how it ended."""
+        came, gone, heard = self._callbacks
         ours, its = socket.socketpair()
         with ours:
             try:
@@ -119,7 +119,7 @@ class Child:
         return stood_still or f"has ended ({code})"
 
     def _start(self, its: socket.socket) -> "subprocess.Popen[bytes]":
-        return subprocess.Popen(  # noqa: S603 - the Python that was named, and our own program
+        return subprocess.Popen(  # noqa: S603 - the configured Python, and our own program
             [*self._command, str(its.fileno()), *self._arguments],
             env=self._environment,
             pass_fds=[its.fileno()],
@@ -137,7 +137,7 @@ class Child:
 
 
 class _Signs:
-    """Of life, among what it tells."""
+    """The signs of life among the frames."""
 
     def __init__(self, sock: socket.socket, heard: Callable[[Head, bytes], object]) -> None:
         self._sock = sock
@@ -155,13 +155,13 @@ class _Signs:
 
     @property
     def missing(self) -> str:
-        """Empty, or for how long there were none."""
+        """Empty, or for how long there was no sign of life."""
         late = time.monotonic() - self._at >= self._patience_s
-        return f"stood still: it told nothing for {self._patience_s:g} s" if late else ""
+        return f"froze: it sent nothing for {self._patience_s:g} s" if late else ""
 
 
 def environment(master: str, ip: str) -> dict[str, str]:
-    """Of the child. Where the master is on this host and nobody says otherwise, the node listens on loopback only."""
+    """Returns the child's environment. With a local master the node listens on loopback by default."""
     made = {name: value for name, value in os.environ.items() if name != "PYTHONHOME"}
     made["ROS_MASTER_URI"] = master
     named = [name for name in ("ROS_IP", "ROS_HOSTNAME") if made.get(name)]

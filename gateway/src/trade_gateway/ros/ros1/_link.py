@@ -1,4 +1,4 @@
-"""What is open in our node, and what it was asked: kept here, so that a node that died is told everything again."""
+"""Keeps what is open in the ROS 1 node and its pending requests, so that a restarted node receives everything again."""
 
 import itertools
 import threading
@@ -16,10 +16,10 @@ from trade_gateway.ros.ros1._node._frames import Channel, Head
 __all__ = ["Link", "Opened"]
 
 _AT_ONCE: Final = 16
-"""Questions under way; each holds a thread of the node."""
+"""Number of pending requests; each holds a thread of the node."""
 _MARGIN_S: Final = 0.5
-"""The node itself tells that time is up; it is given so long to."""
-_GONE: Final = "our node of ROS 1 ended meanwhile; whether it was done is not known"
+"""Extra time for the node to report a timeout itself."""
+_GONE: Final = "the bridge's ROS 1 node ended meanwhile; whether it was done is unknown"
 
 
 class _Answer(NamedTuple):
@@ -49,7 +49,7 @@ class Opened:
 
 
 class Link:
-    """Frames to the node and from it. `node` is told of nodes, `alone` that ours has ended and sees none any more."""
+    """Frames to and from the node. `node` reports nodes; `alone` reports that our node ended and sees no others."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Link:
         told: Callable[[str, bool], object],
         alone: Callable[[], object],
     ) -> None:
-        self._told = told
+        self._node_changed = told
         self._alone = alone
         self._numbers = itertools.count(1)
         self._state = threading.Condition()
@@ -77,16 +77,16 @@ class Link:
 
     @property
     def healthy(self) -> str:
-        """Empty, or what is wrong."""
+        """Empty if the node is connected to its master, else why not."""
         if self._closed:
             return "it was closed"
         problem = self._problem
         return self._child.problem if problem is None else problem
 
-    # --- what is open
+    # --- open topics and services
 
     def open(self, head: Head, told: Callable[[Head, bytes], object], most: int = 0) -> Opened:
-        """Open a topic or service, now and in each node that comes; `told` hears its frames."""
+        """Opens a topic or service, now and in each restarted node; the callback receives its frames."""
         number = next(self._numbers)
         opened = Opened(self, number, {**head, "id": number, "most": most}, told, most)
         with self._state:
@@ -95,7 +95,7 @@ class Link:
         return opened
 
     def names(self, op: str, name: str) -> list[Head]:
-        """What is open so, under this name."""
+        """Returns what is open by this operation under this name."""
         with self._state:
             return [one.head for one in self._open.values() if one.head["op"] == op and one.head["name"] == name]
 
@@ -111,14 +111,14 @@ class Link:
                 self._put({"op": "close", "id": opened.number})
 
     def reply(self, asked: int, body: bytes, problem: str = "") -> None:
-        """Answer a request."""
+        """Answers a request."""
         with self._state:
             self._put({"op": "reply", "ask": asked, "problem": problem}, body)
 
-    # --- what is asked
+    # --- requests
 
     def ask(self, what: str, head: Head, body: bytes, timeout_s: float, *, stops: bool = False) -> tuple[Any, bytes]:
-        """Ask the node; what stops something takes no turn.
+        """Sends a request to the node; one that stops something does not wait for its turn.
 
         Raises:
             RosUnreachable, RosRefused: about `what`.
@@ -127,7 +127,7 @@ class Link:
         if stops:
             return self._answered(what, head, body, timeout_s, deadline)
         if not self._turns.acquire(timeout=max(timeout_s, 0)):
-            raise RosUnreachable(what=what, problem=f"{_AT_ONCE} others are being asked, and none has answered")
+            raise RosUnreachable(what=what, problem=f"{_AT_ONCE} other requests are pending without an answer")
         try:
             return self._answered(what, head, body, timeout_s, deadline)
         finally:
@@ -193,7 +193,7 @@ class Link:
             case "health":
                 self._problem = head["problem"]
             case "node":
-                self._told(head["name"], head["there"])
+                self._node_changed(head["name"], head["there"])
             case "answer":
                 with self._state:
                     answered = self._asked.pop(head["ask"], None)

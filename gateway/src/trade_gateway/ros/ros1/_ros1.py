@@ -1,4 +1,4 @@
-"""The `Graph` of ROS 1: types are coded here, everything else is done by our node in a child process."""
+"""The `Graph` of ROS 1: this process encodes the types; a node in a child process does everything else."""
 
 import os
 import re
@@ -34,7 +34,7 @@ __all__ = ["Nodes", "Ros1"]
 
 
 class Nodes:
-    """The nodes that can be seen. Each watcher is told on a thread of its own, in order, and misses nothing."""
+    """The visible nodes. Each watcher is called on its own thread, in order, with every change."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -43,7 +43,7 @@ class Nodes:
         self._watched = 0
 
     def told(self, name: str, there: bool) -> None:
-        """A node came, or went."""
+        """Reports that a node came or went."""
         with self._lock:
             if there == (name in self._there):
                 return
@@ -52,12 +52,12 @@ class Nodes:
                 watcher.put((name, there))
 
     def none(self) -> None:
-        """Nothing can be seen any more."""
+        """Reports that no node is visible any more."""
         for name in sorted(self._there):
             self.told(name, False)
 
     def watch(self, told: NodeTold) -> Callable[[], None]:
-        """Tell of those that are there, and of every change; returns what ends it."""
+        """Reports the present nodes and every change; returns what ends it."""
         watcher = Mailbox[tuple[str, bool]]("trade-ros1-nodes", lambda news: told(*news), end_s=0.0)
         with self._lock:
             self._watched += 1
@@ -77,9 +77,9 @@ class Nodes:
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 _MASTER: Final = "http://localhost:11311"
 HeardAt = Callable[[Message, str, float], object]
-"""As `Heard`; told, too, when the message came, by ``time.monotonic()``."""
+"""As `Heard`, also with the time of arrival by ``time.monotonic()``."""
 _NEWEST: Final = 10
-"""Messages of a topic that wait at each place where they do."""
+"""Number of messages of a topic that wait in each queue."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class _Published:
 
 @dataclass(frozen=True, eq=False)
 class _Closing:
-    """Something open that ends by these steps; each may be done twice."""
+    """Something open that these steps close; each step may run twice."""
 
     steps: tuple[Callable[[], object], ...]
 
@@ -107,7 +107,7 @@ class _Closing:
 
 
 class Ros1(Graph):
-    """A ROS 1 system, as a node of it. See `Graph`."""
+    """A ROS 1 system, accessed as a node of it. See `Graph`."""
 
     def __init__(
         self,
@@ -117,18 +117,18 @@ class Ros1(Graph):
         folders: Iterable[Path] = (),
         ip: str = "",
     ) -> None:
-        """Returns at once; `healthy` says when the master knows of it.
+        """Returns at once; `healthy` shows when the node is registered with the master.
 
         Args:
-            master: where the master is; else as ``ROS_MASTER_URI`` says, or ``http://localhost:11311``.
-            node: our name in ROS.
-            python: one that has rospy.
-            folders: with definitions of types, see `Types`.
-            ip: address under which others find us (``ROS_IP``). Left out, it is as the environment says (``ROS_IP``,
-                ``ROS_HOSTNAME``); else loopback where the master is on loopback, and whatever ROS picks where not.
+                master: the master's URI; else ``ROS_MASTER_URI``, or ``http://localhost:11311``.
+                node: the bridge's name in ROS.
+                python: an interpreter that has rospy.
+                folders: folders of type definitions, see `Types`.
+                ip: address under which others reach us (``ROS_IP``). Without it, the environment decides (``ROS_IP``,
+                        ``ROS_HOSTNAME``); else loopback if the master is on loopback, and otherwise the choice of ROS.
 
         Raises:
-            ConfigurationError: a name is none of ROS, or a definition cannot be read.
+                ConfigurationError: a name is not a name of ROS, or a definition cannot be read.
         """
         self._types = Types(1, folders)
         self._nodes = Nodes()
@@ -153,7 +153,7 @@ class Ros1(Graph):
         return self.publish(topic, type_name, latched=latched, most=_NEWEST)
 
     def publish(self, topic: str, type_name: str, *, latched: bool, most: int) -> _Published:
-        """As `advertise`; so many messages wait at most, the newest."""
+        """As `advertise`; at most `most` messages wait, the newest ones."""
         head = self._topic("publish", topic, type_name)
         return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
@@ -166,7 +166,7 @@ class Ros1(Graph):
     def hear(
         self, topic: str, type_name: str, heard: HeardAt, *, most: int, latched: bool = True
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
-        """As `subscribe`; so many messages wait at most, the newest. Our node and we have one monotonic clock."""
+        """As `subscribe`; at most `most` messages wait, the newest ones. The node shares our monotonic clock."""
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
 
         def tell(message: tuple[Head, bytes]) -> None:
@@ -186,7 +186,7 @@ class Ros1(Graph):
     def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         head = {**service_head(self._types, type_name), "op": "serve", "name": _name(name, "service")}
         if self._link.names("serve", name):
-            raise ConfigurationError(where=name, problem="is offered already, by this very node")
+            raise ConfigurationError(where=name, problem="is offered already by this node")
         served = Served(self._types, name, type_name, answer, self._link.reply, stops=stops)
         opened = self._link.open(head, served.came)
         return self._closing((served.close, opened.close))
@@ -227,7 +227,7 @@ class Ros1(Graph):
     def set_parameter(self, node: str, name: str, value: Any, timeout_s: float) -> None:
         at = f"{node.rstrip('/')}/{name.lstrip('/')}"
         if not isinstance(value, (bool, int, float, str, list, dict)):
-            raise RosRefused(what=at, problem=f"{value!r} is no parameter of ROS")
+            raise RosRefused(what=at, problem=f"{value!r} cannot be a parameter of ROS")
         self._link.ask(at, {"op": "set_parameter", "name": at, "value": value}, b"", timeout_s)
 
     def watch_nodes(self, told: NodeTold) -> Closes:
@@ -249,7 +249,7 @@ class Ros1(Graph):
         head = {**message_head(self._types, type_name), "op": op, "name": _name(topic, "topic")}
         for other in self._link.names("publish", topic) + self._link.names("subscribe", topic):
             if other["md5"] != head["md5"]:
-                raise ConfigurationError(where=topic, problem=f"is open as {other['type']} already, by this very node")
+                raise ConfigurationError(where=topic, problem=f"is open as {other['type']} already in this node")
         return head
 
     def _node(self, name: str, there: bool) -> None:
@@ -266,19 +266,19 @@ class Ros1(Graph):
 
 
 def _nothing(told: Head, body: bytes) -> None:
-    """Of a topic that is published nothing is heard."""
+    """Ignores frames of a published topic."""
 
 
 def _name(name: str, of: str) -> str:
     if not _NAME.fullmatch(name):
         raise ConfigurationError(
-            where=f"ROS {of} {name!r}", problem="is no global name of ROS, as /arm/joint_states is"
+            where=f"ROS {of} {name!r}", problem="is not a global name of ROS, such as /arm/joint_states"
         )
     return name
 
 
 def _flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Parameters by their whole names; an empty namespace has none."""
+    """Parameters by their full names; an empty namespace has none."""
     found: dict[str, Any] = {}
     for name, value in tree.items():
         found.update(

@@ -1,4 +1,4 @@
-"""A service of ours: requests one after the other, or each at once, and every one of them is answered."""
+"""A ROS 1 service server: it runs requests in turn, or each at once, and answers every request."""
 
 import threading
 import time
@@ -13,14 +13,14 @@ from trade_gateway.ros.ros1._node._frames import Head
 __all__ = ["Served"]
 
 _MOST: Final = 32
-"""Requests that wait."""
+"""Number of requests that wait."""
 _LATE_S: Final = 5.0
-"""A request that waited longer for its turn is refused, not executed; who asked has given up."""
+"""A request that waited longer is refused, not executed; its client has given up."""
 _AT_ONCE: Final = 64
-"""Threads of a service that stops something. Whoever comes when all are taken is answered yet, in order."""
+"""Threads of a service that stops something. When all are in use, further requests are answered in order."""
 
 Reply = Callable[[int, bytes, str], object]
-"""Given the number of a request, the bytes of its response, and what failed instead."""
+"""Receives the number of a request, the bytes of its response, and the error instead of it."""
 
 
 class _Request(NamedTuple):
@@ -31,7 +31,7 @@ class _Request(NamedTuple):
 
 
 class Served:
-    """See the module. One that `stops` something refuses no request for its age or for the number that waits."""
+    """See the module. A service that `stops` something refuses no request for its age or for a full queue."""
 
     def __init__(
         self, types: Types, name: str, type_name: str, answer: Answer, reply: Reply, *, stops: bool = False
@@ -49,7 +49,7 @@ class Served:
         self._mailbox = Mailbox(self._name, self._do, end_s=0.0)
 
     def came(self, head: Head, body: bytes) -> None:
-        """A request."""
+        """Handles a request."""
         request = _Request(head["ask"], body, head["who"], head["at"])
         with self._lock:
             refused = "the service was withdrawn" if self._closed else ""
@@ -65,7 +65,7 @@ class Served:
             self._mailbox.put(request)
 
     def close(self) -> None:
-        """Whoever waits is told. Idempotent."""
+        """Refuses all waiting requests. Idempotent."""
         self._mailbox.close()
         with self._lock:
             self._closed = True
@@ -74,10 +74,10 @@ class Served:
             self._reply(asked, b"", "the service was withdrawn")
 
     def _begun(self, request: _Request) -> bool:
-        """Whether a thread of its own answers it."""
+        """Whether a new thread answers it."""
         try:
             threading.Thread(target=self._do_alone, args=(request,), name=self._name, daemon=True).start()
-        except RuntimeError:  # there can be no more threads
+        except RuntimeError:  # the thread limit is reached
             self._ended()
             return False
         return True
@@ -95,7 +95,7 @@ class Served:
     def _do(self, request: _Request) -> None:
         try:
             answer, problem = self._answered(request), ""
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is the caller's to know
+        except Exception as error:  # noqa: BLE001 - reported to the caller, whatever it is
             answer, problem = b"", str(error) or type(error).__name__
         with self._lock:
             waited = request.asked in self._waiting
@@ -105,6 +105,6 @@ class Served:
 
     def _answered(self, request: _Request) -> bytes:
         if not self._stops and time.monotonic() - request.at > _LATE_S:
-            raise TimeoutError("not executed: others were before it for too long")
+            raise TimeoutError("not executed: it waited too long behind other requests")
         given = self._answer(self._types.from_bytes(self._request, request.body), request.who, request.at)
         return self._types.to_bytes(self._response, given)

@@ -10,7 +10,7 @@ Time = dict[str, int]
 
 
 class Status(IntEnum):
-    """Of a goal, as its server tells."""
+    """State of a goal, as its server reports it."""
 
     PENDING = 0
     ACTIVE = 1
@@ -30,12 +30,12 @@ ENDED: Final = frozenset(
 
 
 def now() -> Time:
-    """The time of day."""
+    """Returns the current time of day."""
     return _day(time.time_ns())
 
 
 def day(at: float) -> Time:
-    """The time of day that it was at a time of ``time.monotonic()``."""
+    """Converts a time of ``time.monotonic()`` to the time of day."""
     return _day(time.time_ns() - int((time.monotonic() - at) * 1e9))
 
 

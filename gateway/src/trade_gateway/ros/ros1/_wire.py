@@ -1,4 +1,4 @@
-"""How ROS 1 names types and checks that both ends mean the same.
+"""Names and checksums of ROS 1 types, by which both ends check that their definitions match.
 
 Sources: "ROS/TCPROS" (fields of the connection header) and "ROS/Technical Overview" (MD5 sums: comments gone,
 constants first, the types of other messages replaced by their sums) on wiki.ros.org; "actionlib/DetailedDescription"
@@ -21,7 +21,7 @@ _AROUND: Final = {
     "Result": ("result", "status", "actionlib_msgs/msg/GoalStatus"),
     "Feedback": ("feedback", "status", "actionlib_msgs/msg/GoalStatus"),
 }
-"""Of each part of an action: its field in the message around it, and the field beside it."""
+"""For each part of an action: its field in the surrounding message, and the field beside it."""
 
 
 class ActionTypes(NamedTuple):
@@ -33,13 +33,13 @@ class ActionTypes(NamedTuple):
 
 
 def message_head(types: Types, type_name: str) -> Head:
-    """What a frame tells of a message type. Raises ConfigurationError: it is not known."""
+    """The description of a message type in a frame. Raises ConfigurationError: the type is not known."""
     text, checked = types.definition(type_name)
     return {"type": _plain(type_name), "md5": checked, "text": text}
 
 
 def service_head(types: Types, type_name: str) -> Head:
-    """What a frame tells of a service type. Raises ConfigurationError: it is not known."""
+    """The description of a service type in a frame. Raises ConfigurationError: the type is not known."""
     parts = types.parts(type_name)
     request, response = (message_head(types, part) for part in parts)
     checked = md5("".join(_checked_text(types, part) for part in parts).encode(), usedforsecurity=False).hexdigest()
@@ -47,7 +47,7 @@ def service_head(types: Types, type_name: str) -> Head:
 
 
 def action_types(types: Types, type_name: str) -> ActionTypes:
-    """The messages around goal, result and feedback, as ROS 1 names them. Raises ConfigurationError: not known."""
+    """Names of the messages around goal, result and feedback. Raises ConfigurationError: the type is not known."""
     package, _, action = type_name.split("/")
     made: list[str] = []
     for part, (suffix, (field, beside, beside_type)) in zip(types.parts(type_name), _AROUND.items(), strict=True):
@@ -66,7 +66,7 @@ def _plain(type_name: str) -> str:
 
 
 def _checked_text(types: Types, type_name: str) -> str:
-    """The text that an MD5 sum is taken of."""
+    """Returns the text that the MD5 sum covers."""
     own, _, _ = types.definition(type_name)[0].partition(_RULE)
     return "\n".join(_checked_line(types, line) for line in own.splitlines()).strip()
 

@@ -1,4 +1,4 @@
-"""ROS 2 by the key space of rmw_zenoh, without ROS 2; the facts stand in each module that relies on them."""
+"""ROS 2 over the key space of rmw_zenoh, without an installation of ROS 2; each module lists the facts it uses."""
 
 from trade_gateway.ros.ros2._ros2 import Ros2
 

@@ -1,9 +1,9 @@
-"""What both ends of an action of ROS 2 need.
+"""What the client and the server of a ROS 2 action share.
 
 Facts, from the design article *Actions* of ROS 2 (design.ros2.org) and ``action_msgs``: an action ``/name`` is the
 services ``/name/_action/send_goal``, ``cancel_goal``, ``get_result`` and the topics ``feedback`` and ``status``, the
-last one latched. Goals are named by 16 random bytes, chosen by the client. ``get_result`` is answered when the goal has
-ended. A request to cancel names a goal, or a time up to which all were accepted, or neither: then it means all.
+last one latched. The client names a goal by 16 random bytes. ``get_result`` is answered when the goal has ended.
+A request to cancel names a goal, or a time up to which all were accepted, or neither, which means all goals.
 """
 
 from enum import IntEnum
@@ -19,7 +19,7 @@ ANY: Final = bytes(16)
 
 
 class Status(IntEnum):
-    """Of a goal: ``action_msgs/msg/GoalStatus``."""
+    """State of a goal: ``action_msgs/msg/GoalStatus``."""
 
     UNKNOWN = 0
     ACCEPTED = 1
@@ -31,7 +31,7 @@ class Status(IntEnum):
 
 
 class Refusal(IntEnum):
-    """Of a request to cancel: ``action_msgs/srv/CancelGoal``."""
+    """Return code of a cancel request: ``action_msgs/srv/CancelGoal``."""
 
     NONE = 0
     REJECTED = 1

@@ -1,4 +1,4 @@
-"""An action of ours."""
+"""A ROS 2 action server."""
 
 import logging
 import threading
@@ -16,14 +16,14 @@ from trade_gateway.ros.ros2._topics import Topic
 __all__ = ["Action", "Pursued"]
 
 _MOST_ENDED: Final = 32
-"""Results that are kept for who asks later; a client of ROS 2 asks as soon as its goal is accepted."""
+"""Number of results kept for late requests; a client of ROS 2 asks as soon as its goal is accepted."""
 _END_S: Final = 5.0
 
 _log: Final = logging.getLogger("trade")
 
 
 class Pursued(Goal):
-    """A goal that somebody has sent."""
+    """A goal that a client has sent."""
 
     def __init__(self, action: "Action", goal_id: bytes, message: Message, came_at: float) -> None:
         self.id: Final = goal_id
@@ -33,7 +33,7 @@ class Pursued(Goal):
         self.waiting: Final[list[Asked]] = []
         self.thread: threading.Thread | None = None
         self.of = ""
-        """Its client; not known before it is begun."""
+        """Its client; unknown until the goal begins."""
         self._action = action
         self._message = message
         self._came_at = came_at
@@ -54,7 +54,7 @@ class Pursued(Goal):
         return self._came_at
 
     def feedback(self, message: Mapping[str, Any]) -> None:
-        """See `Goal`. Raises ConfigurationError: it does not fit the type."""
+        """See `Goal`. Raises ConfigurationError: the message does not fit the type."""
         self._action.feedback.send({"goal_id": uuid(self.id), "feedback": message})
 
     def when_canceled(self, tell: Callable[[], object]) -> None:
@@ -67,20 +67,20 @@ class Pursued(Goal):
 
     @property
     def canceled(self) -> bool:
-        """Whether its end was asked for."""
+        """Whether its cancellation was requested."""
         with self._lock:
             return self._canceled
 
     def cancel(self) -> None:
-        """Tell those who asked to be. Idempotent."""
+        """Runs the callbacks registered with `when_canceled`. Idempotent."""
         with self._lock:
             self._canceled = True
             told, self._tell = self._tell, []
         for tell in told:
             try:
                 tell()
-            except Exception:  # noqa: BLE001 - the others are to be told, too
-                _log.exception("the end of a goal that %s asked for could not be told", self.of or "a client")
+            except Exception:  # noqa: BLE001 - the remaining callbacks must still run
+                _log.exception("a callback for the canceled goal of %s failed", self.of or "a client")
 
     def info(self) -> dict[str, Any]:
         """A ``action_msgs/msg/GoalInfo``."""
@@ -88,7 +88,7 @@ class Pursued(Goal):
 
 
 class Action:
-    """Its services and topics, and the goals it has been sent."""
+    """The services and topics of an action, and the goals that it has received."""
 
     def __init__(self, node: Node, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
         node.hashes.learn_action(type_name)
@@ -109,7 +109,7 @@ class Action:
         )
 
     def close(self) -> None:
-        """Take no more goals, and cancel those there are; waits for their end for some seconds. Idempotent."""
+        """Accepts no more goals, cancels the current ones and waits some seconds for their end. Idempotent."""
         with self._lock:
             self._closed = True
             going = self._going()
@@ -122,10 +122,10 @@ class Action:
         for each in (*self._servers, self._status, self.feedback):
             each.close()
 
-    # --- what clients ask
+    # --- requests of clients
 
     def _accept(self, asked: Asked) -> None:
-        """S01: it can be canceled as soon as it is here; the name of who sent it is waited for only after that."""
+        """S01: the goal can be canceled on arrival; only after that does this wait for the name of its sender."""
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
         goal = Pursued(self, goal_id, request["goal"], asked.came_at)
@@ -161,9 +161,9 @@ class Action:
             if goal is not None and goal.outcome is None:
                 goal.waiting.append(asked)
                 return
-        asked.answer({"status": Status.UNKNOWN} if goal is None else _told(goal))
+        asked.answer({"status": Status.UNKNOWN} if goal is None else _status_of(goal))
 
-    # --- what is done
+    # --- execution
 
     def _pursue(self, goal: Pursued, before: list[Pursued], asked: Asked) -> None:
         with self._lock:
@@ -177,12 +177,12 @@ class Action:
         goal.of = asked.who()
         try:
             self._end(goal, Outcome(Ended.CANCELED, {}) if goal.canceled else self._do(goal))
-        except Exception:  # noqa: BLE001 - its client is told that it failed
+        except Exception:  # noqa: BLE001 - its client receives the failure
             _log.exception("a goal of %s failed", self._name)
             self._end(goal, Outcome(Ended.ABORTED, {}))
 
     def _end(self, goal: Pursued, outcome: Outcome) -> None:
-        self._node.types.to_bytes(self._type_name + "_Result", outcome.result)  # raised now, not at each who asks
+        self._node.types.to_bytes(self._type_name + "_Result", outcome.result)  # raises here, not for each client
         with self._lock:
             goal.outcome, goal.status = outcome, ENDS[outcome.how]
             waiting = list(goal.waiting)
@@ -191,7 +191,7 @@ class Action:
                 del self._goals[old.id]
         self._tell_status()
         for asked in waiting:
-            asked.answer(_told(goal))
+            asked.answer(_status_of(goal))
 
     def _going(self) -> list[Pursued]:
         return [goal for goal in self._goals.values() if goal.outcome is None]
@@ -223,5 +223,5 @@ def _refusal(goal_id: bytes, known: Pursued | None, ending: list[Pursued]) -> Re
     return Refusal.UNKNOWN_GOAL if known is None else Refusal.GOAL_TERMINATED
 
 
-def _told(goal: Pursued) -> dict[str, Any]:
+def _status_of(goal: Pursued) -> dict[str, Any]:
     return {"status": goal.status, "result": {} if goal.outcome is None else goal.outcome.result}

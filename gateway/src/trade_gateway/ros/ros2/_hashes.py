@@ -1,6 +1,6 @@
-"""What ROS 2 names types by: RIHS01, also of services and of what an action is made of.
+"""Type hashes of ROS 2 (RIHS01), also for services and the parts of actions.
 
-Facts: REP 2011 and 2016 (the hash is of a description of the type and of all it contains), and of what ``rosidl``
+Facts: REP 2011 and 2016 (the hash covers the description of the type and of all types in it), and the additions of
 adds (``rosidl_parser/definition.py``, ``rosidl_generator_type_description``):
 
 - A service is described as a type with the fields ``request_message``, ``response_message``, ``event_message``; its
@@ -8,7 +8,7 @@ adds (``rosidl_parser/definition.py``, ``rosidl_generator_type_description``):
 - An action ``Name`` has the services ``Name_SendGoal`` (goal id and goal; accepted and stamp) and ``Name_GetResult``
   (goal id; status and result), and the message ``Name_FeedbackMessage`` (goal id and feedback).
 - ``char`` is an unsigned number of 8 bits. rosbags takes it for a character of IDL, which gives wrong hashes to all
-  services, as their events contain one; here it is put right.
+    services, as their events contain one; this module corrects that.
 """
 
 import threading
@@ -26,11 +26,11 @@ _UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 
 Described = tuple[str, Any]
-"""A field: its name, and its kind in rosbags' words."""
+"""A field: its name, and its kind in the notation of rosbags."""
 
 
 class Hashes:
-    """Of the types of one graph; the parts of actions that ROS makes by itself become known to it."""
+    """Hashes of the types of one graph. It also adds the parts of actions that ROS generates to the graph's types."""
 
     def __init__(self, types: Types) -> None:
         self._types = types
@@ -38,13 +38,13 @@ class Hashes:
         self._lock = threading.Lock()
 
     def message(self, type_name: str) -> str:
-        """Of a message. Raises ConfigurationError: it, or what it contains, is not known."""
+        """Returns the hash of a message. Raises ConfigurationError: the message or a type in it is not known."""
         with self._lock:
             self._describe(type_name)
             return self._described.hash_rihs01(type_name)
 
     def service(self, type_name: str) -> str:
-        """Of a service, or of one that an action is made of. Raises ConfigurationError: it is not known."""
+        """Returns the hash of a service, also of one of an action. Raises ConfigurationError: it is not known."""
         request, response = f"{type_name}_Request", f"{type_name}_Response"
         event = f"{type_name}_Event"
         with self._lock:
@@ -56,10 +56,10 @@ class Hashes:
             return self._described.hash_rihs01(type_name)
 
     def learn_action(self, type_name: str) -> None:
-        """Make known what ROS adds to an action, so that it can be written and read as bytes.
+        """Adds the types that ROS generates for an action, so that they can be read and written as bytes.
 
         Raises:
-            ConfigurationError: it is not known, or is no action.
+                ConfigurationError: the type is not known, or is not an action.
         """
         goal, result, feedback = _three(type_name, self._types.parts(type_name))
         with self._lock:
@@ -94,7 +94,7 @@ def _name(type_name: str) -> Any:
 
 
 def _few(type_name: str) -> Any:
-    """At most one of it."""
+    """A sequence of at most one."""
     return (Nodetype.SEQUENCE, (_name(type_name), 1))
 
 
@@ -123,4 +123,4 @@ def _three(type_name: str, parts: tuple[str, ...]) -> tuple[str, str, str]:
         case (goal, result, feedback):
             return goal, result, feedback
         case _:
-            raise ConfigurationError(where=type_name, problem="is no action")
+            raise ConfigurationError(where=type_name, problem="is not an action")

@@ -1,11 +1,11 @@
 # pyright: reportUnknownMemberType=false
-"""The zenoh session at the router that ROS 2 runs (``rmw_zenohd``), apart from the sessions of TRADE.
+"""The zenoh session at the router of ROS 2 (``rmw_zenohd``), separate from the sessions of TRADE.
 
-It is a client, not a peer as the nodes of ROS 2 are: their router does not pass on what one peer says to another
+It is a client; the nodes of ROS 2 are peers. Their router does not forward messages between peers
 (``peers_failover_brokering`` is off in its configuration), but it serves clients.
 
-zenoh declares everything again when it was cut off. But a client cannot be opened before its router is there: that is
-tried again and again here, and what has been asked for until then is declared once it is.
+After a lost connection, zenoh repeats all declarations. A client session cannot be opened without a router, so this
+module retries until there is one, and then makes the declarations that were requested meanwhile.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from trade.errors import ConfigurationError
 __all__ = ["CLOSED", "Declared", "Link"]
 
 CLOSED: Final = (zenoh.ZError, RuntimeError)
-"""What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
+"""What zenoh raises for an object that is already closed, or that another thread is closing or using."""
 _OPEN_MS: Final = 500
 _AGAIN_S: Final = 0.5
 _LEASE_MS: Final = 2000
@@ -30,7 +30,7 @@ _END_S: Final = 5.0
 
 
 class Undeclares(Protocol):
-    """What zenoh gives for what is declared."""
+    """A declaration of zenoh."""
 
     def undeclare(self) -> Any: ...
 
@@ -39,7 +39,7 @@ Declare = Callable[[zenoh.Session], Sequence[Undeclares]]
 
 
 class Declared:
-    """Something declared, or to be declared once there is a router."""
+    """A declaration that is made, or will be made once there is a router."""
 
     def __init__(self, link: "Link", declare: Declare) -> None:
         self._link = link
@@ -47,17 +47,17 @@ class Declared:
         self.made: Sequence[Undeclares] = ()
 
     def close(self) -> None:
-        """Take it back. Idempotent."""
+        """Withdraws the declaration. Idempotent."""
         for made in self._link.forget(self):
             with contextlib.suppress(*CLOSED):
                 made.undeclare()
 
 
 class Link:
-    """See the module."""
+    """Opens the session and keeps the declarations. See the module."""
 
     def __init__(self, router: str) -> None:
-        """Raises ConfigurationError: that is no endpoint of zenoh."""
+        """Raises ConfigurationError: this is not an endpoint of zenoh."""
         self.id: Final = f"{secrets.randbelow(15) + 1:x}{secrets.token_hex(15)}{secrets.randbelow(16):x}"
         self._router = router
         self._config = _configuration(router, self.id)
@@ -71,7 +71,7 @@ class Link:
 
     @property
     def problem(self) -> str:
-        """Empty, or what is wrong."""
+        """Empty if the router is connected, else why not."""
         session = self._session
         with contextlib.suppress(*CLOSED):
             if session is not None and list(session.info.routers_zid()):
@@ -80,14 +80,14 @@ class Link:
 
     @property
     def session(self) -> zenoh.Session | None:
-        """None before a router was there for the first time, and after the end."""
+        """The session; None before the first contact with a router, and after the end."""
         return self._session
 
     def declare(self, declare: Declare) -> Declared:
-        """Have something declared, now or once there is a session.
+        """Makes a declaration, now or once there is a session.
 
         Args:
-            declare: is given the session; returns what is to be undeclared, in this order. Called with a lock held.
+                declare: receives the session, returns what to undeclare, in this order. It is called with a lock held.
         """
         declared = Declared(self, declare)
         with self._lock:
@@ -97,7 +97,7 @@ class Link:
         return declared
 
     def forget(self, declared: Declared) -> Sequence[Undeclares]:
-        """What it had declared, to be undeclared; nothing the second time."""
+        """Returns the declarations to undeclare; nothing the second time."""
         with self._lock:
             if declared in self._declared:
                 self._declared.remove(declared)
@@ -105,7 +105,7 @@ class Link:
         return made
 
     def close(self) -> None:
-        """End the session, and with it all that is declared. Idempotent."""
+        """Ends the session and with it all declarations. Idempotent."""
         self._closed.set()
         if self._opening.is_alive():
             self._opening.join(_END_S)
@@ -145,7 +145,7 @@ def _configuration(router: str, session_id: str) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # what is latched is only found again by its time
+        # latched messages can only be found by their timestamps
         "timestamping/enabled": True,
         "transport/link/tx/lease": _LEASE_MS,
         "transport/link/tx/keep_alive": 4,
@@ -156,6 +156,6 @@ def _configuration(router: str, session_id: str) -> zenoh.Config:
     try:
         config.insert_json5("connect/endpoints", json.dumps([router]))
     except zenoh.ZError as bad:
-        problem = f"{bad}; it must be written like tcp/localhost:7447"
+        problem = f"{bad}; write it like tcp/localhost:7447"
         raise ConfigurationError(where=f"router {router!r}", problem=problem) from None
     return config

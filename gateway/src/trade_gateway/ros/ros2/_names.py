@@ -1,11 +1,11 @@
-"""Names of ROS 2 as keys of zenoh, the way rmw_zenoh writes them.
+"""Names of ROS 2 as keys of zenoh, in the notation of rmw_zenoh.
 
 Facts, all from ros2/rmw_zenoh (``docs/design.md``, ``rmw_zenoh_cpp/src/detail/liveliness_utils.cpp``, ``qos.cpp``):
 
 - Topics and services are at ``<domain>/<name without its first slash>/<DDS type>/<type hash>``; the DDS type of
   ``package/msg/Name`` is ``package::msg::dds_::Name_``.
-- Who is there is told by liveliness tokens: ``@ros2_lv/<domain>/<session>/<node id>/<entity id>/<kind>/<enclave>/
-  <namespace>/<node>``, and of an endpoint also ``/<name>/<DDS type>/<type hash>/<QoS>``. In all of these a slash is
+- Liveliness tokens announce nodes: ``@ros2_lv/<domain>/<session>/<node id>/<entity id>/<kind>/<enclave>/
+    <namespace>/<node>``, and endpoints add ``/<name>/<DDS type>/<type hash>/<QoS>``. In all of these a slash is
   written ``%``. Kinds are NN, MP, MS, SS, SC: node, publisher, subscription, service server and client.
 - QoS is ``reliability:durability:history,depth:deadline:lifespan:liveliness``, each empty where it is the default:
   reliable, volatile, keep last, depth 42, no deadlines.
@@ -41,7 +41,7 @@ _ENDPOINT_PARTS: Final = 13
 
 
 class Kind(Enum):
-    """Of a liveliness token."""
+    """Kind of a liveliness token."""
 
     NODE = "NN"
     PUBLISHER = "MP"
@@ -51,29 +51,29 @@ class Kind(Enum):
 
 
 class Seen(NamedTuple):
-    """What a liveliness token says."""
+    """The content of a liveliness token."""
 
     session: str
     kind: Kind
     node: str
     """Fully qualified: ``/arm/teleop``."""
     name: str = ""
-    """Of the topic or service; a node has none."""
+    """Name of the topic or service; a node has none."""
 
 
 def absolute(name: str) -> str:
-    """A name of a topic, service, action or node, unchanged.
+    """Returns a name of a topic, service, action or node unchanged.
 
     Raises:
-        ConfigurationError: it is no absolute name of ROS.
+            ConfigurationError: it is not an absolute name of ROS.
     """
     if _NAME.fullmatch(name) is None or "__" in name:
-        raise ConfigurationError(where="ROS name", problem=f"{name!r} must be written /like/this_1: absolute")
+        raise ConfigurationError(where="ROS name", problem=f"{name!r} must be absolute, such as /like/this_1")
     return name
 
 
 def dds_type(type_name: str) -> str:
-    """``std_msgs/msg/String`` as ``std_msgs::msg::dds_::String_``. Raises ConfigurationError: it is no type's name."""
+    """``std_msgs/msg/String`` as ``std_msgs::msg::dds_::String_``. Raises ConfigurationError: it is not a type name."""
     found = _TYPE.fullmatch(type_name)
     if found is None:
         raise ConfigurationError(where="ROS type", problem=f"{type_name!r} must be written package/msg/Name")
@@ -82,7 +82,7 @@ def dds_type(type_name: str) -> str:
 
 
 def data_key(domain_id: int, name: str, type_name: str, type_hash: str) -> str:
-    """Where a topic's messages go, or a service's requests."""
+    """The key of a topic's messages or of a service's requests."""
     return f"{domain_id}/{absolute(name)[1:]}/{dds_type(type_name)}/{type_hash}"
 
 
@@ -102,7 +102,7 @@ def token(
     type_hash: str,
     qos: str,
 ) -> str:
-    """The token of an endpoint; its number is its own within the session, and not 0."""
+    """The token of an endpoint; its number is unique within the session and not 0."""
     start = f"{_ADMIN}/{domain_id}/{session}/0/{number}/{kind.value}/{_of_node(node)}"
     return f"{start}/{_mangled(absolute(name))}/{dds_type(type_name)}/{type_hash}/{qos}"
 
@@ -113,7 +113,7 @@ def every_token(domain_id: int) -> str:
 
 
 def read_token(key: str) -> Seen | None:
-    """What a token says; None if it is not of rmw_zenoh. Parts that a later version adds at its end are left alone."""
+    """Parses a token; None if it is not of rmw_zenoh. Ignores parts that a later version appends."""
     parts = key.split("/")
     if len(parts) < _NODE_PARTS or parts[0] != _ADMIN:
         return None
@@ -129,7 +129,7 @@ def read_token(key: str) -> Seen | None:
 
 
 def gid(endpoint_token: str) -> bytes:
-    """What an endpoint puts into each message, 16 bytes."""
+    """The 16 bytes that an endpoint puts into each message."""
     return xxhash.xxh3_128_intdigest(endpoint_token.encode()).to_bytes(16, "little")
 
 

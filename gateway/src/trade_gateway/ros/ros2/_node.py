@@ -1,4 +1,4 @@
-"""Our node in ROS 2, and what each topic and service of it needs."""
+"""The bridge's node in ROS 2, and the endpoints of its topics and services."""
 
 import itertools
 import struct
@@ -20,7 +20,7 @@ _FORMAT: Final = struct.Struct(f"<qqB{GID_BYTES}s")
 
 
 class Attachment(NamedTuple):
-    """What travels beside each message, request and response.
+    """The data attached to each message, request and response.
 
     Facts, from ros2/rmw_zenoh (``rmw_zenoh_cpp/src/detail/attachment_helpers.cpp`` since its change 601 of spring 2025)
     and zenoh's serialization format: sequence number and time in ns since 1970 as 64-bit little-endian integers, then
@@ -33,15 +33,15 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def to_bytes(self) -> bytes:
-        """As it travels."""
+        """Returns it as it travels."""
         return _FORMAT.pack(self.sequence, self.time_ns, GID_BYTES, self.gid)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "Attachment":
-        """One that came.
+        """Parses a received attachment.
 
         Raises:
-            ValueError: these are not the bytes of one, or of an older rmw_zenoh.
+                ValueError: these bytes are not an attachment, or come from an older rmw_zenoh.
         """
         if len(data) != _FORMAT.size:
             raise ValueError(f"an attachment has {_FORMAT.size} bytes, not {len(data)}")
@@ -52,34 +52,34 @@ class Attachment(NamedTuple):
 
 
 USUAL: Final = "::,10:,:,:,,"
-"""Reliable, volatile, keep last 10: what ROS 2 gives topics and services that ask for nothing else."""
+"""Reliable, volatile, keep last 10: the default of ROS 2 for topics and services."""
 LATCHED: Final = ":1:,1:,:,:,,"
 """Reliable, transient local, keep last 1."""
 
 
 class Endpoint(NamedTuple):
-    """A publisher, subscription, service server or client of ours."""
+    """A publisher, subscription, service server or client of this node."""
 
     key: str
     token: str
     gid: bytes
 
     def attachment(self, sequence: int) -> bytes:
-        """What goes beside something it says now."""
+        """Returns the attachment of a message that is sent now."""
         return Attachment(sequence, time.time_ns(), self.gid).to_bytes()
 
 
 class Sender:
-    """Who sent something, by what was attached to it. Looked up when it comes: its sender may be gone soon."""
+    """The sender of something, by its attachment. It is looked up on arrival, as the sender may end soon."""
 
     def __init__(self, presence: Presence, attachment: "zenoh.ZBytes | None") -> None:
         self.attached: Final = None if attachment is None else _read(attachment)
-        """None: nothing, or nothing that can be read."""
+        """None: there is no attachment, or it cannot be read."""
         self._presence = presence
         self._name = "" if self.attached is None else presence.known(self.attached.gid)
 
     def name(self, *, waits: bool = True) -> str:
-        """Of its node; empty if nothing tells it. May wait shortly for that."""
+        """The name of its node; empty if unknown. May wait shortly for it."""
         if self._name or self.attached is None:
             return self._name
         look = self._presence.node_of if waits else self._presence.known
@@ -94,10 +94,10 @@ def _read(attachment: zenoh.ZBytes) -> Attachment | None:
 
 
 class Node:
-    """Seen by others as soon as there is a router."""
+    """The node. Others see it as soon as there is a router."""
 
     def __init__(self, link: Link, domain_id: int, name: str, types: Types) -> None:
-        """Raises ConfigurationError: that is no name of a node."""
+        """Raises ConfigurationError: this is not the name of a node."""
         self.name: Final = absolute(name)
         self.link: Final = link
         self.types: Final = types
@@ -108,19 +108,19 @@ class Node:
         self._declared: Declared = link.declare(self._declare)
 
     def topic(self, kind: Kind, name: str, type_name: str, qos: str) -> Endpoint:
-        """A publisher or subscription. Raises ConfigurationError: its name or type is none."""
+        """A publisher or subscription. Raises ConfigurationError: its name or type is invalid."""
         return self._endpoint(kind, name, type_name, self.hashes.message(type_name), qos)
 
     def service(self, kind: Kind, name: str, type_name: str) -> Endpoint:
-        """A service server or client. Raises ConfigurationError: its name or type is none."""
+        """A service server or client. Raises ConfigurationError: its name or type is invalid."""
         return self._endpoint(kind, name, type_name, self.hashes.service(type_name), USUAL)
 
     def sender(self, attachment: "zenoh.ZBytes | None") -> Sender:
-        """Of something that has just come with that attached. Does not wait."""
+        """The sender of what has just arrived with this attachment. Does not wait."""
         return Sender(self.presence, attachment)
 
     def close(self) -> None:
-        """Be seen no more. Idempotent."""
+        """Withdraws the node. Idempotent."""
         self.presence.close()
         self._declared.close()
 

@@ -1,7 +1,7 @@
-"""Parameters of nodes of ROS 2, by the services that each node has for them; and those of ours, which has none.
+"""Parameters of ROS 2 nodes, through the services that each node has for them; the bridge's own node has none.
 
-Facts, from ``rcl_interfaces``: values are numbered by type, ``ParameterType.msg``; lists of any depth are asked for by
-depth 0. A parameter has the type it was declared with: a whole number given for a ``double`` is refused.
+Facts, from ``rcl_interfaces``: values are numbered by type, ``ParameterType.msg``; depth 0 requests lists of any
+depth. A parameter has the type it was declared with: a whole number for a ``double`` is refused.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,30 +32,30 @@ _FIELDS: Final = {
 _OF_ONE: Final = {bool: 1, int: 2, float: 3, str: 4, bytes: 5}
 _OF_MANY: Final = {bool: 6, int: 7, float: 8, str: 9}
 _NUMBERS: Final = (2, 7)
-"""Whole numbers, one and several; those with fractions are the next."""
+"""Whole numbers, scalar and array; the types of fractional numbers follow them."""
 _PACKAGE: Final = "rcl_interfaces/srv"
 
 
 def all_of(call: Call, node: str, timeout_s: float) -> dict[str, Any]:
-    """See `Graph.parameters`. Waits for each of two services that long."""
+    """See `Graph.parameters`. The timeout applies to each of two services."""
     names = call(f"{node}/list_parameters", f"{_PACKAGE}/ListParameters", {}, timeout_s)["result"]["names"]
     values = call(f"{node}/get_parameters", f"{_PACKAGE}/GetParameters", {"names": names}, timeout_s)["values"]
     return {name: _value(value) for name, value in zip(names, values, strict=False)}
 
 
 def put(call: Call, node: str, name: str, value: Any, timeout_s: float) -> None:
-    """See `Graph.set_parameter`. Waits for each of two services that long."""
+    """See `Graph.set_parameter`. The timeout applies to each of two services."""
     types = call(f"{node}/get_parameter_types", f"{_PACKAGE}/GetParameterTypes", {"names": [name]}, timeout_s)["types"]
     parameter = {"name": name, "value": _typed(name, value, types[0] if types else 0)}
     asked = {"parameters": [parameter]}
     (result,) = call(f"{node}/set_parameters", f"{_PACKAGE}/SetParameters", asked, timeout_s)["results"] or [None]
     if result is None or not result["successful"]:
-        reason = "it gave no answer for it" if result is None else result["reason"] or "it gave no reason"
+        reason = "the node did not answer for it" if result is None else result["reason"] or "the node gave no reason"
         raise RosRefused(what=f"parameter {name} of {node}", problem=f"was not set to {value!r}: {reason}")
 
 
 class NoParameters:
-    """The services by which others ask for parameters, so that nobody waits for the answer."""
+    """The parameter services of the bridge's node, so that clients that ask for its parameters need not wait."""
 
     def __init__(self, node: Node) -> None:
         answers: dict[str, Callable[[Message], Message]] = {
@@ -72,7 +72,7 @@ class NoParameters:
         ]
 
     def close(self) -> None:
-        """End them. Idempotent."""
+        """Ends the services. Idempotent."""
         for server in self._servers:
             server.close()
 

@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
-"""Who is there, by liveliness tokens: nodes, what they offer, and which node an endpoint is of.
+"""Presence by liveliness tokens: the nodes, what they offer, and which node an endpoint belongs to.
 
-A process that ends or is killed takes its tokens with it at once, as its connection to the router ends. One that
-freezes or is cut off is noticed by the router after the lease of its session, 60 s in the configuration that ROS 2
-ships. When our own router is gone, everybody is.
+The tokens of a process that ends or is killed vanish at once with its connection to the router. The router notices a
+frozen or disconnected one after the lease of its session, 60 s in the configuration that ROS 2 ships. Without a
+router, no node is visible.
 """
 
 import threading
@@ -23,34 +23,34 @@ from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_tok
 __all__ = ["Presence", "Watching"]
 
 _INTRODUCTION_S: Final = 0.5
-"""How long a first message waits for the token of its sender, which may come after it."""
+"""How long a first message waits for the token of its sender, which may arrive later."""
 _PAUSE_S: Final = 5.0
-"""How soon after one that had none the next is waited for: strangers must not keep others from being heard (S07)."""
+"""Pause after an unknown sender before the next is waited for, so that unknown ones do not delay the others (S07)."""
 _MOST_STRANGERS: Final = 1024
 _ENDED_S: Final = 10.0
-"""How long an endpoint that ended keeps its name: what it sent before, and waits for its turn, is told with it."""
+"""How long the name of an ended endpoint is kept, for messages of it that still wait in a queue."""
 _MOST_ENDED: Final = 4096
 
 
 class Watching:
-    """Somebody told of nodes."""
+    """A subscription to the nodes."""
 
     def __init__(self, told: NodeTold, end: "Callable[[Watching], None]") -> None:
-        self._told = told
+        self._report = told
         self._end = end
         self.mailbox: Final = Mailbox[tuple[str, bool]]("ros2 nodes", self._tell)
 
     def _tell(self, news: tuple[str, bool]) -> None:
-        self._told(*news)
+        self._report(*news)
 
     def close(self) -> None:
-        """Tell no more. Idempotent."""
+        """Ends the subscription. Idempotent."""
         self._end(self)
         self.mailbox.close()
 
 
 class Presence:
-    """Of one domain, as the router tells it."""
+    """The nodes and endpoints of one domain, as the router announces them."""
 
     def __init__(self, link: Link, domain_id: int) -> None:
         self._own = link.id
@@ -58,7 +58,7 @@ class Presence:
         self._seen: dict[str, Seen] = {}
         self._node_of: dict[bytes, str] = {}
         self._ended: dict[bytes, tuple[str, float]] = {}
-        """Nodes of endpoints that ended, and until when they are told; the oldest first."""
+        """Nodes of endpoints that ended, and until when they are kept; the oldest first."""
         self._nodes: Counter[str] = Counter()
         self._offered: Counter[tuple[Kind, str]] = Counter()
         self._strangers: set[bytes] = set()
@@ -67,12 +67,12 @@ class Presence:
         self._declared = link.declare(partial(self._listen, every_token(domain_id)))
 
     def introduce(self, endpoint_gid: bytes, node: str) -> None:
-        """An endpoint of our own."""
+        """Adds an endpoint of the bridge's own node."""
         with self._changed:
             self._node_of[endpoint_gid] = node
 
     def node_of(self, endpoint_gid: bytes) -> str:
-        """The name of the node that an endpoint is of; empty if no token tells it. May wait, once for each stranger."""
+        """The name of an endpoint's node; empty without a token. May wait, once for each unknown endpoint."""
         with self._changed:
             now = time.monotonic()
             known = self._named(endpoint_gid) or endpoint_gid in self._strangers
@@ -81,7 +81,7 @@ class Presence:
             return self._named(endpoint_gid)
 
     def known(self, endpoint_gid: bytes) -> str:
-        """The same without waiting: empty also if its token has not come yet."""
+        """The same without waiting: also empty if its token has not arrived yet."""
         with self._changed:
             return self._named(endpoint_gid)
 
@@ -91,7 +91,7 @@ class Presence:
             return self._offered[kind, name] > 0
 
     def watch(self, told: NodeTold) -> Watching:
-        """See `Graph.watch_nodes`; our own node is not told of."""
+        """See `Graph.watch_nodes`; the bridge's own node is not reported."""
         watching = Watching(told, self._unwatch)
         with self._changed:
             self._watching.append(watching)
@@ -100,7 +100,7 @@ class Presence:
         return watching
 
     def close(self) -> None:
-        """Listen no more. Idempotent."""
+        """Stops listening. Idempotent."""
         self._declared.close()
         with self._changed:
             watching = list(self._watching)
@@ -172,7 +172,7 @@ class Presence:
         self._nodes[seen.node] -= 1
         self._tell(seen.node, there=False)
         if self._nodes[seen.node]:
-            # of two with one name one has died: it counts, whoever is left
+            # of two nodes with one name, one ended: report that, whichever remains
             self._tell(seen.node, there=True)
         else:
             del self._nodes[seen.node]

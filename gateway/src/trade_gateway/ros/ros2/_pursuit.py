@@ -1,4 +1,4 @@
-"""A goal of ours at an action of theirs."""
+"""A ROS 2 action client: one goal of the bridge at an action of ROS."""
 
 import contextlib
 import secrets
@@ -20,11 +20,11 @@ __all__ = ["Pursuing"]
 _ACCEPT_S: Final = 5.0
 _CANCEL_S: Final = 5.0
 _ASK_S: Final = 30.0
-"""One question for the result; there is another one after it. ROS 2 itself asks once, without a deadline."""
+"""Timeout of one request for the result; another follows it. ROS 2 itself asks once, without a deadline."""
 _ABANDON_S: Final = 10.0
-"""How long a goal that is given up, and may go on, is told to end."""
+"""How long an abandoned goal that may still run is canceled again and again."""
 _GONE_S: Final = 3.0
-"""How long a server may not be seen before it counts as gone: the router may be back by then."""
+"""How long a server may be invisible before it counts as gone: the router may return in that time."""
 _AGAIN_S: Final = 0.2
 _END_S: Final = 2.0
 
@@ -32,10 +32,10 @@ _HOW: Final = {int(status): how for how, status in ENDS.items()}
 
 
 class Pursuing:
-    """Asks for its result until it is known, on a thread of its own."""
+    """A sent goal. Its own thread requests the result until it is known."""
 
     def __init__(self, node: Node, name: str, type_name: str, feedback: Callable[[Message], object] | None) -> None:
-        """Raises ConfigurationError: the name or type is none."""
+        """Raises ConfigurationError: the name or type is invalid."""
         node.hashes.learn_action(type_name)
         self._node = node
         self._name = name
@@ -58,10 +58,10 @@ class Pursuing:
         self._thread = threading.Thread(target=self._follow, name=f"ros2 pursuit {name}", daemon=True)
 
     def begin(self, goal: Mapping[str, Any]) -> None:
-        """Send it. If what came of it is not heard, it is told to end, and has not ended before that has.
+        """Sends the goal. If its outcome is unknown, the goal is canceled and counts as running until it ends.
 
         Raises:
-            RosUnreachable: nobody serves the action: it was not sent.
+                RosUnreachable: no node serves the action, so the goal was not sent.
             ConfigurationError: the goal does not fit.
         """
         try:
@@ -95,14 +95,14 @@ class Pursuing:
                 raise failure
 
     def cancel(self) -> None:
-        """See `Pursuit`. Asked for without a router, it is asked again when there is one."""
+        """See `Pursuit`. Without a router, the request is repeated once there is one."""
         self._unwanted = True
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable):
                 self._stop.send(self._this, _CANCEL_S)
 
     def close(self) -> None:
-        """Have it canceled, and follow it no longer. Idempotent."""
+        """Cancels the goal and stops following it. Idempotent."""
         self._closed.set()
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable, RosRefused):
@@ -128,7 +128,7 @@ class Pursuing:
             self._over.wait(_AGAIN_S)
 
     def _is_there(self) -> bool:
-        """Whether somebody serves the action after all, who is told to cancel the goal by this."""
+        """Whether a node serves the action after all; if so, this cancels the goal."""
         try:
             answer = self._stop.ask(self._this, _END_S)
         except RosRefused:
@@ -142,21 +142,21 @@ class Pursuing:
             self._abandon(why)
 
     def _abandon(self, why: RosUnreachable) -> None:
-        """S05: whether it goes on is not known, so it is told to end, again and again for some time."""
+        """S05: the goal may still run, so this cancels it repeatedly for some time."""
         threading.Thread(target=self._end, args=(why,), name=f"ros2 end {self._name}", daemon=True).start()
 
     def _end(self, why: RosUnreachable) -> None:
         deadline = time.monotonic() + _ABANDON_S
         told, ended = False, False
         while not ended and time.monotonic() < deadline and not self._closed.is_set():
-            refusal = None if told else self._told_to_end()
+            refusal = None if told else self._cancel_once()
             told = told or refusal is Refusal.NONE
             ended = refusal is Refusal.GOAL_TERMINATED or (told and self._has_ended(deadline - time.monotonic()))
             if not ended:
                 self._closed.wait(_AGAIN_S)
         self._finish(RosUnreachable(what=self._name, problem=f"{why.problem}; {_end_of(told=told, ended=ended)}"))
 
-    def _told_to_end(self) -> Refusal | None:
+    def _cancel_once(self) -> Refusal | None:
         with contextlib.suppress(RosUnreachable, RosRefused, ValueError):
             return Refusal(self._stop.call(self._this, _END_S)["return_code"])
         return None
@@ -169,7 +169,7 @@ class Pursuing:
     def _read(self, answer: Message) -> Outcome | RosUnreachable:
         how: Ended | None = _HOW.get(answer["status"])
         if how is None:
-            problem = "its server does not know the goal any more; was it started again?"
+            problem = "its server does not know the goal any more; has the server restarted?"
             return RosUnreachable(what=self._name, problem=problem)
         return Outcome(how, answer["result"])
 
@@ -190,5 +190,5 @@ def _end_of(*, told: bool, ended: bool) -> str:
     if ended:
         return "it was canceled, and has ended"
     if told:
-        return "it was told to end, but its end is not known"
-    return "it could not be canceled, and its end is not known"
+        return "it was canceled, but whether it has ended is unknown"
+    return "it could not be canceled, and whether it has ended is unknown"

@@ -1,4 +1,4 @@
-"""A system of ROS 2 that uses rmw_zenoh, seen from its router; nothing of ROS is installed here."""
+"""A ROS 2 system that uses rmw_zenoh, accessed through its router; it needs no ROS installation on this host."""
 
 import threading
 import weakref
@@ -25,8 +25,8 @@ _Opened = TypeVar("_Opened", bound=Closes)
 class Ros2(Graph):
     """A `Graph` over the key space of rmw_zenoh.
 
-    The name of a sender comes from the gid in its message, which is the hash of its liveliness token; it is empty for
-    who has no token, or does not make its gid that way.
+    A sender's name comes from the gid in its message, which is the hash of its liveliness token. It is empty for a
+    sender that has no token, or makes its gid in another way.
     """
 
     def __init__(
@@ -36,16 +36,16 @@ class Ros2(Graph):
         node: str = "/trade",
         folders: Iterable[Path] = (),
     ) -> None:
-        """Does not wait for the router; see `healthy`.
+        """Returns without waiting for the router; see `healthy`.
 
         Args:
-            router: where ``rmw_zenohd`` listens, as zenoh writes endpoints.
+                router: where ``rmw_zenohd`` listens, as an endpoint of zenoh.
             domain_id: ``ROS_DOMAIN_ID`` of that system.
-            node: our name in it, absolute; nobody else may have it.
-            folders: of definitions of types, see `Types`.
+                node: the bridge's name in it, absolute and unique.
+                folders: folders of type definitions, see `Types`.
 
         Raises:
-            ConfigurationError: one of these is wrong.
+                ConfigurationError: one of these is invalid.
         """
         if domain_id < 0:
             raise ConfigurationError(where="ROS domain", problem=f"{domain_id} must be 0 or more, as ROS_DOMAIN_ID is")
@@ -66,21 +66,21 @@ class Ros2(Graph):
         return self._types
 
     def advertise(self, topic: str, type_name: str, *, latched: bool = False) -> Publisher:
-        """See `Graph`. Raises ConfigurationError: its name or type is none."""
+        """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Topic(self._node, topic, type_name, latched=latched))
 
     def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
-        """See `Graph`; latched: what was published before is told, too, if its publisher keeps it.
+        """See `Graph`; latched: also delivers earlier messages that the publisher keeps.
 
-        While a call of `heard` lasts, ten messages wait at most, and none longer than a second.
+        While a call of `heard` lasts, at most ten messages wait, each for at most a second.
 
         Raises:
-            ConfigurationError: its name or type is none.
+                ConfigurationError: its name or type is invalid.
         """
         return self._keep(TopicHeard(self._node, topic, type_name, heard, latched=latched))
 
     def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
-        """See `Graph`. Raises ConfigurationError: its name or type is none."""
+        """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Server(self._node, name, type_name, answering(answer), stops=stops))
 
     def call(
@@ -92,7 +92,7 @@ class Ros2(Graph):
         *,
         stops: bool = False,  # noqa: ARG002 - no call waits for another here
     ) -> Message:
-        """See `Graph`. Raises also ConfigurationError: the name or type is none, or the request does not fit."""
+        """See `Graph`. Raises also ConfigurationError: the name or type is invalid, or the request does not fit."""
         with self._lock:
             client = self._clients.get((name, type_name))
             if client is None:
@@ -100,20 +100,20 @@ class Ros2(Graph):
         return client.call(request, timeout_s)
 
     def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
-        """See `Graph`. Raises ConfigurationError: its name or type is none."""
+        """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Action(self._node, name, type_name, do))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
     ) -> Pursuit:
-        """See `Graph`; waits up to 5 s for the goal to be accepted. What has not ended at our end is canceled.
+        """See `Graph`; waits up to 5 s for the goal to be accepted. Goals that still run are canceled on closing.
 
-        A goal whose acceptance is not heard of may begin any time: it is told to end for some seconds, and has not
-        ended before; `Pursuit.wait` raises RosUnreachable then, and says whether it was canceled.
+        A goal without a known answer may begin at any time. It is canceled for some seconds and counts as running
+        meanwhile; `Pursuit.wait` then raises RosUnreachable, which says whether the goal was canceled.
 
         Raises:
-            RosUnreachable: nobody serves it: it was not sent.
-            ConfigurationError: the name or type is none, or the goal does not fit.
+                RosUnreachable: no node serves the action, so the goal was not sent.
+                ConfigurationError: the name or type is invalid, or the goal does not fit.
         """
         pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))
         pursuing.begin(goal)
@@ -124,11 +124,11 @@ class Ros2(Graph):
         return _parameters.all_of(self.call, node, timeout_s)
 
     def set_parameter(self, node: str, name: str, value: Any, timeout_s: float) -> None:
-        """See `Graph`. Raises also ConfigurationError: there are no parameters of that kind."""
+        """See `Graph`. Raises also ConfigurationError: ROS has no parameters of that kind."""
         _parameters.put(self.call, node, name, value, timeout_s)
 
     def watch_nodes(self, told: NodeTold) -> Closes:
-        """See `Graph`. Not told of is our own node; of nodes that freeze or are cut off, see `_presence`."""
+        """See `Graph`. The bridge's own node is not reported; for frozen or disconnected nodes see `_presence`."""
         return self._keep(self._node.presence.watch(told))
 
     @property
@@ -136,7 +136,7 @@ class Ros2(Graph):
         return self._link.problem
 
     def close(self) -> None:
-        """See `Graph`; goals of ours that go on are canceled."""
+        """See `Graph`; cancels goals of the bridge that still run."""
         with self._lock:
             opened, clients = list(self._opened), list(self._clients.values())
             self._clients.clear()

@@ -2,10 +2,10 @@
 """Services of ROS 2.
 
 Facts, from ros2/rmw_zenoh (``rmw_service_data.cpp``, ``rmw_client_data.cpp``): a service is a complete queryable at its
-key; the request is the query's payload, the response the reply's, both CDR, each with an attachment. ROS 2 has no way
-to say that a service failed: here it is an error reply of zenoh, which a client of ROS 2 logs, and goes on waiting.
+key; the request is the query's payload, the response the reply's, both CDR, each with an attachment. In ROS 2 a
+service cannot report a failure. Here it sends an error reply of zenoh; a client of ROS 2 logs it and keeps waiting.
 
-ROS 2 asks every server of a name and takes the first answer. Here one of them is asked: what they do is done once.
+ROS 2 asks every server of a name and takes the first answer. Here only one of them is asked, so a request runs once.
 """
 
 import contextlib
@@ -29,22 +29,22 @@ __all__ = ["Asked", "Client", "Server", "Unanswered", "answering"]
 
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
-"""S01: a request that waited longer for its turn is refused, not executed; who asked has given up."""
+"""S01: a request that waited longer is refused, not executed; its client has given up."""
 _MOST_STOPS: Final = 64
 """How many stops of one service are answered at a time; more wait, but none is refused for that (S07)."""
 _AFTER_S: Final = 5.0
-"""How much later than ours the deadline is that zenoh knows; only what ends by itself reaches that."""
+"""How much later zenoh's own deadline is than ours; only requests that expire by themselves reach it."""
 
 _log: Final = logging.getLogger("trade")
 
 
 class Asked:
-    """A request that came. It must be ended by one of its methods."""
+    """A received request. It must be ended by one of its methods."""
 
     def __init__(
         self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str, *, stops: bool = False
     ) -> None:
-        """stops: it waits for nothing, not even for the name of who asks."""
+        """stops: it waits for nothing, not even for the name of its client."""
         self._query = query
         self._endpoint = endpoint
         self._node = node
@@ -54,22 +54,22 @@ class Asked:
         self.came_at: Final = time.monotonic()
 
     def request(self) -> Message:
-        """What is asked. Raises ValueError: it is malformed."""
+        """The content of the request. Raises ValueError: it is malformed."""
         payload = self._query.payload
         return self._node.types.from_bytes(f"{self._type_name}_Request", b"" if payload is None else payload.to_bytes())
 
     def who(self) -> str:
-        """The node that asks, or empty. May wait shortly, unless it is a stop."""
+        """The client's node, or empty. May wait shortly, unless it is a stop."""
         return self._sender.name(waits=not self._stops)
 
     def answer(self, response: Mapping[str, Any]) -> None:
-        """Give the response. Raises ConfigurationError: it does not fit the type."""
+        """Sends the response. Raises ConfigurationError: it does not fit the type."""
         payload = self._node.types.to_bytes(f"{self._type_name}_Response", response)
         with contextlib.suppress(*CLOSED), self._query:
             self._query.reply(self._endpoint.key, payload, attachment=self._attachment(), express=True)
 
     def refuse(self, problem: str) -> None:
-        """Say that it failed."""
+        """Reports that the request failed."""
         with contextlib.suppress(*CLOSED), self._query:
             self._query.reply_err(problem.encode())
 
@@ -79,9 +79,9 @@ class Asked:
 
 
 class Server:
-    """A service of ours; each request is handled on its thread, one after another, and refused if it waits too long.
+    """A service server. Its thread handles the requests in turn, and refuses one that has waited too long.
 
-    One that is to stop something is handled at once, on a thread of its own, and never refused for its age.
+    A request of a service that stops something runs at once, on its own thread, and is never refused for its age.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Server:
         self._declared = node.link.declare(self._declare)
 
     def close(self) -> None:
-        """Serve no more. Idempotent."""
+        """Ends the service. Idempotent."""
         self._declared.close()
         self._mailbox.close()
 
@@ -112,12 +112,12 @@ class Server:
         self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name, stops=self._stops))
 
     def _late(self, asked: Asked) -> None:
-        asked.refuse("not executed: others were before it for too long, or the service has ended")
+        asked.refuse("not executed: it waited too long behind other requests, or the service has ended")
 
     def _try(self, asked: Asked) -> None:
         try:
             self._handle(asked)
-        except Exception as failed:  # noqa: BLE001 - told to the caller, whatever it is
+        except Exception as failed:  # noqa: BLE001 - reported to the caller, whatever it is
             _log.warning("%s failed: %s", self._endpoint.key, failed)
             asked.refuse(f"{type(failed).__name__}: {failed}")
 
@@ -128,15 +128,15 @@ def answering(answer: Answer) -> Callable[[Asked], object]:
 
 
 class Unanswered(NamedTuple):
-    """There was no response."""
+    """The absence of a response."""
 
     problem: str
     sent: bool
-    """It may have come to somebody, and be done."""
+    """Whether a node may have received the request, and executed it."""
 
 
 class Client:
-    """A service of theirs."""
+    """A client of a ROS service."""
 
     def __init__(self, node: Node, name: str, type_name: str) -> None:
         self._endpoint = node.service(Kind.CLIENT, name, type_name)
@@ -154,10 +154,10 @@ class Client:
         return answer
 
     def ask(self, request: Mapping[str, Any], timeout_s: float) -> Message | Unanswered:
-        """The same for who must know whether it was sent.
+        """The same for callers that must know whether the request was sent.
 
         Raises:
-            RosRefused: it failed.
+                RosRefused: the service failed.
             ConfigurationError: the request does not fit.
         """
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
@@ -175,18 +175,18 @@ class Client:
         finally:
             cancel()
         if reply is None:
-            nobody = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
+            missing = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
             cut_off = self._node.link.problem
-            return Unanswered(cut_off or nobody, sent=bool(cut_off) or was_there or self._is_there())
+            return Unanswered(cut_off or missing, sent=bool(cut_off) or was_there or self._is_there())
         return self._read(reply)
 
     def send(self, request: Mapping[str, Any], timeout_s: float) -> None:
-        """Call it without waiting for the response. Raises RosUnreachable: no router."""
+        """Calls it without waiting for the response. Raises RosUnreachable: no router."""
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
         self._ask(payload, timeout_s, lambda _: None, lambda: None)
 
     def close(self) -> None:
-        """Be seen as its client no more. Idempotent."""
+        """Withdraws the client. Idempotent."""
         self._declared.close()
 
     def _is_there(self) -> bool:
@@ -221,7 +221,7 @@ class Client:
         try:
             return self._node.types.from_bytes(f"{self._type_name}_Response", payload)
         except ValueError as malformed:
-            raise RosRefused(what=self.name, problem=f"answered what cannot be read: {malformed}") from None
+            raise RosRefused(what=self.name, problem=f"its answer cannot be read: {malformed}") from None
 
     def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
         return [session.liveliness().declare_token(self._endpoint.token)]

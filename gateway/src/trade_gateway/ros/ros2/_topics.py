@@ -2,8 +2,8 @@
 """Topics of ROS 2.
 
 Facts, from ros2/rmw_zenoh (``rmw_publisher_data.cpp``, ``rmw_subscription_data.cpp``): a message is a put of its CDR
-with an attachment. A publisher that is transient local is an advanced one of zenoh with a cache of its depth, that can
-be detected and tells of what it sent last; a subscription that is transient local asks such caches.
+with an attachment. A transient local publisher is an advanced one of zenoh with a cache of its depth. It can be
+detected and announces what it sent last; a transient local subscription queries such caches.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ __all__ = ["Topic", "TopicHeard"]
 
 _DEPTH: Final = 10
 _LATE_S: Final = 1.0
-"""S01, S04: a message that waited longer for its subscriber, who was busy, is not told: it may be a command."""
+"""S01, S04: a message that waited longer for a busy subscriber is dropped: it may be a command."""
 _HEARTBEAT_S: Final = 0.5
 
 _Came = tuple[zenoh.Sample, Sender]
@@ -35,7 +35,7 @@ _log: Final = logging.getLogger("trade")
 
 
 class Topic:
-    """One that is published."""
+    """A published topic."""
 
     def __init__(self, node: Node, topic: str, type_name: str, *, latched: bool) -> None:
         self._endpoint = node.topic(Kind.PUBLISHER, topic, type_name, LATCHED if latched else USUAL)
@@ -49,7 +49,7 @@ class Topic:
         self._declared = node.link.declare(self._declare)
 
     def send(self, message: Mapping[str, Any]) -> None:
-        """See `Publisher`. Without a router only what is latched is kept, and only the last."""
+        """See `Publisher`. Without a router only the last latched message is kept."""
         payload = self._types.to_bytes(self._type_name, message)
         with self._sending:
             if self._latched:
@@ -57,7 +57,7 @@ class Topic:
             self._put(payload)
 
     def close(self) -> None:
-        """Publish no more. Idempotent."""
+        """Stops publishing. Idempotent."""
         self._declared.close()
         with self._sending:
             self._publisher = None
@@ -94,7 +94,7 @@ class Topic:
 
 
 class TopicHeard:
-    """One that is subscribed to."""
+    """A topic subscription."""
 
     def __init__(self, node: Node, topic: str, type_name: str, heard: Heard, *, latched: bool) -> None:
         self._endpoint = node.topic(Kind.SUBSCRIPTION, topic, type_name, LATCHED if latched else USUAL)
@@ -107,7 +107,7 @@ class TopicHeard:
         self._declared = node.link.declare(self._declare)
 
     def close(self) -> None:
-        """Hear no more. Idempotent."""
+        """Ends the subscription. Idempotent."""
         self._declared.close()
         self._mailbox.close()
 
@@ -119,7 +119,7 @@ class TopicHeard:
         try:
             message = self._node.types.from_bytes(self._type_name, sample.payload.to_bytes())
         except ValueError as malformed:
-            _log.warning("%s is not told: %s", sample.key_expr, malformed)
+            _log.warning("a message on %s is dropped: %s", sample.key_expr, malformed)
             return
         self._heard(message, sender.name())
 

@@ -1,4 +1,4 @@
-"""The node: ``python3 -m _node FD MASTER NODE``, told what to open by the frames on a socket, until that closes."""
+"""The node: ``python3 -m _node FD MASTER NODE``. Frames on a socket control what it opens; it ends with the socket."""
 
 # pyright: basic, reportMissingImports=false
 
@@ -14,12 +14,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-# ROS as its makers ship it, where nobody has read its setup file
+# where ROS installs its packages, in case its setup file was not sourced
 sys.path.extend(sorted(str(path) for path in Path("/opt/ros").glob("*/lib/python3/dist-packages")))
 try:
     import rospy
 except ImportError as missing:
-    sys.exit(f"{sys.executable} has no rospy ({missing}): install python3-rospy, or name another Python")
+    sys.exit(f"{sys.executable} has no rospy ({missing}). Install python3-rospy, or configure another Python")
 
 import rosgraph.xmlrpc
 import rospy.core
@@ -37,7 +37,7 @@ from ._peers import Peers
 from ._registrar import Registrar
 
 _REPLY_S = 3600.0
-"""The longest a service of ours may take."""
+"""The longest time that a service of TRADE may take."""
 _END_S = 2.0
 
 
@@ -52,15 +52,13 @@ class Node:
         self._open: dict[int, Any] = {}
         self._classes: dict[tuple[str, str], Any] = {}
         self._replies: dict[int, tuple[threading.Event, list]] = {}
-        self._asked = int.from_bytes(
-            os.urandom(6), "little"
-        )  # a reply meant for the node before this one is for nobody
+        self._asked = int.from_bytes(os.urandom(6), "little")  # a reply for the previous node has no recipient
         self._lock = threading.Lock()
         self._peers = Peers(lambda name, there: channel.put({"op": "node", "name": name, "there": there}))
         self._registrar = Registrar(master, name, _started(master, name), self._peers, self._healthy)
 
     def heard(self, head: Head, body: bytes) -> None:
-        """Do what a frame asks for."""
+        """Executes a frame."""
         try:
             if "ask" in head and head["op"] != "reply":
                 threading.Thread(target=self._answer, args=(head, body), daemon=True).start()
@@ -95,7 +93,7 @@ class Node:
         def came(message: Any) -> None:
             header = message._connection_header  # one object for all messages of a connection
             if not latched and header.get("latching") == "1" and met not in header:
-                header[met] = "1"  # ROS does not say whether the first one is as old as its publisher
+                header[met] = "1"  # ROS does not say whether the first message is as old as its publisher
                 return
             told = {"op": "heard", "id": number, "who": header.get("callerid", ""), "at": time.monotonic()}
             self._channel.put(told, message._buff, key=str(number), most=most)
@@ -150,7 +148,7 @@ class Node:
             waiting[1].extend((head, body))
             waiting[0].set()
 
-    # --- what TRADE asks
+    # --- requests of TRADE
 
     def _answer(self, head: Head, body: bytes) -> None:
         told: Head = {"op": "answer", "ask": head["ask"], "failed": ""}
@@ -159,7 +157,7 @@ class Node:
             told["value"], answer = getattr(self, "_" + head["op"])(head, body)
         except Unreachable as error:
             told.update(failed="unreachable", problem=str(error))
-        except Exception as error:  # noqa: BLE001 - also what rospy raises: whoever asks must be told
+        except Exception as error:  # noqa: BLE001 - also what rospy raises: TRADE needs an answer
             told.update(failed="refused", problem=str(error) or repr(error))
         self._channel.put(told, answer)
 
@@ -185,7 +183,7 @@ class Node:
         named = "endpoint_id" if isinstance(opened, rospy.Publisher) else "callerid_pub"
         return sorted({getattr(connection, named) for connection in opened.impl.connections})
 
-    # --- classes that carry bytes
+    # --- classes for raw bytes
 
     def _class(self, wire: Head) -> Any:
         key = wire["type"], wire["md5"]
@@ -206,8 +204,8 @@ def _filled(kind: Any, body: bytes) -> Any:
 
 
 def _started(master: str, name: str) -> Any:
-    """rospy's servers, without its registering with the master, which waits for one and tells it once."""
-    # either would ask the master, and wait for it
+    """Starts rospy's servers without its registration at the master, which blocks, and registers only once."""
+    # both of these would query the master and wait for it
     rospy.impl.tcpros_base._use_tcp_keepalive = True
     rospy.impl.statistics.SubscriberStatisticsLogger.is_enabled = staticmethod(lambda: False)
     rospy.impl.tcpros.init_tcpros()
@@ -219,7 +217,7 @@ def _started(master: str, name: str) -> Any:
     deadline = time.monotonic() + 10
     while not (server.uri and handler._is_registered()):
         if time.monotonic() > deadline:
-            sys.exit("could not listen: is ROS_IP or ROS_HOSTNAME an address of this host?")
+            sys.exit("cannot listen. Is ROS_IP or ROS_HOSTNAME an address of this host?")
         time.sleep(0.005)
     handler.masterUri = master
     rospy.core.set_node_uri(server.uri)
@@ -229,8 +227,8 @@ def _started(master: str, name: str) -> Any:
 
 
 def main() -> None:
-    """Until the socket is closed, or the master has us shut down."""
-    for meant_for_trade in (signal.SIGINT, signal.SIGTERM):  # which has things to say yet, and ends us by the socket
+    """Runs until the socket is closed or the master requests a shutdown."""
+    for meant_for_trade in (signal.SIGINT, signal.SIGTERM):  # TRADE still sends frames, and ends us by the socket
         signal.signal(meant_for_trade, signal.SIG_IGN)
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(message).300s")
     number, master, name = sys.argv[1:]
@@ -241,7 +239,7 @@ def main() -> None:
     channel.read(node.heard)
     node.end()
     sys.stderr.flush()
-    os._exit(0)  # rospy leaves threads that nothing ends
+    os._exit(0)  # rospy leaves threads that cannot be ended
 
 
 if __name__ == "__main__":

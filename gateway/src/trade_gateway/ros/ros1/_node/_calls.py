@@ -1,4 +1,4 @@
-"""Calls of services of others, each with a deadline; rospy's own proxy waits for ever."""
+"""Service calls with a deadline each; rospy's own proxy waits without one."""
 
 # pyright: basic, reportMissingImports=false
 
@@ -23,7 +23,7 @@ __all__ = ["call"]
 
 class _Client(TCPROSServiceClient):
     def _read_service_error(self, sock: Any, b: Any) -> str:
-        """What went wrong, as text; rospy would print the bytes."""
+        """Returns the error as text; rospy would print the bytes."""
         while b.tell() < 5 or b.tell() < 5 + _size(b):
             recv_buff(sock, b, 4096)
         return b.getvalue()[5 : 5 + _size(b)].decode("utf-8", "replace")
@@ -34,17 +34,17 @@ def _size(read: Any) -> int:
 
 
 def call(master: str, node: str, name: str, service: Any, body: bytes, timeout_s: float) -> bytes:
-    """The bytes of the response.
+    """Returns the bytes of the response.
 
     Raises:
-        Unreachable: nobody offers it, or no answer came in time.
-        Refused: it failed, or is of another type.
+            Unreachable: no node offers the service, or no answer arrived in time.
+            Refused: it failed, or has another type.
     """
     deadline = time.monotonic() + timeout_s
     try:
         uri = ask(master, "lookupService", node, name, timeout_s=timeout_s)
     except Refused:
-        raise Unreachable("nobody offers it") from None
+        raise Unreachable("no node offers it") from None
     client = _Client(name, service)
     transport = TCPROSTransport(client, name)
     timer = threading.Timer(max(deadline - time.monotonic(), 0.0), _cut, (transport,))
@@ -77,7 +77,7 @@ def _exchange(transport: Any, uri: str, service: Any, body: bytes, timeout_s: fl
 
 
 def _cut(transport: Any) -> None:
-    """Wake the thread that waits on it."""
+    """Wakes the thread that waits on it."""
     sock = transport.socket
     if sock is not None:
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Frames between TRADE and its ROS 1 node: a head in JSON and raw bytes. Both Pythons read this, so it keeps to 3.8."""
+"""Frames between TRADE and its ROS 1 node: a JSON head and raw bytes. Both Pythons run this, so it needs Python 3.8."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ __all__ = ["Channel", "Head", "Heard"]
 
 Head = Dict[str, Any]
 Heard = Callable[[Head, bytes], object]
-"""Told of a frame."""
+"""Receives a frame."""
 
 _LENGTHS = struct.Struct("<II")
 _LARGEST = 256 << 20
-"""Bytes of a frame's body; above is no frame, but a stream that went wrong."""
+"""Greatest size of a frame's body in bytes; a greater one means a corrupt stream."""
 _log = logging.getLogger("trade.ros1")
 
 
 class Channel:
-    """One end of a stream socket. Nobody who puts waits: a thread writes; of what may be dropped, the newest stay."""
+    """One end of a stream socket. `put` never waits, as a thread writes; of droppable frames the newest are kept."""
 
     def __init__(self, sock: socket.socket, name: str) -> None:
         self._sock = sock
@@ -35,9 +35,9 @@ class Channel:
         threading.Thread(target=self._write, name=name + "-writer", daemon=True).start()
 
     def put(self, head: Head, body: bytes = b"", *, key: str = "", most: int = 0) -> None:
-        """Have a frame sent; of those with this key, this many wait at most (0: any number). Nothing after the end."""
+        """Queues a frame. At most `most` frames with this key wait (0: any number). After the end it does nothing."""
         if len(body) > _LARGEST:
-            _log.error("a message of %s bytes was left out: %s", len(body), head)
+            _log.error("a message of %s bytes was dropped: %s", len(body), head)
             return
         with self._ready:
             if self._closed:
@@ -51,7 +51,7 @@ class Channel:
             self._ready.notify()
 
     def read(self, heard: Heard) -> None:
-        """Read until the other end closes, this one does, or the socket's timeout passes."""
+        """Reads until either end closes or the socket's timeout passes."""
         try:
             while True:
                 head_size, body_size = _LENGTHS.unpack(self._exactly(_LENGTHS.size))

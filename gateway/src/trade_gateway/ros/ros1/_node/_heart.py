@@ -1,4 +1,4 @@
-"""The sign that this process lives, for TRADE, which ends and starts again one that stands still."""
+"""The heartbeat of this process. TRADE ends and restarts a process without one."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["Heart"]
 
 _EVERY_S = 0.5
 _STUCK_S = 60.0
-"""Every question to a master has a deadline; work that is not done again for so long never will be."""
+"""Every request to a master has a deadline; work that takes longer than this will never finish."""
 
 
 class Heart:
-    """Beats on a thread of its own, whatever others wait for, as long as the work goes on at all."""
+    """Sends heartbeats on its own thread, even while other threads wait, as long as the work makes progress."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -24,7 +24,7 @@ class Heart:
         self.thread.start()
 
     def worked(self) -> None:
-        """The work goes on."""
+        """Reports progress of the work."""
         self._worked_at = time.monotonic()
 
     def _beat(self) -> None:

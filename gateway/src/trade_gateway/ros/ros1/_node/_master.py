@@ -12,11 +12,11 @@ _UNREACHABLE = (OSError, http.client.HTTPException, xmlrpc.client.ProtocolError)
 
 
 class Unreachable(Exception):
-    """Nobody answered, or not in time."""
+    """No answer, or not in time."""
 
 
 class Refused(Exception):
-    """Somebody answered, and not with success."""
+    """An answer that is not a success."""
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -31,11 +31,11 @@ class _Transport(xmlrpc.client.Transport):
 
 
 def ask(uri: str, method: str, *arguments: Any, timeout_s: float = 2.0) -> Any:
-    """Call a method of a ROS API and unwrap its (code, text, value).
+    """Calls a method of a ROS API and unwraps its (code, text, value).
 
     Raises:
-        Unreachable: nobody answered within timeout_s.
-        Refused: it said no, with its text.
+            Unreachable: no answer within timeout_s.
+            Refused: the callee reported a failure, with its text.
     """
     transport = _Transport(max(timeout_s, 0.05))
     try:

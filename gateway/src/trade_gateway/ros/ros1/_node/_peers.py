@@ -1,6 +1,6 @@
-"""Which nodes are there: a connection to the slave API of each is held open, and its end is the sign.
+"""Detects which nodes are alive by an open connection to the slave API of each; its end means the node's end.
 
-A process that is killed closes its sockets at once; of a host that is cut off, keepalive probes tell within 3 s.
+A killed process closes its sockets at once; keepalive probes detect a disconnected host within 3 s.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ __all__ = ["Peers"]
 
 _CONNECT_S = 1.0
 _AGAIN_S = 2.0
-"""Between attempts at an address where nobody answered."""
+"""Pause between attempts at an address without an answer."""
 _SHORT_S = 1.0
-"""A connection that ends sooner is not tried again at once."""
+"""A connection that ends sooner is not retried at once."""
 _LOOK_S = 0.5
 _PROBES = (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 2), ("TCP_USER_TIMEOUT", 3000))
 
@@ -34,10 +34,10 @@ class _Held:
 
 
 class Peers:
-    """Nodes by name; `told` is called with a name and whether it is there, each change once."""
+    """Nodes by name; reports each change once to a callback, with the name and whether the node is present."""
 
     def __init__(self, told: Callable[[str, bool], object]) -> None:
-        self._told = told
+        self._changed = told
         self._lock = threading.Lock()
         self._held: dict[str, _Held] = {}
         self._there: set[str] = set()
@@ -48,18 +48,18 @@ class Peers:
         threading.Thread(target=self._look, name="peers", daemon=True).start()
 
     def uri(self, name: str) -> str | None:
-        """Where a node is that is there."""
+        """The address of a present node."""
         with self._lock:
             held = self._held.get(name)
             return held.uri if held else None
 
     def seeks(self, name: str) -> bool:
-        """Whether it is worth looking up where this node is."""
+        """Whether this node's address should be looked up."""
         with self._lock:
             return name not in self._held and name not in self._trying
 
     def at(self, name: str, uri: str) -> None:
-        """A node is said to be at this address."""
+        """Adds a node's address, as the master gave it."""
         with self._lock:
             failed, when = self._failed.get(name, ("", 0.0))
             if name in self._held or name in self._trying:
@@ -70,7 +70,7 @@ class Peers:
         self._pool.submit(self._try, name, uri)
 
     def only(self, names: set[str]) -> None:
-        """Forget failures of nodes that nobody speaks of any more."""
+        """Forgets failures of nodes that the master no longer lists."""
         with self._lock:
             for name in set(self._failed) - names:
                 del self._failed[name]
@@ -84,7 +84,7 @@ class Peers:
         self._tried(name, uri, sock)
 
     def _try_again(self, held: _Held, wait_s: float) -> None:
-        """Where it was: no name is looked up."""
+        """Retries the last address, without a name lookup."""
         time.sleep(wait_s)
         self._tried(held.name, held.uri, _connected(held.address))
 
@@ -101,11 +101,11 @@ class Peers:
     def _tell(self, name: str, there: bool) -> None:
         if there != (name in self._there):
             (self._there.add if there else self._there.discard)(name)
-            self._told(name, there)
+            self._changed(name, there)
 
     def _look(self) -> None:
         while True:
-            # what is registered meanwhile is seen by the call that is under way (epoll), the timeout is for the others
+            # epoll sees a new registration during the call; the timeout is for the other systems
             for key, _ in self._selector.select(_LOOK_S) if self._selector.get_map() else ():
                 if _ended(key.data.sock):
                     self._lost(key.data)
@@ -118,18 +118,18 @@ class Peers:
             held.sock.close()
             del self._held[held.name]
             self._trying.add(held.name)
-        # a server may close what is idle; a process that is gone refuses at once
+        # a server may close idle connections; an ended process refuses a new one at once
         wait_s = 0.3 if time.monotonic() - held.since < _SHORT_S else 0.0
-        # not in the pool, where addresses wait at which nobody may answer: a death is told at once
+        # not in the pool, whose threads may wait for silent addresses: a death must be reported at once
         again = threading.Thread(target=self._try_again, args=(held, wait_s), name="peers-lost", daemon=True)
         try:
             again.start()
-        except RuntimeError:  # there can be no more threads
+        except RuntimeError:  # the thread limit is reached
             self._try_again(held, wait_s)
 
 
 def _address(sock: socket.socket, uri: str) -> tuple[str, int]:
-    """Where the other end is, as a number."""
+    """The address of the other end as a number."""
     try:
         host, port = sock.getpeername()[:2]
     except OSError:  # it has ended already

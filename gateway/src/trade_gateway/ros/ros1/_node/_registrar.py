@@ -1,6 +1,6 @@
-"""What is open in this node, and what the master knows of it, made the same over and over; rospy tells a master once.
+"""Reconciles the node's open topics and services with the master, periodically; rospy registers them only once.
 
-So nothing waits for a master that is away, and one that was started anew is told everything again.
+Nothing waits for an unreachable master, and a restarted master receives all registrations again.
 """
 
 # pyright: basic, reportMissingImports=false
@@ -31,7 +31,7 @@ Entry = Tuple[str, str]
 
 
 class Registrar:
-    """Keeps the master told, and learns from it which nodes there are."""
+    """Keeps the registrations at the master, and learns from it which nodes exist."""
 
     def __init__(self, master: str, node: str, handler: Any, peers: Peers, healthy: Callable[[str], object]) -> None:
         self._master = master
@@ -47,11 +47,11 @@ class Registrar:
         threading.Thread(target=self._run, name="registrar", daemon=True).start()
 
     def wake(self) -> None:
-        """Something was opened or closed."""
+        """Reports that something was opened or closed."""
         self._wake.set()
 
     def end(self, timeout_s: float) -> None:
-        """Take everything back from the master."""
+        """Withdraws all registrations from the master."""
         deadline = time.monotonic() + timeout_s
         self._ended = True
         if not self._turn.acquire(timeout=timeout_s):
@@ -89,7 +89,7 @@ class Registrar:
         return ""
 
     def _other(self) -> str:
-        """Where another node of our name is."""
+        """The address of another node with this name."""
         if self._ended:
             return ""
         try:
@@ -105,7 +105,7 @@ class Registrar:
             if self._done.get(entry) is opened and entry in listed:
                 continue
             if self._done.pop(entry, opened) is not opened:
-                self._unregister(entry)  # closed and opened meanwhile: who was connected must be told to connect again
+                self._unregister(entry)  # reopened meanwhile: its peers must be notified so that they reconnect
             kind, name = entry
             told = ask(self._master, _REGISTER[kind], self._node, name, what, self._handler.uri)
             self._done[entry] = opened
@@ -117,7 +117,7 @@ class Registrar:
 
     def _unregister(self, entry: Entry) -> None:
         kind, name = entry
-        # a service is unregistered by its address, which is that of all our services
+        # a service is unregistered by its address, which all services of this node share
         uri = ROSRPC + "{}:{}".format(*get_tcpros_server_address()) if kind == "service" else self._handler.uri
         ask(self._master, _UNREGISTER[kind], self._node, name, uri)
 
@@ -130,7 +130,7 @@ class Registrar:
         self._peers.only(names)
 
     def _connect(self, publishers: list[Any]) -> None:
-        """Connect anew where a connection broke and both ends live on: rospy waits for a change at the master."""
+        """Reconnects a broken connection whose ends are both alive: rospy waits for a change at the master."""
         now = time.monotonic()
         self._asked = {key: when for key, when in self._asked.items() if now - when < _CONNECT_AGAIN_S}
         for topic, names in publishers:
@@ -143,7 +143,7 @@ class Registrar:
 
 
 def _open() -> dict[Entry, tuple[str, Any]]:
-    """What this node has open: its type (of a service: its address), and the very thing."""
+    """What this node has open: its type (for a service its address) and its object."""
     topics, services = get_topic_manager(), get_service_manager()
     with topics.lock:
         found = {("topic", name): (made.type, made) for name, made in topics.pubs.items()}
