@@ -1,4 +1,4 @@
-"""``trade conformance``: a container in whatever language is started, and seen from outside to keep the rules."""
+"""``trade conformance``: starts a container in any language and checks from outside that it follows the rules."""
 
 from trade_gateway.conformance._check import Check
 from trade_gateway.conformance._run import CHECKS, FAILED, LEFT_OUT, OK, Outcome, run

@@ -1,4 +1,4 @@
-"""What a check says: that a rule is not held, or that something does not happen in time."""
+"""Assertions of the checks: that a rule is followed, or that something happens in time."""
 
 import threading
 import time
@@ -6,26 +6,26 @@ from collections.abc import Callable
 from typing import Final
 
 PATIENCE_S: Final = 10.0
-"""How long anything may take that has no limit of its own."""
+"""Time limit of everything that has no limit of its own, in seconds."""
 STOPPED_S: Final = 2.0
-"""What moves comes to rest within this (S05)."""
+"""Time in which a moving arm must come to rest (S05), in seconds."""
 SLACK_S: Final = 3.0
-"""What the suite allows itself, on a busy machine, for saying so and seeing it."""
+"""Extra time for the suite's own messages on a busy machine, in seconds."""
 _LOOK_S: Final = 0.02
 
 
 class NotHeld(Exception):
-    """The container under test does not do what the page says."""
+    """The container under test breaks a rule of the page."""
 
 
 def require(holds: object, otherwise: str) -> None:
-    """Raises NotHeld unless it holds."""
+    """Raises NotHeld if the condition is false."""
     if not holds:
         raise NotHeld(otherwise)
 
 
 def eventually(holds: Callable[[], object], otherwise: str, within_s: float = PATIENCE_S) -> None:
-    """Look until it holds; raises NotHeld if it does not within that time, in seconds."""
+    """Polls until the condition is true; raises NotHeld if it stays false for that time, in seconds."""
     until = time.monotonic() + within_s
     while not holds():
         require(time.monotonic() < until, f"{otherwise} within {within_s:g} s")

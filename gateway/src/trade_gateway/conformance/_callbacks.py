@@ -1,4 +1,4 @@
-"""Checks of the other direction: it calls a service of ours, under a lock of ours, and passes on for whom."""
+"""Checks of the container as a caller: of a service of the suite, under its lock, and on behalf of others."""
 
 import threading
 from collections.abc import Generator
@@ -20,7 +20,7 @@ _SHORT_S = 2.0
 
 
 class Run(NamedTuple):
-    """How our service was called."""
+    """How the suite's service was called."""
 
     depth_mm: float
     caller: str
@@ -33,7 +33,7 @@ class Run(NamedTuple):
 
 
 class Lathe:
-    """What the container under test is to call; it notes how."""
+    """The provider that the container under test calls; it records the calls."""
 
     def __init__(self) -> None:
         self.resources = [Resource("judge.lathe")]
@@ -43,18 +43,18 @@ class Lathe:
 
     @service
     def cut(self, depth_mm: float) -> str:
-        """Cut so deep."""
+        """Cuts to a depth."""
         call = current_call()
         if call is not None:
             calls = () if call.behalf is None else call.behalf.calls
-            told = (call.session, call.sessions, calls, call.chain, call.remaining_s)
-            self.runs.append(Run(depth_mm, call.caller, *told, locked=self.resources[0].live != 0))
+            what = (call.session, call.sessions, calls, call.chain, call.remaining_s)
+            self.runs.append(Run(depth_mm, call.caller, *what, locked=self.resources[0].live != 0))
         self.go_on.wait(5.0)
         return f"{depth_mm:g} mm"
 
     @service
     def jam(self) -> None:
-        """Always fail."""
+        """Always fails."""
         raise errors.DeviceSilent(device="judge.lathe", bus="jammed", waited_s=1.0)
 
     @service(effect="stop")
@@ -83,18 +83,18 @@ def _relay(stage: Stage, who: Voice, name: str, resources: list[str], args: list
 
 @check("calls", "Expiry", still=True)
 def calls(stage: Stage) -> None:
-    """It calls a service of ours, with the right arguments, an expiry no later than its own, and for whom it does."""
+    """It calls the suite's service with the right arguments, an expiry no later than its own, and its callers."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         call_id = _relay(stage, anna, "cut", [], [2.5])
         reply = anna.answer(call_id)
         require(reply.status == Status.OK, f"relay was answered with status {reply.status}: {_why(reply)}")
-        require(msgspec.msgpack.decode(reply.body) == "2.5 mm", "relay did not answer what our service did")
-        require(len(lathe.runs) == 1, f"our service ran {len(lathe.runs)} times")
+        require(msgspec.msgpack.decode(reply.body) == "2.5 mm", "relay did not return what the suite's service did")
+        require(len(lathe.runs) == 1, f"the suite's service ran {len(lathe.runs)} times")
         run = lathe.runs[0]
-        require(run.depth_mm == 2.5, f"our service was called with {run.depth_mm}")
-        require(run.caller == "peer", f"our service was called by {run.caller}")
+        require(run.depth_mm == 2.5, f"the suite's service was called with {run.depth_mm}")
+        require(run.caller == "peer", f"the suite's service was called by {run.caller}")
         require(run.session.startswith("peer/peer/"), f"it called in the session {run.session}")
-        require(anna.session in run.sessions, "its call does not say on whose behalf it is made")
+        require(anna.session in run.sessions, "its call does not name the session on whose behalf it is made")
         require(call_id in run.calls, "its call does not name the one that led to it")
         require(run.chain[-1:] and run.chain[-1].endswith("relay"), f"the chain of its call is {run.chain}")
         require(
@@ -104,65 +104,65 @@ def calls(stage: Stage) -> None:
 
 @check("calls-no-longer", "Expiry", still=True)
 def calls_no_longer(stage: Stage) -> None:
-    """What it calls expires no later than the call that led to it, however early or late that is."""
+    """Its call expires no later than the call that led to it, whether that expiry is early or late."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         for expires_ns in (anna.expiry_ns(_SHORT_S), 2**63 - 1):
             reply = anna.answer(_relay(stage, anna, "cut", [], [1.0], expires_ns=expires_ns))
             require(reply.status == Status.OK, f"relay was answered with status {reply.status}: {_why(reply)}")
         early, late = (run.remaining_s for run in lathe.runs)
-        require(early is not None and early < _SHORT_S, f"of {_SHORT_S:g} s, {early} s are left to what it called")
-        require(late is not None and late > _SHORT_S, f"of all the time there is, {late} s are left to what it called")
+        require(early is not None and early < _SHORT_S, f"of {_SHORT_S:g} s, {early} s remain for what it called")
+        require(late is not None and late > _SHORT_S, f"of a later expiry, {late} s remain for what it called")
 
 
 @check("passes-errors", "Messages", still=True)
 def passes_errors(stage: Stage) -> None:
-    """An error of a service it calls comes to its own caller."""
+    """An error of a service that it calls reaches its own caller."""
     with stage.voice() as anna, _lathe(stage):
         found = error_of(anna.answer(_relay(stage, anna, "jam", [], [])))
-        require("jammed" in str(found), f"the error of our service came as {found!r}")
+        require("jammed" in str(found), f"the error of the suite's service arrived as {found!r}")
 
 
 @check("locks-ours", "S11", still=True)
 def locks_ours(stage: Stage) -> None:
-    """It takes a lock on what we offer, calls under it, and gives it back."""
+    """It takes a lock on the suite's resources, calls under it, and releases it."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         reply = anna.answer(_relay(stage, anna, "cut", ["judge.lathe"], [1.0]))
         require(reply.status == Status.OK, f"relay under a lock was answered with status {reply.status}: {_why(reply)}")
-        require(lathe.runs[0].locked, "our service ran without the lock")
-        eventually(lambda: lathe.resources[0].live == 0, "it did not give the lock back")
+        require(lathe.runs[0].locked, "the suite's service ran without the lock")
+        eventually(lambda: lathe.resources[0].live == 0, "it did not release the lock")
 
 
 @check("renews", "S12", still=True)
 def renews(stage: Stage) -> None:
-    """A lock of ours is renewed for as long as it is used."""
+    """It renews a lock for as long as it uses it."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         lathe.go_on.clear()
         call_id = _relay(stage, anna, "cut", ["judge.lathe"], [1.0])
-        eventually(lambda: lathe.runs, "our service was not called")
+        eventually(lambda: lathe.runs, "the suite's service was not called")
         threading.Event().wait(2.6)  # longer than the lease of 2 s
         require(lathe.resources[0].live != 0, "the lock was not renewed within its lease of 2 s")
         lathe.go_on.set()
         require(anna.answer(call_id).status == Status.OK, "the call under the lock failed")
-        eventually(lambda: lathe.resources[0].live == 0, "it did not give the lock back")
+        eventually(lambda: lathe.resources[0].live == 0, "it did not release the lock")
 
 
 @check("is-refused", "S11", still=True)
 def is_refused(stage: Stage) -> None:
-    """While somebody else has the lock it is refused, and says so to its caller."""
+    """While another client has the lock, it is refused and reports that to its caller."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         with stage.container.lock(where(group="judge.lathe"), purpose="a check"):
             for resources in ([], ["judge.lathe"]):
                 found = error_of(anna.answer(_relay(stage, anna, "cut", resources, [1.0])))
-                require(isinstance(found, errors.LockedByOther), f"without our lock it was refused with {found!r}")
-        require(not lathe.runs, "our service ran without the lock")
+                require(isinstance(found, errors.LockedByOther), f"without the lock it was refused with {found!r}")
+        require(not lathe.runs, "the suite's service ran without the lock")
 
 
 @check("streams", "Streams", needs="listen")
 def streams(stage: Stage) -> None:
-    """A reading service is put on the key of its stream while somebody listens."""
+    """It publishes the samples of a reading service while there is a subscriber."""
     handle = stage.container.find(where(name="angle", group="peer"), wait_s=10.0)
     with stage.voice() as anna, stage.container.stream(handle, hz=20) as stream:
-        require(stream.next(5.0).value == stage.angle(anna), "a sample of the angle is another one")
+        require(stream.next(5.0).value == stage.angle(anna), "a sample differs from angle()")
 
 
 def _why(reply: Any) -> str:

@@ -1,4 +1,4 @@
-"""Checks of calls: what is answered, what is not run, and that nothing runs twice."""
+"""Checks of calls: their answers, which calls must not run, and that none runs twice."""
 
 import math
 import signal
@@ -17,7 +17,7 @@ _LATEST_NS: Final = 2**63 - 1
 
 @check("answers", "Messages", still=True)
 def answers(stage: Stage) -> None:
-    """echo answers with what it was given, of every kind, by place and by name."""
+    """echo returns its argument, of every type, positional or named."""
     values: list[Any] = [None, True, -1, 2**63 - 1, -(2**63), 0.25, "häß", b"\x00\xff", [1, [2]], {"a": {"b": []}}]
     with stage.voice() as anna:
         for value in [*values, "x" * 70_000]:
@@ -29,7 +29,7 @@ def answers(stage: Stage) -> None:
 
 @check("refuses-arguments", "Messages")
 def refuses_arguments(stage: Stage) -> None:
-    """Arguments that do not fit, or are beyond a limit, are refused with an error of ours, and nothing runs."""
+    """Arguments that do not fit or exceed a limit are refused with a TRADE error, and the call does not run."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
@@ -46,13 +46,13 @@ def refuses_arguments(stage: Stage) -> None:
 
 @check("knows-not", "Messages")
 def knows_not(stage: Stage) -> None:
-    """An unknown service or provider is answered with status 4; so is a stop on a call's key and a call on a stop's."""
+    """An unknown service or provider is answered with status 4, as is a stop on a call's key, and the reverse."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
         wrong: list[tuple[tuple[str, str], str, tuple[Any, ...], bool]] = [
             (arm, "fly", (), False),
-            ((arm[0], "nobody"), "echo", (1,), False),
+            ((arm[0], "nobody"), "echo", (1,), False),  # plain: nobody
             (("elsewhere", arm[1]), "echo", (1,), False),
             (arm, "halt", (), False),
             (arm, "turn", (0.1,), True),
@@ -67,14 +67,14 @@ def knows_not(stage: Stage) -> None:
 
 @check("late-is-never", "S01")
 def late_is_never(stage: Stage) -> None:
-    """A command whose expiry has passed, or that has none, is answered with status 3 and never runs."""
+    """A command without an expiry, or after it, is answered with status 3 and never runs."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
         for expires_ns in (anna.expiry_ns(-0.001), anna.expiry_ns(-3600.0), 0, NEVER):
             reply = anna.ask(arm, "turn", 0.1, expires_ns=expires_ns)
             require(reply.status == Status.EXPIRED, f"a late turn was answered with status {reply.status}, not 3")
-        require(stage.turns(anna) == began, "a turn that came too late began")
+        require(stage.turns(anna) == began, "a turn began after its expiry")
         reply = anna.ask(SYSTEM, "acquire", ["peer.arm"], {}, expires_ns=NEVER)
         require(reply.status == Status.EXPIRED, f"a late acquire was answered with status {reply.status}, not 3")
         require(anna.ask(arm, "echo", 1, expires_ns=NEVER).status == Status.OK, "echo without an expiry did not run")
@@ -82,7 +82,7 @@ def late_is_never(stage: Stage) -> None:
 
 @check("late-when-frozen", "S01")
 def late_when_frozen(stage: Stage) -> None:
-    """A command that came in time to a process that stood still, and has expired when it goes on, never runs."""
+    """A command that expires while the process is frozen never runs when the process continues."""
     peer, arm = stage.peer, stage.peer.arm
     with stage.voice() as anna:
         began, expires_ns = stage.turns(anna), anna.expiry_ns(0.5)
@@ -98,7 +98,7 @@ def late_when_frozen(stage: Stage) -> None:
 
 @check("once", "S02")
 def once(stage: Stage) -> None:
-    """The same actuating call again, while it runs or later, gets the same answer and does not run again."""
+    """A repeated actuating call, while the first runs or later, gets the same answer and does not run again."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began, expires_ns = stage.turns(anna), anna.expiry_ns()
@@ -116,7 +116,7 @@ def once(stage: Stage) -> None:
 
 @check("once-for-ever", "S02")
 def once_for_ever(stage: Stage) -> None:
-    """A call with the latest expiry that there can be is answered, does not run again, and harms nobody."""
+    """A call with the latest possible expiry is answered, does not run again, and does no harm."""
     peer, arm = stage.peer, stage.peer.arm
     with stage.voice() as anna:
         began, here_rad, call_id = stage.turns(anna), stage.angle(anna), anna.new_id()
@@ -124,7 +124,7 @@ def once_for_ever(stage: Stage) -> None:
             anna.call(arm, "turn", here_rad, call_id=call_id, expires_ns=_LATEST_NS)
             sent = f"a call that never expires, sent {times} times, was not answered each time"
             eventually(lambda times=times: len(anna.answers(call_id)) >= times, sent)
-            require(peer.alive, f"a call that never expires killed it: {stage.last_words()}")
+            require(peer.alive, f"a call that never expires ended its process: {stage.last_words()}")
         statuses = [reply.status for reply in anna.answers(call_id)]
         require(statuses == [Status.OK] * 2, f"a call that never expires was answered with status {statuses}")
         require(stage.turns(anna) == began + 1, f"one call that never expires began {stage.turns(anna) - began} turns")
@@ -132,18 +132,18 @@ def once_for_ever(stage: Stage) -> None:
 
 @check("once-for-each", "S02")
 def once_for_each(stage: Stage) -> None:
-    """Calls of the same id by two callers are two calls."""
+    """Calls with the same id by two callers are two calls."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         began, call_id = stage.turns(anna), anna.new_id()
         here_rad = stage.angle(anna)
         for who in (anna, bob):
             who.result(stage.peer.arm, "turn", here_rad, call_id=call_id)
-        require(stage.turns(anna) == began + 2, "a call of one caller was taken for that of another")
+        require(stage.turns(anna) == began + 2, "a call of one caller was mistaken for that of another")
 
 
 @check("cancels", "Once")
 def cancels(stage: Stage) -> None:
-    """A cancelled turn ends with an error and rests; one cancelled before it came never begins."""
+    """A cancelled turn ends with an error and the arm rests; one cancelled before its arrival never begins."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         running = stage.begin_turn(anna)
@@ -154,8 +154,8 @@ def cancels(stage: Stage) -> None:
         began, unborn = stage.turns(anna), anna.new_id()
         require(anna.cancel(unborn, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
         found = error_of(anna.ask(arm, "turn", 0.1, call_id=unborn))
-        require(isinstance(found, errors.Cancelled), f"a call that was cancelled before it came ended with {found!r}")
-        require(stage.turns(anna) == began, "a turn that was cancelled before it came began")
+        require(isinstance(found, errors.Cancelled), f"a call cancelled before its arrival ended with {found!r}")
+        require(stage.turns(anna) == began, "a turn cancelled before its arrival began")
 
 
 @check("cancels-own-only", "Once")
@@ -171,7 +171,7 @@ def cancels_own_only(stage: Stage) -> None:
 
 @check("versions", "Versions")
 def versions(stage: Stage) -> None:
-    """A call of another version is dropped without an answer; one with more fields than are known is taken."""
+    """A call of another version is dropped without an answer; one with additional fields is accepted."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
@@ -183,7 +183,7 @@ def versions(stage: Stage) -> None:
 
 @check("forged", "Keys")
 def forged(stage: Stage) -> None:
-    """A call in the name of another's session, or to a pattern of keys, does not run."""
+    """A call that names another client's session, or that is sent to a key pattern, does not run."""
     peer, arm = stage.peer, stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         began = stage.turns(anna)

@@ -1,4 +1,4 @@
-"""One check: what is asked of a container, where that is said, and how it is found out."""
+"""The description of one check: its rule, the source of that rule, and its function."""
 
 from collections.abc import Callable
 
@@ -8,21 +8,21 @@ from trade_gateway.conformance._environment import Stage
 
 
 class Check(Struct, frozen=True):
-    """A rule and how to see whether it is held."""
+    """A rule and the function that checks it."""
 
     name: str
     what: str
     rule: str
-    """Of the safety rules (docs/safety.md), or the section of the wire protocol's page."""
+    """A safety rule (docs/safety.md), or a section of the wire protocol's page."""
     does: Callable[[Stage], None]
     still: bool = False
-    """Whether it asks nothing of what moves; the others turn the arm, or fail where there is none."""
+    """Whether the check needs no motion; the others turn the arm, and fail without one."""
     needs: str = ""
-    """A function of the container's own provider, without which the check is left out."""
+    """A function of the container's own provider, without which the check is skipped."""
 
 
 def check(name: str, rule: str, *, still: bool = False, needs: str = "") -> Callable[[Callable[[Stage], None]], Check]:
-    """Make a check of a function; what it asks is the first line of its docstring."""
+    """Turns a function into a check; the first line of its docstring is the requirement."""
 
     def make(does: Callable[[Stage], None]) -> Check:
         what = (does.__doc__ or "").strip().splitlines()[0].rstrip(".")

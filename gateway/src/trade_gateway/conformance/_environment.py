@@ -1,4 +1,4 @@
-"""A system of its own, on this host only, and in it the container under test: started, ended, killed, started anew."""
+"""The environment of the checks: a system on this host only, and control over the container under test in it."""
 
 import contextlib
 import os
@@ -37,7 +37,7 @@ _LAST_LINES: Final = 12
 
 
 class Stage:
-    """Everything a check needs. A context manager: nothing of it is left behind."""
+    """Everything that a check needs. A context manager that leaves nothing behind."""
 
     def __init__(self, command: str, folder: Path, *, motion: bool) -> None:
         try:
@@ -45,14 +45,14 @@ class Stage:
         except ValueError as bad:
             raise ConfigurationError(where="--peer", problem=f"cannot be read as words: {bad}") from None
         if not self._command:
-            raise ConfigurationError(where="--peer", problem="names no program; write the command that starts it")
+            raise ConfigurationError(where="--peer", problem="names no program. Give the command that starts it")
         if shutil.which(self._command[0]) is None:
             raise ConfigurationError(
                 where="--peer", problem=f"cannot be started: there is no program {self._command[0]!r}"
             )
         self._folder = folder
         self.motion: Final = motion
-        """Whether the arm may be turned."""
+        """Whether checks may turn the arm."""
         self._system = f"conformance-{secrets.token_hex(4)}"
         self._credentials = ("conformance", secrets.token_hex(16))
         self._ending = contextlib.ExitStack()
@@ -60,7 +60,7 @@ class Stage:
         self._states = 0
         self._peer: Peer | None = None
         self.container: Container
-        """One of ours, of this project: what it offers the container under test calls."""
+        """The suite's own container, which offers what the container under test calls."""
 
     def __enter__(self) -> "Stage":
         with contextlib.ExitStack() as ending:
@@ -93,14 +93,14 @@ class Stage:
 
     @property
     def peer(self) -> Peer:
-        """The one that runs; started if none does."""
+        """The running container under test; starts it if necessary."""
         if self._peer is None or not self._peer.alive:
             self.dismiss()
             self._peer = self.start()
         return self._peer
 
     def environment(self) -> dict[str, str]:
-        """What it is started with, as docs/wire-protocol.md says."""
+        """The environment variables of the container under test, from docs/wire-protocol.md."""
         return {
             "TRADE_SYSTEM": self._system,
             "TRADE_IDENTITY": IDENTITY,
@@ -111,13 +111,13 @@ class Stage:
         }
 
     def start(self, *, forgetful: bool = False) -> Peer:
-        """Start it, and wait for its sign of life.
+        """Starts the container under test, and waits for its sign of life.
 
         Args:
-            forgetful: it has a new folder for what outlives it.
+                forgetful: whether it gets a new folder for its persistent state.
 
         Raises:
-            NotHeld: it ends, or is not seen.
+                NotHeld: it ends, or does not appear.
             ConfigurationError: there is no such program.
         """
         self._states += forgetful
@@ -125,13 +125,13 @@ class Stage:
         log = self._folder / "peer.log"
         try:
             with log.open("ab") as said:
-                process = subprocess.Popen(  # noqa: S603 - it is what one wants tested
+                process = subprocess.Popen(  # noqa: S603 - the container under test, as configured
                     self._command,
                     stdin=subprocess.DEVNULL,
                     stdout=said,
                     stderr=subprocess.STDOUT,
                     env={**_without_ours(os.environ), **self.environment()},
-                    start_new_session=True,  # what is started may be a shell, or start others: all of it is ended
+                    start_new_session=True,  # it may be a shell, or start other processes: all of them are ended
                 )
         except OSError as bad:
             raise ConfigurationError(where="--peer", problem=f"cannot be started: {bad}") from None
@@ -141,11 +141,11 @@ class Stage:
             return bool(set(self.boots()) - known)
 
         try:
-            eventually(seen, f"no sign of life of alive/{IDENTITY}/{NAME}/... is seen", _START_S)
+            eventually(seen, f"there is no sign of life on alive/{IDENTITY}/{NAME}/...", _START_S)
             rose = set(self.boots()) - known
-            require(len(rose) == 1, f"{len(rose)} signs of life rose: {', '.join(map(str, rose))}")
+            require(len(rose) == 1, f"{len(rose)} signs of life appeared: {', '.join(map(str, rose))}")
             [address] = rose
-            eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer what it offers")
+            eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer the registry query")
         except BaseException:
             end_group(process)
             raise
@@ -153,35 +153,35 @@ class Stage:
         return self._peer
 
     def kill(self) -> Peer:
-        """End the one that runs without any warning; returns it."""
+        """Kills the container under test; returns it."""
         was = self.peer
         was.signal(signal.SIGKILL)
         was.process.wait()
-        eventually(lambda: not self.seen(was.address), "its sign of life stands after its end")
+        eventually(lambda: not self.seen(was.address), "its sign of life remains after its end")
         self._peer = None
         return was
 
     def dismiss(self) -> None:
-        """Ask the one that runs to end, and see to it that it does. Idempotent."""
+        """Ends the container under test, by force if necessary. Idempotent."""
         was, self._peer = self._peer, None
         if was is not None:
             end_group(was.process)
 
     def last_words(self) -> str:
-        """What it said last, for people."""
+        """Its last lines of output, for people."""
         log = self._folder / "peer.log"
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         return " | ".join(lines[-_LAST_LINES:]) or "it said nothing"
 
-    # --- looking
+    # --- observation
 
     def boots(self) -> list[Address]:
-        """The boots of it whose sign of life stands."""
+        """The boots of the container under test that have a sign of life."""
         found = [sign.split("/")[1:] for sign in set(self._signs)]
         return [Address(*chunks) for chunks in found if chunks[:2] == [IDENTITY, NAME] and _is_boot(chunks)]
 
     def seen(self, address: Address) -> bool:
-        """Whether a container's sign of life stands."""
+        """Whether a container has a sign of life."""
         return f"alive/{address}" in self._signs
 
     def _watch(self, signs: Any) -> None:
@@ -194,12 +194,12 @@ class Stage:
             self._signs = known - {message.key} if message.payload is None else known | {message.key}
 
     def ask(self, pattern: str) -> list[Answer]:
-        """What is answered to the question what stands."""
+        """Returns the answers to a registry query."""
         return [answer for answer in self._transport.ask(pattern, 2.0) if answer.messages]
 
     @contextlib.contextmanager
     def listening(self, pattern: str) -> Generator[list[Any], None, None]:
-        """The messages put on keys that match, in a list that grows."""
+        """The messages on matching keys, in a list that grows."""
         heard: list[Any] = []
         channel = self._transport.subscribe(pattern)
 
@@ -214,24 +214,24 @@ class Stage:
         finally:
             channel.close()
 
-    # --- speaking
+    # --- clients
 
     def voice(self, identity: str = "anna", *, client: str = "1") -> Voice:
-        """Somebody who speaks to it; to be closed."""
+        """A client that sends it raw messages; the caller closes it."""
         return Voice(self._transport, identity, self.peer.address, client=client, motion=self.motion)
 
-    # --- its arm
+    # --- the arm
 
     def angle(self, who: Voice) -> float:
-        """Where its arm stands, in rad."""
+        """The angle of its arm in rad."""
         return float(who.result(self.peer.arm, "angle", expires_ns=NEVER))
 
     def turns(self, who: Voice) -> int:
-        """How many turns have begun since its boot."""
+        """The number of turns that have begun since its boot."""
         return int(who.result(self.peer.arm, "turns", expires_ns=NEVER))
 
     def begin_turn(self, who: Voice, **how: Any) -> int:
-        """Have it turn for long; returns the call's id once it moves. Raises NotHeld if it does not."""
+        """Starts a long turn; returns the call's id once the arm moves. Raises NotHeld if it does not."""
         away_rad = self.far_rad(who)
         call_id = who.call(self.peer.arm, "turn", away_rad, expires_ns=who.expiry_ns(60.0), **how)
 
@@ -240,7 +240,7 @@ class Stage:
                 raise NotHeld(f"a turn did not begin, but was answered with status {reply.status}")
             return self.moves(who)
 
-        eventually(moves, "a turn that was asked for is not seen at angle()")
+        eventually(moves, "angle() does not show the requested turn")
         return call_id
 
     def far_rad(self, who: Voice) -> float:
@@ -248,27 +248,27 @@ class Stage:
         return -30.0 if self.angle(who) > 0 else 30.0
 
     def moves(self, who: Voice) -> bool:
-        """Whether it moves now."""
+        """Whether the arm moves now."""
         before = self.angle(who)
         threading.Event().wait(_LOOK_S)
         return self.angle(who) != before
 
     @contextlib.contextmanager
     def stopping(self, who: Voice, after: str) -> Generator[None, None, None]:
-        """Raises NotHeld unless the arm rests in time, from when what stops it is begun, and stays there.
+        """Raises NotHeld unless the arm comes to rest in time after the stop begins, and stays there.
 
-        What stops it is not to wait for its answer: an answer may come later than the arm has to rest.
+        The stop must not wait for its answer, which may arrive after the arm has to rest.
         """
         since = time.monotonic()
         yield
         self.require_rest(who, after, since)
 
     def require_rest(self, who: Voice, after: str, since: float) -> None:
-        """Raises NotHeld unless the arm rests in time, from that moment of time.monotonic(), and stays there."""
+        """Raises NotHeld unless the arm rests in time after that moment of time.monotonic(), and stays there."""
         limit_s, before = STOPPED_S + SLACK_S, self.angle(who)
         while True:
             took_s = time.monotonic() - since
-            require(took_s < limit_s, f"the arm is not seen at rest after {after} within {limit_s:g} s")
+            require(took_s < limit_s, f"the arm is not at rest within {limit_s:g} s after {after}")
             threading.Event().wait(_LOOK_S)
             where = self.angle(who)
             if where == before:
@@ -278,18 +278,18 @@ class Stage:
         require(self.angle(who) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
 
     def acquire(self, who: Voice, resources: Sequence[str], **terms: Any) -> Any:
-        """Ask for a lock; the answer."""
+        """Requests a lock; returns the answer."""
         return who.ask(SYSTEM, "acquire", list(resources), terms)
 
     def granted(self, who: Voice, resources: Sequence[str], **terms: Any) -> Token:
-        """Take a lock; raises NotHeld if it is not given."""
+        """Takes a lock; raises NotHeld if it is not granted."""
         found = who.result(SYSTEM, "acquire", list(resources), terms)
         try:
             granted = msgspec.convert(found, Granted)
         except msgspec.ValidationError as bad:
-            raise NotHeld(f"what acquire answered cannot be read: {bad}") from None
+            raise NotHeld(f"the answer of acquire cannot be read: {bad}") from None
         if granted.token is None or not set(resources) <= set(granted.resources):
-            raise NotHeld(f"acquire answered {found!r}, which is not what was asked for")
+            raise NotHeld(f"acquire answered {found!r}, which is not what was requested")
         return granted.token
 
 

@@ -1,4 +1,4 @@
-"""Checks of the e-stop: obeyed, confirmed, kept over a restart, learnt by who joins, cleared."""
+"""Checks of the e-stop: executed, confirmed, kept over a restart, adopted on joining, cleared."""
 
 import secrets
 import time
@@ -29,7 +29,7 @@ def _cleared(*orders: EstopOrder) -> EstopOrder:
 
 
 def _order(stage: Stage, who: Voice, order: EstopOrder) -> EstopConfirmed:
-    """Put an order until it is confirmed; raises NotHeld if it is not."""
+    """Sends an order until it is confirmed; raises NotHeld if it is not."""
     return _confirmed(stage, who, order.request, encode_message(order))
 
 
@@ -54,8 +54,8 @@ def _confirmation(message: Any) -> EstopConfirmed | None:
         return None
 
 
-def _told(stage: Stage) -> tuple[str, ...]:
-    """Whichever of its own providers tells them."""
+def _shown(stage: Stage) -> tuple[str, ...]:
+    """The open e-stops in the container's own registry entry."""
     entries = stage.peer.offer().entries
     return tuple(estop.id for (domain, _), info in entries.items() if domain == SYSTEM[0] for estop in info.estops)
 
@@ -69,26 +69,26 @@ def _require_stopped(stage: Stage, who: Voice, when: str) -> None:
 
 @check("estop", "S09")
 def estop(stage: Stage) -> None:
-    """An e-stop stops all, is told and confirmed; nothing moves before it is cleared, and reading goes on."""
+    """An e-stop stops everything and is shown and confirmed. Until it is cleared, reading works but nothing moves."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         running, order = stage.begin_turn(anna), _open(bob)
         try:
             since = time.monotonic()
             confirmed = _order(stage, bob, order)
-            require(confirmed.problem == "", f"it says that something of an e-stop failed: {confirmed.problem}")
+            require(confirmed.problem == "", f"it reports that part of an e-stop failed: {confirmed.problem}")
             require(not stage.moves(anna), "the arm moves after the e-stop was confirmed")
             stage.require_rest(anna, "an e-stop", since)
             error_of(anna.answer(running))
             _require_stopped(stage, anna, "while an e-stop is open")
-            require(order.request in _told(stage), "its entry does not tell which e-stops are open")
-            require(_order(stage, bob, order).problem == "", "an order that comes again is not confirmed again")
-            require(anna.ask(stage.peer.arm, "echo", 1, expires_ns=NEVER).status == 0, "reading ended with an e-stop")
+            require(order.request in _shown(stage), "its entry does not show the open e-stops")
+            require(_order(stage, bob, order).problem == "", "a repeated order is not confirmed again")
+            require(anna.ask(stage.peer.arm, "echo", 1, expires_ns=NEVER).status == 0, "an e-stop stopped reading")
         finally:
             cleared = _order(stage, bob, _cleared(order))
-        require(cleared.problem == "", f"it says that the clearing failed: {cleared.problem}")
-        eventually(lambda: not _told(stage), "its entry still tells of an e-stop that was cleared")
+        require(cleared.problem == "", f"it reports that the clearing failed: {cleared.problem}")
+        eventually(lambda: not _shown(stage), "its entry still shows a cleared e-stop")
         _order(stage, bob, order)
-        require(not _told(stage), "an e-stop that was cleared is opened again by its own order")
+        require(not _shown(stage), "its own order opens a cleared e-stop again")
         anna.result(SYSTEM, "resume", ["peer.arm"])
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
@@ -111,14 +111,14 @@ def estop_reported(stage: Stage) -> None:
 
 @check("estop-forged", "E-stops")
 def estop_forged(stage: Stage) -> None:
-    """An order in the name of another identity is dropped: the arm goes on."""
+    """An order in the name of another identity is dropped: the arm continues."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         running, forged = stage.begin_turn(anna), _open(anna)
         bob.put(estop_key("bob"), encode_message(forged), urgent=True)
         until = time.monotonic() + _WATCHED_S
-        while True:  # it may take a moment until something comes of it
+        while True:  # an effect may take a moment
             last = time.monotonic() >= until
-            require(not _told(stage), "a forged e-stop is open")
+            require(not _shown(stage), "a forged e-stop is open")
             require(stage.moves(anna) and not anna.answers(running), "a forged e-stop stopped the arm")
             if last:
                 break
@@ -128,13 +128,13 @@ def estop_forged(stage: Stage) -> None:
 
 @check("estop-of-any-version", "S09")
 def estop_of_any_version(stage: Stage) -> None:
-    """An order to stop of another version is obeyed and confirmed, whatever else is in it; one to clear is not."""
+    """An order to stop of another version is executed and confirmed, whatever its content; one to clear is not."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         running, order = stage.begin_turn(anna), _open(bob)
         try:
             later = [PROTOCOL + 1, order.request, [order.request, bob.session, {"text": "smoke"}, None, 7], "more"]
             confirmed = _confirmed(stage, bob, order.request, encode_message(later))
-            require(confirmed.problem == "", f"it says that something of an e-stop failed: {confirmed.problem}")
+            require(confirmed.problem == "", f"it reports that part of an e-stop failed: {confirmed.problem}")
             require(not stage.moves(anna), "the arm moves after an e-stop of another version was confirmed")
             error_of(anna.answer(running))
             cleared = [PROTOCOL + 1, secrets.token_hex(4), None, [order.request]]
@@ -149,13 +149,13 @@ def estop_of_any_version(stage: Stage) -> None:
 
 @check("estop-kept", "S09")
 def estop_kept(stage: Stage) -> None:
-    """An e-stop is still open after a kill and a restart, even if others have cleared it meanwhile."""
+    """An e-stop is still open after a kill and a restart, even if other containers have cleared it meanwhile."""
     order = _with_voice(stage, lambda bob: _ordered(stage, bob))
     stage.kill()
     stage.container.estop_clear([order.request], limit_s=_ALL_TOLD_S)
-    with stage.voice("anna") as anna:  # which starts it
+    with stage.voice("anna") as anna:  # this starts it
         try:
-            require(order.request in _told(stage), "after its restart it knows nothing of the e-stop that was open")
+            require(order.request in _shown(stage), "after its restart the e-stop is not open any more")
             _require_stopped(stage, anna, "after a restart, with an e-stop open")
         finally:
             _order(stage, anna, _cleared(order))
@@ -164,13 +164,13 @@ def estop_kept(stage: Stage) -> None:
 
 @check("estop-learnt", "S09")
 def estop_learnt(stage: Stage) -> None:
-    """Who joins while an e-stop is open elsewhere takes it up."""
+    """A container that joins while an e-stop is open elsewhere adopts it."""
     order = _with_voice(stage, lambda bob: _ordered(stage, bob))
     stage.kill()
     stage.start(forgetful=True)
     with stage.voice("anna") as anna:
         try:
-            eventually(lambda: order.request in _told(stage), "it does not take up an e-stop that others have open")
+            eventually(lambda: order.request in _shown(stage), "it does not adopt an e-stop that is open elsewhere")
             _require_stopped(stage, anna, "with an e-stop open elsewhere")
         finally:
             _order(stage, anna, _cleared(order))
@@ -179,14 +179,14 @@ def estop_learnt(stage: Stage) -> None:
 
 
 def _ordered(stage: Stage, who: Voice) -> EstopOrder:
-    """An e-stop that is open in the container under test, and in ours."""
+    """Opens an e-stop in the container under test and the suite's own."""
     order = _open(who)
     _order(stage, who, order)
 
     def everywhere() -> bool:
         return any(one.id == order.request for one in stage.container._parts.estop.open_here())
 
-    eventually(everywhere, "the suite's own container did not hear the e-stop")
+    eventually(everywhere, "the suite's own container did not receive the e-stop")
     return order
 
 

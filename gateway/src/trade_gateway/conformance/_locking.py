@@ -1,4 +1,4 @@
-"""Checks of locks: who has one is alone, under a lease; who loses it, stops."""
+"""Checks of locks: exclusive use under a lease, and a stop when the lock is lost."""
 
 import threading
 import time
@@ -27,22 +27,22 @@ def _release(who: Voice, lock: Token, lost: str = "") -> bool:
     return bool(who.result(SYSTEM, "release", lock.number, lost, stop=True))
 
 
-def _told(who: Voice) -> list[LockInfo]:
+def _locks_of(who: Voice) -> list[LockInfo]:
     try:
         return msgspec.convert(who.result(SYSTEM, "locks"), list[LockInfo])
     except msgspec.ValidationError as bad:
-        raise NotHeld(f"what locks told cannot be read: {bad}") from None
+        raise NotHeld(f"the answer of locks cannot be read: {bad}") from None
 
 
 @check("locks", "S11")
 def locks(stage: Stage) -> None:
-    """Under a lock only calls that show it run; reading goes on; given back, it is free."""
+    """Under a lock only calls that show it run; reading works; after its release, the resource is free."""
     arm, here = stage.peer.arm, stage.peer.address
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
         require(lock.epoch == here.epoch, f"the token's epoch is {lock.epoch}, not that of the container")
         began, here_rad = stage.turns(anna), stage.angle(anna)
-        elsewhere = Token("0" * len(here.epoch), lock.number)  # a number alone says nothing
+        elsewhere = Token("0" * len(here.epoch), lock.number)  # a number alone is no proof
         unknown = Token(here.epoch, lock.number + 1)
         for who, tokens in ((bob, ()), (anna, ()), (bob, (lock,)), (bob, (unknown,)), (anna, (elsewhere,))):
             refused = error_of(who.ask(arm, "turn", here_rad, tokens=tokens))
@@ -52,29 +52,27 @@ def locks(stage: Stage) -> None:
         require(stage.turns(anna) == began, "a turn began without the lock")
         anna.result(arm, "turn", here_rad, tokens=[lock])
         require(stage.turns(anna) == began + 1, "the turn under the lock did not begin")
-        require(_release(anna, lock), "the lock was not given back")
+        require(_release(anna, lock), "the lock was not released")
         bob.result(arm, "turn", here_rad)
 
 
-@check("locks-told", "S11")
-def locks_told(stage: Stage) -> None:
-    """locks tells what is held, by whom and for what; a refusal names the owner."""
+@check("locks-told", "S11")  # plain: told
+def locks_shown(stage: Stage) -> None:
+    """locks shows what is held, by which owner and for what purpose; a refusal names the owner."""
     arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
-        told = _told(bob)
-        require(len(told) == 1, f"locks told {told!r}")
-        [info] = told
-        require(info.token == lock, "locks tells another token than was granted")
-        require(list(info.resources) == _ARM, f"locks tells of {info.resources!r}")
+        found = _locks_of(bob)
+        require(len(found) == 1, f"locks answered {found!r}")
+        [info] = found
+        require(info.token == lock, "locks shows a token other than the granted one")
+        require(list(info.resources) == _ARM, f"locks shows the resources {info.resources!r}")
         said = (info.holder.identity, info.holder.session, info.holder.purpose)
-        require(said == ("anna", anna.session, "a check"), f"locks says that the holder is {info.holder!r}")
-        require(0 < info.left_s <= 20, f"locks says that {info.left_s!r} s of a lease of 20 s are left")
+        require(said == ("anna", anna.session, "a check"), f"locks shows the holder {info.holder!r}")
+        require(0 < info.left_s <= 20, f"locks shows that {info.left_s!r} s of a lease of 20 s are left")
         refused = error_of(bob.ask(arm, "turn", 0.1))
         require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
-        require(
-            "anna" in str(refused) and "a check" in str(refused), f"the refusal does not say who and why: {refused}"
-        )
+        require("anna" in str(refused) and "a check" in str(refused), f"the refusal lacks owner or purpose: {refused}")
         _release(anna, lock)
 
 
@@ -97,20 +95,20 @@ def locked_by_ours(stage: Stage) -> None:
 
 @check("one-owner", "S13")
 def one_owner(stage: Stage) -> None:
-    """A second one is refused at once, or waits for its turn as long as it says; nobody releases another one's."""
+    """A second client is refused at once, or waits as long as it requests; only its owner releases a lock."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, lease_s=20.0)
         refused = error_of(stage.acquire(bob, _ARM))
         require(isinstance(refused, errors.LockedByOther), f"acquire of a locked resource ended with {refused!r}")
-        require(not _release(bob, lock), "bob gave back the lock of anna")
+        require(not _release(bob, lock), "bob released the lock of anna")
         require(_renew(bob, lock), "bob renewed the lock of anna")
         waiting = bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 6.0, "lease_s": 20.0})
         threading.Event().wait(0.2)
         require(not bob.answers(waiting), "acquire did not wait for its turn")
         _release(anna, lock)
         reply = bob.answer(waiting)
-        require(reply.status == Status.OK, f"who waited for its turn was answered with status {reply.status}")
-        for info in _told(bob):
+        require(reply.status == Status.OK, f"acquire that waited for its turn was answered with status {reply.status}")
+        for info in _locks_of(bob):
             _release(bob, info.token)
         unknown = error_of(stage.acquire(bob, ["peer.nothing"]))
         require(isinstance(unknown, errors.ServiceGone), f"acquire of an unknown resource ended with {unknown!r}")
@@ -118,85 +116,85 @@ def one_owner(stage: Stage) -> None:
 
 @check("waits-for-motion", "S13")
 def waits_for_motion(stage: Stage) -> None:
-    """What moves is not granted before it rests; while it is waited for, no new call is let in."""
+    """A moving resource is granted only after it rests; while a client waits for that, no new call begins."""
     arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         running = stage.begin_turn(anna)
         refused = error_of(stage.acquire(bob, _ARM))
-        require(isinstance(refused, errors.LockedByOther), f"acquire of what moves ended with {refused!r}")
+        require(isinstance(refused, errors.LockedByOther), f"acquire of a moving resource ended with {refused!r}")
         waiting = bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 7.0, "lease_s": 20.0})
         threading.Event().wait(0.2)
         began = stage.turns(anna)
         shut_out = error_of(anna.ask(arm, "turn", 0.1))
-        require(isinstance(shut_out, errors.LockedByOther), f"a turn while a lock is waited for: {shut_out!r}")
-        require(stage.turns(anna) == began, "a turn began while a lock was waited for")
-        require(not bob.answers(waiting), "what moves was granted")
+        require(isinstance(shut_out, errors.LockedByOther), f"a turn while a client waits for a lock: {shut_out!r}")
+        require(stage.turns(anna) == began, "a turn began while a client waited for a lock")
+        require(not bob.answers(waiting), "a moving resource was granted")
         anna.cancel(running, "peer.turn")
         reply = bob.answer(waiting)
-        require(reply.status == Status.OK, f"acquire was answered with status {reply.status} when all was at rest")
-        for info in _told(bob):
+        require(reply.status == Status.OK, f"acquire of a resource at rest was answered with status {reply.status}")
+        for info in _locks_of(bob):
             _release(bob, info.token)
 
 
 @check("leases", "S12")
 def leases(stage: Stage) -> None:
-    """A lock lasts while it is renewed and falls with its lease; what moves under it stops; it never comes back."""
+    """A lock lasts while it is renewed and expires with its lease; its motion stops; it never comes back."""
     arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, lease_s=_LEASE_S * 2)
         for _ in range(8):  # longer than the lease
             threading.Event().wait(_LEASE_S / 2)
-            require(not _renew(anna, lock), "a lock that was renewed is said to be over")
+            require(not _renew(anna, lock), "renew reports a renewed lock as lost")
         running = stage.begin_turn(anna, tokens=[lock])
-        require(not _renew(anna, lock), "a lock that was renewed is said to be over")
-        over = time.monotonic() + _LEASE_S * 2  # not later: what is renewed is answered
+        require(not _renew(anna, lock), "renew reports a renewed lock as lost")
+        over = time.monotonic() + _LEASE_S * 2  # not later: the renewal was answered
         stage.require_rest(anna, "the lease of the lock it moved under ended", over)
-        eventually(lambda: not _told(bob), "a lock that was not renewed still holds")
+        eventually(lambda: not _locks_of(bob), "a lock that was not renewed still holds")
         error_of(anna.answer(running))
-        require(lock.number in _renew(anna, lock), "renew does not say that the lock is over")
+        require(lock.number in _renew(anna, lock), "renew does not report an expired lock")
         refused = error_of(anna.ask(arm, "turn", 0.1, tokens=[lock]))
-        require(isinstance(refused, errors.LockLost), f"a turn under a lock that is over ended with {refused!r}")
+        require(isinstance(refused, errors.LockLost), f"a turn under an expired lock ended with {refused!r}")
         bob.result(arm, "turn", stage.angle(bob))
 
 
 @check("stop-beside-waiting", "S07")
 def stop_beside_waiting(stage: Stage) -> None:
-    """A stop gets through, in its time, while a hundred wait for a lock; they wait no more when their session ends."""
+    """A stop runs in time while a hundred calls wait for a lock; they end with their session."""
     with stage.voice("anna") as anna:
         lock = stage.granted(anna, _ARM, lease_s=30.0)
         running = stage.begin_turn(anna, tokens=[lock])
         with stage.voice("bob") as bob:
             asked = [bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 7.0}) for _ in range(_MANY)]
             eventually(
-                lambda: _waiting(anna) + sum(bool(bob.answers(one)) for one in asked) >= _MANY, "not all are heard"
+                lambda: _waiting(anna) + sum(bool(bob.answers(one)) for one in asked) >= _MANY, "some did not arrive"
             )
-            require(_waiting(anna), "nobody waits for a lock that is held")
+            require(_waiting(anna), "no client waits for a lock that is held")
             with stage.stopping(anna, "a stop, while many wait for a lock"):
                 halting = anna.call(stage.peer.arm, "halt", stop=True)
             body_of(anna.answer(halting), "halt")
             error_of(anna.answer(running))
-        eventually(lambda: not _waiting(anna), "who waited for a lock and has ended waits on")
-        require(_release(anna, lock), "the lock was not given back")
+        eventually(lambda: not _waiting(anna), "an ended client still waits for a lock")
+        require(_release(anna, lock), "the lock was not released")
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
 def _waiting(who: Voice) -> int:
-    return sum(len(info.waiting) for info in _told(who))
+    return sum(len(info.waiting) for info in _locks_of(who))
 
 
 @check("owner-ends", "S12")
 def owner_ends(stage: Stage) -> None:
-    """A lock falls with the session that has it."""
+    """The end of a session releases its lock."""
     with stage.voice("bob") as bob:
         with stage.voice("anna") as anna:
             stage.granted(anna, _ARM, lease_s=30.0)
-        eventually(lambda: not _told(bob), "the lock of a session that has ended still holds")
+        eventually(lambda: not _locks_of(bob), "the lock of a session that has ended still holds")
         bob.result(stage.peer.arm, "turn", stage.angle(bob))
 
 
 @check("lost-stops", "S14")
 def lost_stops(stage: Stage) -> None:
-    """What moves under a lock stops when that is broken, or given back as lost."""
+    """Motion under a lock stops when the lock is broken, or released as lost."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         for how in ("broken", "lost"):
             lock = stage.granted(anna, _ARM, lease_s=30.0)
@@ -214,16 +212,16 @@ def lost_stops(stage: Stage) -> None:
 
 @check("stop-needs-no-lock", "S07")
 def stop_needs_no_lock(stage: Stage) -> None:
-    """A stop gets through whoever has the lock."""
+    """A stop runs although another client has the lock."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, lease_s=30.0)
         stage.begin_turn(anna, tokens=[lock])
         try:
-            with stage.stopping(anna, "a stop by one without the lock"):
+            with stage.stopping(anna, "a stop by a client without the lock"):
                 halting = bob.call(stage.peer.arm, "halt", stop=True)
             body_of(bob.answer(halting), "halt")
             refused = error_of(bob.ask(SYSTEM, "resume", _ARM))
-            require(isinstance(refused, errors.LockedByOther), f"resume by one without the lock ended with {refused!r}")
+            require(isinstance(refused, errors.LockedByOther), f"resume without the lock ended with {refused!r}")
         finally:
             anna.result(SYSTEM, "resume", _ARM)
             _release(anna, lock)

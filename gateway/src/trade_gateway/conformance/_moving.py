@@ -1,4 +1,4 @@
-"""Checks of motion: it stops when it is told to, and with whoever set it going."""
+"""Checks of motion: it stops on request, and with the client that started it."""
 
 from trade import errors
 from trade._protocol.messages import Status
@@ -10,7 +10,7 @@ from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, body_of,
 
 @check("turns", "Writing a container in another language")
 def turns(stage: Stage) -> None:
-    """A turn moves the arm, and is answered when it is there."""
+    """A turn moves the arm, and is answered when the arm has arrived."""
     with stage.voice() as anna:
         goal_rad = stage.angle(anna) + (0.3 if stage.angle(anna) < 0 else -0.3)
         said = anna.result(stage.peer.arm, "turn", goal_rad)
@@ -19,7 +19,7 @@ def turns(stage: Stage) -> None:
 
 @check("stops", "S07")
 def stops(stage: Stage) -> None:
-    """halt stops the arm at once; the turn it ends is answered with an error. It needs no expiry."""
+    """halt stops the arm at once, and the turn ends with an error. It needs no expiry."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         running = stage.begin_turn(anna)
@@ -27,7 +27,7 @@ def stops(stage: Stage) -> None:
             halting = anna.call(arm, "halt", stop=True, expires_ns=NEVER)
         require(anna.answer(halting).status == Status.OK, "halt was not answered with status 0")
         error_of(anna.answer(running))
-        anna.result(arm, "turn", stage.angle(anna))  # one's own stop does not latch
+        anna.result(arm, "turn", stage.angle(anna))  # a client's own stop does not latch
 
 
 @check("stops-late", "S07")
@@ -43,14 +43,14 @@ def stops_late(stage: Stage) -> None:
 
 @check("stop-latches", "S08")
 def stop_latches(stage: Stage) -> None:
-    """After a stop by somebody else nothing moves before resume; reading goes on."""
+    """After a stop by another client nothing moves before resume; reading works."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
-        _latches(stage, anna, bob, "somebody else's stop")
+        _latches(stage, anna, bob, "another client's stop")
 
 
 @check("stop-latches-own", "S08")
 def stop_latches_own(stage: Stage) -> None:
-    """So it is after a stop by another session of the same identity: it may be another person, or program."""
+    """A stop by another session of the same identity latches too: it may be another person or program."""
     with stage.voice("anna") as anna, stage.voice("anna", client="2") as other:
         _latches(stage, anna, other, "a stop by another session of the same identity")
 
@@ -68,52 +68,52 @@ def _latches(stage: Stage, anna: Voice, other: Voice, stop: str) -> None:
         require(stage.turns(anna) == began, f"a turn began after {stop}")
     finally:
         resumed = anna.result(SYSTEM, "resume", ["peer.arm"])
-    require(list(resumed) == ["peer.arm"], f"resume answered {resumed!r}, not which it let move again")
+    require(list(resumed) == ["peer.arm"], f"resume answered {resumed!r}, not the resource that may move again")
     anna.result(arm, "turn", stage.angle(anna))
 
 
 @check("session-ends", "S05")
 def session_ends(stage: Stage) -> None:
-    """When the session of a client ends, what it set moving stops; the end of another one stops nothing."""
+    """When the session of a client ends, the motion that it started stops; another session's end stops nothing."""
     with stage.voice("anna") as anna:
         with stage.voice("bob") as bob, stage.voice("carol"):
             stage.begin_turn(bob)
-            with stage.stopping(anna, "the session that set it moving has ended"):
+            with stage.stopping(anna, "the end of the session that started it"):
                 bob.close()
         running = stage.begin_turn(anna)
         with stage.voice("bob") as bob:
             stage.angle(bob)
-        require(stage.moves(anna) and not anna.answers(running), "it stopped when the session of another one ended")
+        require(stage.moves(anna) and not anna.answers(running), "it stopped when another session ended")
         anna.cancel(running, "peer.turn")
         anna.answer(running)
 
 
 @check("caller-ends", "S05")
 def caller_ends(stage: Stage) -> None:
-    """When the container of a caller ends, what its clients set moving stops."""
+    """When the container of a caller ends, the motion that its clients started stops."""
     with stage.voice("anna") as anna, stage.voice("bob", client="") as bob:
         stage.begin_turn(bob)
-        with stage.stopping(anna, "the container that set it moving has ended"):
+        with stage.stopping(anna, "the end of the container that started it"):
             bob.close()
 
 
 @check("behalf-ends", "S03")
 def behalf_ends(stage: Stage) -> None:
-    """A motion stops as well when a session ends on whose behalf the call was made."""
+    """A motion also stops when a session ends on whose behalf the call was made."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         stage.begin_turn(anna, sessions=[bob.session])
-        with stage.stopping(anna, "the session on whose behalf it moved has ended"):
+        with stage.stopping(anna, "the end of the session on whose behalf it moved"):
             bob.close()
 
 
 @check("too-late-for-ended", "S05")
 def too_late_for_ended(stage: Stage) -> None:
-    """What comes for a session that has ended does not begin."""
+    """A call of a session that has ended does not begin."""
     with stage.voice("anna") as anna:
         bob = stage.voice("bob")
         bob.result(stage.peer.arm, "turn", stage.angle(anna))
         stage.begin_turn(bob)
-        with stage.stopping(anna, "the session that set it moving has ended"):
+        with stage.stopping(anna, "the end of the session that started it"):
             bob.close()
         began = stage.turns(anna)
         refused = error_of(anna.ask(stage.peer.arm, "turn", 0.1, sessions=[bob.session]))

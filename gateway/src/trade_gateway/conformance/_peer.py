@@ -1,4 +1,4 @@
-"""The container under test, in one of its boots: whether it is there, and what it says that it offers."""
+"""The container under test in one boot: its process, its sign of life, and what it offers."""
 
 import contextlib
 import os
@@ -24,13 +24,13 @@ _LOOK_S: Final = 0.02
 
 
 class Offer(Struct, frozen=True):
-    """What a container answers when it is asked what it offers."""
+    """A container's answer to the registry query."""
 
     entries: dict[Place, ProviderInfo]
     tally: int
-    """The revision as of which that is; -1: it does not say."""
+    """The revision of this answer; -1: it gives none."""
     last: str
-    """The last chunk of the key that was told last."""
+    """The last chunk of the last key in the answer."""
     keys: tuple[str, ...]
 
 
@@ -52,21 +52,21 @@ class Peer:
 
     @property
     def alive(self) -> bool:
-        """Whether its process runs and its sign of life stands."""
+        """Whether its process runs and has a sign of life."""
         return self.process.poll() is None and self._seen(self.address)
 
     def signal(self, number: int) -> None:
-        """Tell the process and all that it started; nothing if none of them is left."""
+        """Sends a signal to the process and all that it started, if any of them is left."""
         signal_group(self.process, number)
 
     @property
     def arm(self) -> Place:
-        """Where its arm is."""
+        """The domain and provider of its arm."""
         return self.place("turn")
 
     def place(self, service: str) -> Place:
-        """Who in group ``peer`` offers a service of that name; raises NotHeld if nobody does."""
-        if service not in self._places:  # it may be a moment before all is offered
+        """The provider of a service in group ``peer``; raises NotHeld if there is none."""
+        if service not in self._places:  # it may take a moment before everything is offered
             eventually(lambda: self._learn(service), f"it offers no {service} in the group {GROUP}", _OFFERED_S)
         return self._places[service]
 
@@ -77,9 +77,9 @@ class Peer:
         return wanted in self._places
 
     def offer(self) -> Offer:
-        """Ask what it offers; raises NotHeld if that is not answered."""
+        """Queries what it offers; raises NotHeld without an answer."""
         found = self._ask(registry_key("*", self.address, "*"))
-        require(found, "it does not answer the question what it offers")
+        require(found, "it does not answer the registry query")
         return _offer(found[0])
 
     def says(self, name: str) -> bool:
@@ -89,7 +89,7 @@ class Peer:
 
 
 def signal_group(process: "subprocess.Popen[bytes]", number: int) -> bool:
-    """A signal for a process begun in a session of its own, and all that it started. Returns whether any is left."""
+    """Sends a signal to a process with its own session, and all that it started. Returns whether any is left."""
     with contextlib.suppress(ProcessLookupError, PermissionError):  # the latter: those left have ended, unreaped
         os.killpg(process.pid, number)
         return True
@@ -97,11 +97,11 @@ def signal_group(process: "subprocess.Popen[bytes]", number: int) -> bool:
 
 
 def end_group(process: "subprocess.Popen[bytes]") -> None:
-    """Ask a process and all that it started to end, and see to it that they do."""
+    """Ends a process and all that it started, by force if necessary."""
     until = time.monotonic() + _GOODBYE_S
     try:
         signal_group(process, signal.SIGTERM)
-        signal_group(process, signal.SIGCONT)  # what stands still hears nothing
+        signal_group(process, signal.SIGCONT)  # a frozen process handles no signal
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_GOODBYE_S)
         while signal_group(process, 0) and time.monotonic() < until:  # a shell may end before what it started
@@ -122,6 +122,6 @@ def _offer(answer: Answer) -> Offer:
             else:
                 entries[domain, provider] = decode_provider(message.payload or b"")
         except Malformed as bad:
-            raise NotHeld(f"what it tells of {domain}/{provider} cannot be read: {bad}") from None
+            raise NotHeld(f"the entry of {domain}/{provider} cannot be read: {bad}") from None
     keys = tuple(message.key for message in answer.messages)
     return Offer(entries, tally, keys[-1].rpartition("/")[2], keys)

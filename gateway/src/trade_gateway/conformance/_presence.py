@@ -1,4 +1,4 @@
-"""Checks of what a container tells of itself: its sign of life, what it offers, how far it is, its end."""
+"""Checks of presence: the sign of life, the registry answers, the tally, and the end."""
 
 import signal
 from typing import Final
@@ -19,9 +19,9 @@ ARM: Final = {
     "halt": ("stop", ()),
     "relay": ("actuate", ("service", "resources", "args")),
 }
-"""What the container under test offers: effect and parameters."""
+"""The services of the container under test: effect and parameters."""
 MOVES: Final = ("turn", "angle", "turns", "halt")
-"""Of these, what has to do with motion."""
+"""Of these, the services for motion."""
 OWN: Final = {
     "clock": "read",
     "acquire": "actuate",
@@ -31,27 +31,27 @@ OWN: Final = {
     "break_lock": "stop",
     "resume": "actuate",
 }
-"""What every container's own provider has at least."""
+"""The functions that every container's own provider has."""
 _TALLY_S: Final = 20.0
-"""A little more than a container may be silent about how far it is."""
+"""A little more than the longest pause between two tallies, in seconds."""
 
 
 @check("presence", "Presence and registry", still=True)
 def presence(stage: Stage) -> None:
-    """One sign of life stands on alive/<identity>/<container>/<epoch>, as the environment names them."""
+    """It has one sign of life on alive/<identity>/<container>/<epoch>, as the environment names them."""
     boots = stage.boots() if stage.peer else []
-    require(len(boots) == 1, f"{len(boots)} signs of life stand: {', '.join(map(str, boots))}")
-    require(is_chunk(boots[0].epoch), f"its epoch {boots[0].epoch!r} is no plain chunk")
+    require(len(boots) == 1, f"it has {len(boots)} signs of life: {', '.join(map(str, boots))}")
+    require(is_chunk(boots[0].epoch), f"its epoch {boots[0].epoch!r} is not a plain chunk")
 
 
 @check("offers", "Presence and registry", still=True)
 def offers(stage: Stage) -> None:
-    """Asked what it offers, it tells its entries on their own keys, and the tally last."""
+    """It answers the registry query with its entries on their own keys, and the tally last."""
     offer = stage.peer.offer()
     require(offer.tally >= 1 and offer.last == "tally", "the tally is not the last thing in its answer")
     for place, info in offer.entries.items():
         own = registry_key(place[0], stage.peer.address, place[1])
-        require(own in offer.keys, f"the entry of {'/'.join(place)} is not told on {own}")
+        require(own in offer.keys, f"the entry of {'/'.join(place)} is not on {own}")
         require(info.revision <= offer.tally, f"the revision of {'/'.join(place)} is above the tally")
         if place != SYSTEM:
             require(info.groups[:1] == place[:1], f"{place[0]} is not the first group of {'/'.join(place)}")
@@ -62,7 +62,7 @@ def offers(stage: Stage) -> None:
 @check("describes", "Messages", still=True)
 def describes(stage: Stage) -> None:
     """The services of group peer and the functions of its own provider are described as agreed."""
-    wanted = {name: told for name, told in ARM.items() if stage.motion or name not in MOVES}
+    wanted = {name: parts for name, parts in ARM.items() if stage.motion or name not in MOVES}
     places = {name: stage.peer.place(name) for name in wanted}
     offer = stage.peer.offer()
     arm = {name: _services(offer, place)[name] for name, place in places.items()}
@@ -81,11 +81,11 @@ def describes(stage: Stage) -> None:
         require(own[name].effect == effect, f"trade.{name} has the effect {own[name].effect!r}, not {effect!r}")
 
 
-@check("tells-late", "Presence and registry", still=True)
+@check("tells-late", "Presence and registry", still=True)  # plain: tells
 def tells_late(stage: Stage) -> None:
-    """Every sixteen seconds at least it says how far it is."""
+    """It publishes its tally at least every sixteen seconds."""
     with stage.listening(tally_key(stage.peer.address)) as heard:
-        eventually(lambda: len(heard) > 0, "it did not say how far it is", _TALLY_S)
+        eventually(lambda: len(heard) > 0, "it did not publish its tally", _TALLY_S)
         tallies = [_tally(message.payload) for message in heard]
     require(tallies[-1].revision == stage.peer.offer().tally, "its tally is not that of its answer")
 
@@ -103,7 +103,7 @@ def found(stage: Stage) -> None:
 
 @check("survives-rubbish", "Messages", still=True)
 def survives_rubbish(stage: Stage) -> None:
-    """What is no message is dropped and kills nothing, on whatever key it comes."""
+    """It drops malformed messages on any key, and survives them."""
     peer, echo = stage.peer, stage.peer.place("echo")
     place = "/".join(echo)
     rubbish = [b"", b"\xc1", b"\xff" * 40, b"\x91" * 5000, b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff\x01"]
@@ -115,13 +115,13 @@ def survives_rubbish(stage: Stage) -> None:
         for key in keys:
             for payload in rubbish:
                 anna.put(key, payload)
-        require(anna.result(echo, "echo", 1, expires_ns=NEVER) == 1, "after rubbish echo answers wrongly")
-    require(peer.alive, f"rubbish killed it: {stage.last_words()}")
+        require(anna.result(echo, "echo", 1, expires_ns=NEVER) == 1, "after malformed messages echo answers wrongly")
+    require(peer.alive, f"malformed messages ended it: {stage.last_words()}")
 
 
 @check("restarts", "Keys")
 def restarts(stage: Stage) -> None:
-    """Killed and started anew it is another epoch, and hears nothing that was said to the one before."""
+    """After a kill and a restart it has another epoch, and receives nothing that was sent to the earlier one."""
     before, arm = stage.kill(), stage.peer.arm
     require(stage.peer.address.epoch != before.address.epoch, "it has the epoch that it had before")
     with stage.voice() as anna:
@@ -134,11 +134,11 @@ def restarts(stage: Stage) -> None:
 
 @check("leaves", "Presence and registry", still=True)
 def leaves(stage: Stage) -> None:
-    """On SIGTERM it ends by itself, and its sign of life falls."""
+    """On SIGTERM it ends by itself, and its sign of life vanishes."""
     peer = stage.peer
     peer.signal(signal.SIGTERM)
     eventually(lambda: peer.process.poll() is not None, "it does not end on SIGTERM")
-    eventually(lambda: not stage.seen(peer.address), "its sign of life stands after its end")
+    eventually(lambda: not stage.seen(peer.address), "its sign of life remains after its end")
 
 
 def _services(offer: Offer, place: tuple[str, str]) -> dict[str, ServiceInfo]:

@@ -1,4 +1,4 @@
-"""One who speaks to the container under test, message by message: what a well-behaved client never says can be said."""
+"""A client that sends raw messages to the container under test, including those that no valid client sends."""
 
 import itertools
 import secrets
@@ -31,11 +31,11 @@ Place = tuple[str, str]
 SYSTEM: Final[Place] = ("trade", "system")
 DEADLINE_S: Final = 8.0
 NEVER: Final = object()
-"""Of an expiry: none."""
+"""The expiry of a call that never expires."""
 
 
 class Voice:
-    """Somebody of an identity of its own, whose session is seen by its sign of life until it is closed."""
+    """A client with its own identity, whose session has a sign of life until it is closed."""
 
     def __init__(
         self, transport: Transport, identity: str, callee: Address, *, client: str = "1", motion: bool = False
@@ -56,10 +56,10 @@ class Voice:
         self._sign = transport.appear(alive_key(self.session))
         threading.Thread(target=self._read, name="suite-replies", daemon=True).start()
 
-    # --- saying
+    # --- requests
 
     def put(self, key: str, payload: bytes, *, urgent: bool = False) -> None:
-        """Any bytes on any key."""
+        """Puts any bytes on any key."""
         if key not in self._publishers:
             self._publishers[key] = self._transport.publish(key, urgent=urgent)
         self._publishers[key].put(payload)
@@ -81,8 +81,8 @@ class Voice:
         callee: Address | None = None,
         key: str = "",
     ) -> int:
-        """Send a call and return its id. Unless said otherwise it expires in good time, by the callee's clock."""
-        require(self._motion or service != "turn", "a check that asks for motion ran without --motion")
+        """Sends a call and returns its id. By default it expires after a sufficient time, by the callee's clock."""
+        require(self._motion or service != "turn", "a check without `still` ran without --motion")
         asked = self.new_id() if call_id is None else call_id
         if expires_ns is None and not stop:
             expires_ns = self.expiry_ns()
@@ -104,33 +104,33 @@ class Voice:
         return asked
 
     def ask(self, place: Place, service: str, *args: Any, **how: Any) -> Reply:
-        """Call and wait for the answer."""
+        """Calls and waits for the answer."""
         return self.answer(self.call(place, service, *args, **how))
 
     def result(self, place: Place, service: str, *args: Any, **how: Any) -> Any:
-        """Call, and what comes of it; raises NotHeld if it failed."""
+        """Calls and returns the result; raises NotHeld if the call failed."""
         return body_of(self.ask(place, service, *args, **how), f"{place[0]}.{service}")
 
     def cancel(self, call_id: int, service: str, keep_s: float = DEADLINE_S) -> Reply:
-        """Ask for the end of a call."""
+        """Cancels a call."""
         return self.ask(SYSTEM, CANCEL, call_id, service, keep_s, stop=True)
 
     def expiry_ns(self, in_s: float = DEADLINE_S) -> int:
-        """A moment, in seconds from now, in the callee's clock; never later than it is meant."""
+        """A time, in seconds from now, by the callee's clock, rounded towards earlier."""
         if self._offset_ns is None:
             answer = self.answer(self.call(SYSTEM, "clock", expires_ns=NEVER))
             self._offset_ns = answer.clock_ns - time.monotonic_ns()
         return time.monotonic_ns() + self._offset_ns + int(in_s * 1e9)
 
-    # --- hearing
+    # --- answers
 
     def answer(self, call_id: int, wait_s: float = PATIENCE_S) -> Reply:
-        """The answer to a call; raises NotHeld if none comes."""
+        """The answer to a call; raises NotHeld if none arrives."""
         eventually(lambda: self.answers(call_id), "there was no answer to a call", wait_s)
         return self.answers(call_id)[0]
 
     def answers(self, call_id: int) -> list[Reply]:
-        """All answers to a call that have come."""
+        """All answers to a call that have arrived."""
         with self._changed:
             return [reply for reply in self._heard.get(call_id, ()) if reply.status != Status.PROGRESS]
 
@@ -149,7 +149,7 @@ class Voice:
                     self._heard.setdefault(reply.id, []).append(reply)
 
     def close(self) -> None:
-        """Its session ends. Idempotent."""
+        """Ends its session. Idempotent."""
         self._sign.close()
         self._answers.close()
         for publisher in self._publishers.values():
@@ -163,7 +163,7 @@ class Voice:
 
 
 def body_of(reply: Reply, what: str) -> Any:
-    """The result in an answer; raises NotHeld if it is none."""
+    """The result in an answer; raises NotHeld if it is an error."""
     if reply.status == Status.OK:
         return msgspec.msgpack.decode(reply.body)
     said = f": {error_of(reply)}" if reply.status == Status.ERROR else ""
@@ -171,10 +171,10 @@ def body_of(reply: Reply, what: str) -> Any:
 
 
 def error_of(reply: Reply) -> BaseException:
-    """The exception that a Python caller would see; raises NotHeld if the answer is no error."""
+    """The exception that a Python caller would get; raises NotHeld if the answer is no error."""
     if reply.status != Status.ERROR:
-        raise NotHeld(f"an error was due (status 1), and the answer has status {reply.status}")
+        raise NotHeld(f"the answer should be an error (status 1), but has status {reply.status}")
     try:
         return unpack_error(msgspec.msgpack.decode(reply.body, type=ErrorInfo), "it")
     except msgspec.DecodeError as bad:
-        raise NotHeld(f"the body of an error is no ErrorInfo: {bad}") from None
+        raise NotHeld(f"the body of an error is not an ErrorInfo: {bad}") from None

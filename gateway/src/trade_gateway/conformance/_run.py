@@ -1,4 +1,4 @@
-"""All checks, in the order they run, each on a container that is at rest."""
+"""Runs the checks in order, each on a container at rest."""
 
 import logging
 import tempfile
@@ -46,7 +46,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _moving.behalf_ends,
     _moving.too_late_for_ended,
     _locking.locks,
-    _locking.locks_told,
+    _locking.locks_shown,
     _locking.locked_by_ours,
     _locking.one_owner,
     _locking.waits_for_motion,
@@ -77,7 +77,7 @@ LEFT_OUT: Final = "left out"
 
 
 class Outcome(Struct, frozen=True):
-    """How one check ended."""
+    """The outcome of one check."""
 
     check: str
     what: str
@@ -89,28 +89,28 @@ class Outcome(Struct, frozen=True):
 
 
 def run(
-    command: str, checks: Sequence[Check], told: Callable[[Outcome], None], *, motion: bool = False
+    command: str, checks: Sequence[Check], report: Callable[[Outcome], None], *, motion: bool = False
 ) -> list[Outcome]:
-    """Start the container under test and run the checks on it.
+    """Starts the container under test and runs the checks on it.
 
     Args:
-        command: starts it; words as in a shell, without one.
-        checks: which.
-        told: called with each outcome when it is known.
-        motion: whether its arm may be turned; else checks that do so are left out, and no call of ``turn`` is sent.
+            command: starts it; split into words as in a shell, but run without one.
+            checks: the checks to run.
+            report: called with each outcome at once.
+            motion: whether its arm may be turned; otherwise such checks are skipped, and ``turn`` is never called.
 
     Raises:
         ConfigurationError: there is no such program.
     """
     outcomes: list[Outcome] = []
-    logging.getLogger("trade").setLevel(logging.CRITICAL)  # what our own container drops here is meant to be dropped
+    logging.getLogger("trade").setLevel(logging.CRITICAL)  # our own container drops messages here on purpose
     with (
         tempfile.TemporaryDirectory(prefix="trade-conformance-") as folder,
         Stage(command, Path(folder), motion=motion) as stage,
     ):
         for outcome in _each(stage, checks):
             outcomes.append(outcome)
-            told(outcome)
+            report(outcome)
     return outcomes
 
 
@@ -119,7 +119,7 @@ def _each(stage: Stage, checks: Sequence[Check]) -> Iterator[Outcome]:
         begun = time.monotonic()
         outcome, why = _judge(stage, one)
         if outcome == FAILED:
-            stage.dismiss()  # the next one begins with one that nothing was done to
+            stage.dismiss()  # the next check begins with a fresh one
         yield Outcome(one.name, one.what, one.rule, outcome, why, round(time.monotonic() - begun, 3))
 
 
@@ -134,6 +134,6 @@ def _judge(stage: Stage, one: Check) -> tuple[str, str]:
         return FAILED, str(why)
     except (TradeError, TimeoutError) as error:
         return FAILED, f"{type(error).__name__}: {error}"
-    except (TypeError, ValueError, LookupError, AttributeError) as error:  # what it answers may be anything
-        return FAILED, f"what it answered cannot be read: {type(error).__name__}: {error}"
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # its answer may have any content
+        return FAILED, f"its answer cannot be read: {type(error).__name__}: {error}"
     return OK, ""
