@@ -145,7 +145,7 @@ def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_s
         say(page, do="watch", id=1, existing=True)
         heard(page)
         calls = [one["call"] for one in chief.ask("GET", "/notifications").body]
-        assert calls.count("tell anna (a client of the door)") == 3
+        assert calls.count("notify anna (a client of the HTTP gateway)") == 3
     hook.detach()
     watching.cancel()
 

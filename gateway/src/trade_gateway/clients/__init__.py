@@ -1,4 +1,4 @@
-"""Clients of a container that acts for others: each a session of its own, and what all of them can have done."""
+"""Clients of the HTTP gateway and of agents: each has its own session, and `ClientApi` executes their requests."""
 
 from trade_gateway.clients._api import ClientApi
 from trade_gateway.clients._authorizer import ANONYMOUS, ClientAuthorizer

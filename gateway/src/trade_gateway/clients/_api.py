@@ -1,4 +1,4 @@
-"""What clients have done, whichever way they ask: judged in their name, made in their session, in threads."""
+"""The operations of clients, for every protocol: authorised in their name, run in their session, in threads."""
 
 import logging
 from collections.abc import Awaitable, Callable, Sequence
@@ -41,18 +41,18 @@ _logger = logging.getLogger("trade")
 T = TypeVar("T")
 
 _THREADS: Final = MOST_CALLS + 16
-"""As many as there may be calls, locks and questions under way, and some for sessions that come and go."""
-_HEARD_S: Final = 1.0
-"""How long to wait for everybody to be heard."""
+"""Enough for all pending calls, locks and queries, and some for sessions that come and go."""
+_ANSWERED_S: Final = 1.0
+"""How long to wait for an answer of every container, in seconds."""
 _NO_GROUP: Final = "_"
-_NOT_TOLD: Final = "nobody with something to stop is known to have been told; use the switch that cuts the power"
+_NOT_RECEIVED: Final = "no container is known to have received the e-stop. Cut the power with its switch"
 
 Gone = Callable[[], Awaitable[object]]
-"""Returns when whoever asked is there no more."""
+"""Returns when the client that made the request is gone."""
 
 
 class ClientApi:
-    """The door's side of its system."""
+    """The operations of clients on a container's system."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
@@ -64,32 +64,32 @@ class ClientApi:
         self.overview: Final = Overview(container, self.judge, self.counted)
 
     async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
-        """Do in a thread what may wait for others; what stops waits for no thread."""
+        """Runs a function that may block in a thread; one that stops something never waits for a free thread."""
         return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
 
     async def counted(self, who: str, do: Callable[..., T], *args: Any) -> T:
-        """Likewise, as one of what may be under way. Raises TooMany."""
+        """Likewise, counted against the limits of pending operations. Raises TooMany."""
         ended = self._quota.take(who)
         try:
             return await self.apart(do, *args)
         finally:
             ended()
 
-    # --- looking
+    # --- queries
 
     def seen(self, who: str, group: str | None = None, name: str | None = None) -> list[Handle]:
-        """The services that an identity may know of; what names no group or service matches none."""
+        """The services that an identity may know of; an invalid group or name matches none."""
         try:
             found = self._container.services(_wanted(group, name))
-        except ConfigurationError:  # no name of a group
+        except ConfigurationError:  # not the name of a group
             return []
         return [handle for handle in found if self.judge.sees(who, handle)]
 
     def find(self, who: str, group: str, name: str, container: str = "") -> Handle:
-        """The service of a group and name; one of exactly this group goes before those beneath it.
+        """Finds a service by group and name; one of exactly this group has priority over those beneath it.
 
         Raises:
-            NoSuchService, TooManyServices: none, or several, that the client may know of.
+                NoSuchService, TooManyServices: the client may know of none, or of several.
         """
         inside = self.seen(who, None if group == _NO_GROUP else group)
         found = [one for one in inside if one.name == name and container in ("", one.container)]
@@ -102,19 +102,19 @@ class ClientApi:
             raise TooManyServices(constraint=f"{group}.{name}", matches=matches, differ=("group", "container"))
         return found[0]
 
-    # --- calling
+    # --- calls
 
     async def begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
-        """Make a call without waiting for its end.
+        """Starts a call without waiting for its end.
 
         Args:
-            client: whose call it is.
-            handle: of what.
+                client: the caller.
+                handle: the service.
             body: its arguments.
-            admitted: what `Client.admit` said when it was asked for.
+                admitted: what `Client.admit` returned for this request.
 
         Raises:
-            TradeError: it is not allowed, or could not begin; Cancelled: the client has asked for a stop since.
+                TradeError: it is not allowed, or could not begin; Cancelled: the client has requested a stop since.
         """
         self.judge.require_call(client.identity, handle)
         stops = handle.effect == "stop"
@@ -151,28 +151,28 @@ class ClientApi:
         return run
 
     async def end(self, client: Client, run: Run) -> None:
-        """End a call early, in its client's name."""
+        """Cancels a call in its client's name."""
         try:
             await self.apart(client.cancel, run, stops=True)
-        except TradeError as error:  # the call itself says how it ended
+        except TradeError as error:  # the call itself reports how it ended
             _logger.info("a call of %s could not be cancelled: %s", client.identity, error)
 
     async def call(self, client: Client, handle: Handle, body: messages.CallBody, gone: Gone, *, alone: bool) -> Run:
-        """Make a call and wait for its end; it is ended early when whoever asked is gone.
+        """Makes a call and waits for its end; cancels it when the client is gone.
 
         Args:
-            client: whose call it is.
-            handle: of what.
+                client: the caller.
+                handle: the service.
             body: its arguments.
-            gone: tells that nobody waits any more.
-            alone: the client is there for this call only, and ends with it.
+                gone: returns when the client no longer waits.
+                alone: whether the client exists for this call only, and ends with it.
 
         Returns:
-            The call, which has ended, well or not.
+                The call, which has ended, with or without success.
 
         Raises:
             TradeError: it could not begin.
-            Cancelled: nobody waits any more.
+                Cancelled: the client no longer waits.
         """
         run = await self.begin(client, handle, body, client.admit(handle))
 
@@ -197,10 +197,10 @@ class ClientApi:
     async def lock(
         self, client: Client, body: messages.LockBody, on_lost: Callable[[str, LockLost], object]
     ) -> messages.LockTaken:
-        """Take a lock for a client.
+        """Takes a lock for a client.
 
         Raises:
-            TradeError: see `trade.Container.lock`; and TooMany. What is not there is not waited for.
+                TradeError: see `trade.Container.lock`; and TooMany. It does not wait for services that do not exist.
         """
         client.locking()
         return await self.counted(client.identity, self._lock, client, body, on_lost)
@@ -228,38 +228,38 @@ class ClientApi:
             taken.append(lock)
             lock.acquire()
         try:
-            self._lockable(client, wanted)  # with what came meanwhile
+            self._lockable(client, wanted)  # with services that joined meanwhile
         except TradeError:
             lock.release()
             raise
         return messages.LockTaken(client.keep(lock, handles), lock.resources, lock.missing)
 
     def _lockable(self, client: Client, wanted: Constraint) -> list[Handle]:
-        """What a lock takes. Raises AccessDenied: the client may not lock all of it."""
+        """The services that a lock takes. Raises AccessDenied: the client may not lock all of them."""
         handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
         self.judge.require(client.identity, "lock", handles)
         return handles
 
     async def locks(self, who: str) -> list[messages.LockView]:
-        """The locks on what an identity may know of."""
+        """The locks on services that an identity may know of."""
         known = {name for _, name in places(self.seen(who))}
         found = await self.counted(who, self._container.locks)
         return [messages.lock_view(info) for info in found if not known.isdisjoint(info.resources)]
 
     async def request_release(self, who: str, body: messages.RequestBody) -> list[str]:
-        """Ask the owners of locks to give them back; who was asked. Raises NoSuchService."""
+        """Asks the owners of locks to release them; returns the owners. Raises NoSuchService."""
         handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
         return await self.counted(who, self._container.request_release, handles, reason)
 
     async def break_locks(self, who: str, body: messages.RequestBody) -> list[messages.LockView]:
-        """Take locks away from their owners; what moves under them stops. Raises AccessDenied, NoSuchService."""
+        """Breaks locks of other owners; motion under them stops. Raises AccessDenied, NoSuchService."""
         handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
         self.judge.require(who, "administer", handles)
         broken = await self.counted(who, self._container.break_lock, handles, reason)
         return [messages.lock_view(info) for info in broken]
 
     def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
-        """What uses these and nothing else. Raises NoSuchService: an identity knows of no such service."""
+        """The services that use exactly these. Raises NoSuchService: an identity knows of no such service."""
         wanted = set(resources)
         actuating = [one for one in self.seen(who) if one.effect == "actuate"]
         found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]
@@ -268,7 +268,7 @@ class ClientApi:
         return found
 
     async def resume(self, client: Client, body: messages.GroupBody) -> list[str]:
-        """Let services move again; without a lock of its own that is for who administers them. Raises AccessDenied."""
+        """Lets services move again; without a lock this needs the right to administer them. Raises AccessDenied."""
         handles = [one for one in self.seen(client.identity, body.group) if one.effect == "actuate"]
         if not handles:
             raise NoSuchService(constraint=body.group, groups=_groups(self.seen(client.identity)))
@@ -282,50 +282,50 @@ class ClientApi:
         return await self.counted(client.identity, resume)
 
     async def estop(self, who: str, body: messages.EstopBody) -> messages.Stopped:
-        """Stop everything in the system.
+        """Stops everything in the system.
 
         Raises:
-            NobodyFound: nobody is known to have been told; it is open here, and who comes into sight is told then.
+                NobodyFound: no container is known to have received it. It is open here; joining containers receive it.
         """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
         report = await self.apart(self._container.estop, reason, stops=True)
         look = partial(self._container.reachability, limit_s=0)
-        reachability = await self.apart(look, stops=True)  # not before: it waits
+        reachability = await self.apart(look, stops=True)  # only after the e-stop, as it waits
         if not (report.confirmed or report.missing or report.failed):
-            raise reachability.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_TOLD}")
+            raise reachability.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_RECEIVED}")
         return _stopped(report, reachability)
 
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
-        """Clear e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and not everybody was heard."""
+        """Clears e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and a container is silent."""
         ids = body.ids or [one.id for one in self._container.estops()]
         self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
         if not ids:
-            await self.counted(who, self._require_all_heard)
+            await self.counted(who, self._require_answers)
             return messages.Stopped("", True, (), (), {})
         report = await self.counted(who, self._container.estop_clear, ids)
         self._container.note_asked("e-stop clearing", ", ".join(ids), kind="stop", who=who)
         return _stopped(report)
 
     def note_refused(self, error: BaseException) -> None:
-        """Have in the record what the policy lets a client not do; what it lets this container not do is there."""
+        """Audits the policy's refusal of a client; a refusal of this container is recorded already."""
         if isinstance(error, AccessDenied) and error.who != self._container.address.identity:
             why, outcome = str(error), type(error).__name__
             self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
 
-    def _require_all_heard(self) -> None:
-        reachability = self._container.reachability(limit_s=_HEARD_S)
+    def _require_answers(self) -> None:
+        reachability = self._container.reachability(limit_s=_ANSWERED_S)
         if not reachability.complete:
-            raise reachability.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
+            raise reachability.nobody(self._container.settings.system, "so an open e-stop may be unknown here")
 
     def estops(self, who: str) -> list[messages.EstopView]:
-        """Those that are open. Raises AccessDenied: an identity may do nothing here but stop."""
+        """The open e-stops. Raises AccessDenied: an identity may do nothing here but stop."""
         self.judge.require_some(who, "estops")
         return [messages.EstopView(one.id, one.by, one.reason, one.at, one.told_by) for one in self._container.estops()]
 
-    # --- listening
+    # --- subscriptions
 
     async def stream(self, client: Client, handle: Handle, asked: messages.Stream) -> Samples:
-        """Samples of a service, until the client is gone. Raises like `trade.Container.stream`."""
+        """Streams samples of a service until the client is gone. Raises like `trade.Container.stream`."""
         self.judge.require_call(client.identity, handle)
 
         def listen() -> Samples:
@@ -335,11 +335,11 @@ class ClientApi:
         return await self.counted(client.identity, listen)
 
     def view(self, who: str, handle: Handle) -> messages.ServiceView:
-        """A service, as an identity is told of it."""
+        """The description of a service for an identity."""
         return messages.service_view(handle, allowed=self.judge.may_call(who, handle))
 
     def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
-        """Have services that come, go or change told of, those that the client may know of, until it is gone."""
+        """Notifies a client of services that come, go or change, if it may know of them, until it is gone."""
 
         wanted, here = _wanted(asked.group, asked.name), self._container
         with client.session.use():
@@ -349,12 +349,13 @@ class ClientApi:
                 "changed": here.changed,
             }
             return [
-                kinds[one](wanted, _Told(client, one, self.judge, tell).hear) for one in dict.fromkeys(asked.occasions)
+                kinds[one](wanted, _Notified(client, one, self.judge, tell).hear)
+                for one in dict.fromkeys(asked.occasions)
             ]
 
 
-class _Told:
-    """Tells a client of services, of those that it may know of."""
+class _Notified:
+    """Forwards notifications of services to a client, if it may know of them."""
 
     def __init__(
         self, client: Client, occasion: str, judge: ClientAuthorizer, tell: Callable[[str, Handle], object]
@@ -363,8 +364,8 @@ class _Told:
         self._occasion = occasion
         self._judge = judge
         self._tell = tell
-        self.told_as = f"tell {client.identity} (a client of the door)"
-        """In lists of notifications."""
+        self.told_as = f"notify {client.identity} (a client of the HTTP gateway)"
+        """Its text in lists of notifications."""
 
     def hear(self, handle: Handle) -> None:
         if self._judge.sees(self._client.identity, handle):

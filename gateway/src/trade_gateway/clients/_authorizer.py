@@ -1,7 +1,7 @@
-"""What the access policy lets a client do.
+"""Authorisation of clients by the access policy.
 
-The system knows the door alone: it judges every call as the door's. So the door judges first, by the same policy and
-with the client's name; and it offers nothing of the middleware's own functions, which would take its word for it.
+The system authorises every call as the HTTP gateway's own identity. So the gateway first authorises the client, by the
+same policy; and it offers no service of the middleware itself, as those would accept the gateway's identity.
 """
 
 from collections.abc import Iterable
@@ -12,15 +12,15 @@ from trade.errors import AccessDenied
 from trade.policies import Policy
 
 ANONYMOUS: Final = "anonymous"
-"""Who shows neither token nor certificate; let in only where the policy names it."""
+"""Identity of clients without a token or certificate; admitted only if the policy names it."""
 _OWN: Final = "trade"
-"""Group of the middleware's own functions."""
+"""Group of the middleware's own services."""
 _TO_SEE: Final = ("call", "read", "lock", "instrument", "administer")
-"""Any of these over a group shows what is in it."""
+"""Any of these rights over a group makes its services visible."""
 
 
 class ClientAuthorizer:
-    """Decides by the policy that the door's container has now; without one everybody may do everything."""
+    """Decides by the current policy of the container; without one everything is allowed."""
 
     def __init__(self, container: Container) -> None:
         self._access = container.access
@@ -33,22 +33,22 @@ class ClientAuthorizer:
 
     @property
     def lets_anybody_in(self) -> bool:
-        """Whether the policy has given a role to those whom nobody knows, by name and not by a pattern."""
+        """Whether the policy has a role for unidentified clients, by name and not by a pattern."""
         policy = self._access.policy
         return policy is not None and ANONYMOUS in policy.names() and bool(policy.roles_of(ANONYMOUS))
 
     @property
     def policy(self) -> Policy | None:
-        """What it goes by."""
+        """The current policy."""
         return self._access.policy
 
     def admits(self, who: str) -> bool:
-        """Whether an identity may speak at all: it is not revoked."""
+        """Whether an identity is admitted at all: it is not revoked."""
         policy = self._access.policy
         return policy is None or policy.authenticated(who).allowed
 
     def sees(self, who: str, handle: Handle) -> bool:
-        """Whether an identity may know of a service. What belongs to the middleware is for no client of the door."""
+        """Whether an identity may know of a service. No client may know of the middleware's own services."""
         policy, group = self._access.policy, handle.key.domain
         if group == _OWN:
             return False
@@ -63,31 +63,31 @@ class ClientAuthorizer:
         return True
 
     def require_call(self, who: str, handle: Handle) -> None:
-        """Raises AccessDenied: it may not call that; a stop needs no right."""
+        """Raises AccessDenied: the identity may not call the service; a stop needs no right."""
         if handle.key.domain == _OWN:
-            rule = "the door passes on no functions of the middleware"
+            rule = "the HTTP gateway forwards no calls to the middleware's own services"
             raise AccessDenied(who=who, verb="call", what=handle.label, rule=rule)
         self._container.require_call(who, handle)
 
     def require(self, who: str, verb: str, handles: Iterable[Handle]) -> None:
-        """Raises AccessDenied: it may not do that to one of these."""
+        """Raises AccessDenied: the identity lacks the right over one of these services."""
         for handle in handles:
             if handle.key.domain == _OWN:
-                rule = "the door passes on no functions of the middleware"
+                rule = "the HTTP gateway forwards no calls to the middleware's own services"
                 raise AccessDenied(who=who, verb=verb, what=handle.label, rule=rule)
             self._access.require(who, verb, handle.key.domain, handle.label)
 
     def require_some(self, who: str, what: str) -> None:
-        """Raises AccessDenied: it may not even see anything, as who has no role; so it reads nothing of the system."""
+        """Raises AccessDenied: the identity has no role, so it may read nothing of the system."""
         policy = self._access.policy
         if policy is not None and not policy.groups_of(who, _TO_SEE):
-            rule = "it has no right over any group, and reads nothing of the system; a stop needs none"
+            rule = "it has no right over any group, so it may read nothing of the system; a stop needs no right"
             raise AccessDenied(who=who, verb="read", what=what, rule=rule)
 
     def require_system(self, who: str, verb: str, what: str) -> None:
-        """Raises AccessDenied: it may not ``administer`` or ``read`` the system itself."""
+        """Raises AccessDenied: the identity may not ``administer`` or ``read`` the system itself."""
         self._access.require(who, verb, _OWN, what)
 
     def may_system(self, who: str, verb: str) -> bool:
-        """Whether it may."""
+        """Whether the identity may."""
         return self._access.denied(who, verb, _OWN, "the system") is None

@@ -1,4 +1,4 @@
-"""Clients: each a session of its own, with its locks, calls and streams, which end with it (S03, S05)."""
+"""Clients: each has its own session, and its locks, calls and streams end with it (S03, S05)."""
 
 import secrets
 import threading
@@ -16,12 +16,12 @@ MOST_CALLS: Final = 64
 MOST_CALLS_OF_ONE: Final = 16
 MOST_CLIENTS: Final = 64
 MOST_OF_ONE: Final = 16
-"""Sessions of one identity that last; those of single requests do not count."""
+"""Most lasting sessions of one identity; those of single requests do not count."""
 MOST_LOCKS: Final = 16
-"""Of one session."""
+"""Most locks of one session."""
 
 Place = tuple[object, str]
-"""A resource, and the container that judges it."""
+"""A resource, and the container that manages it."""
 
 
 class Held(Struct, frozen=True):
@@ -29,17 +29,17 @@ class Held(Struct, frozen=True):
 
     lock: Lock
     covers: frozenset[Place]
-    """What it is of."""
+    """The services that it covers."""
 
 
 class Client:
-    """One page, program or request. Its methods may wait for others: they are for threads, not for the event loop."""
+    """One page, program or request. Its methods may block: they are for threads, not for the event loop."""
 
     def __init__(self, identity: str, session: Session, left: "Callable[[Client], None]") -> None:
         self.identity: Final = identity
         self.session: Final = session
         self.secret: Final = secrets.token_urlsafe(18)
-        """What shows a request to be its own."""
+        """The secret that proves a request to be its own."""
         self._left = left
         self._locks: dict[str, Held] = {}
         self._runs: set[Run] = set()
@@ -47,8 +47,8 @@ class Client:
         self._leaving = False
         self._stops = 0
         self._stopping: dict[object, tuple[int, Callable[[], object]]] = {}
-        """The last of each stop service."""
-        self._told: list[Callable[[], object]] = []
+        """The last call of each stop service."""
+        self._callbacks: list[Callable[[], object]] = []
 
     @property
     def closed(self) -> bool:
@@ -56,7 +56,7 @@ class Client:
 
     @contextmanager
     def speaking(self) -> Generator[None]:
-        """Calls made inside are the client's, under its locks: also those that are lost, until they are given back.
+        """Makes calls inside the context as the client, under its locks, also lost ones until they are released.
 
         Raises SessionEnded.
         """
@@ -70,7 +70,7 @@ class Client:
     # --- calls
 
     def admit(self, handle: Handle) -> int:
-        """A call was asked for; returns the number of stops so far, which it raises if it is one."""
+        """Counts a request for a call; returns the number of stops so far, including this one."""
         stops = handle.effect == "stop"
         with self._guard:
             self._stops += stops
@@ -78,76 +78,76 @@ class Client:
 
     @property
     def stops(self) -> int:
-        """How many were asked for so far."""
+        """The number of stops requested so far."""
         return self._stops
 
     def overtaken(self, admitted: int) -> bool:
-        """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""
+        """Whether a stop was requested after that number; calls that had not begun by then must not begin (S08)."""
         return self._stops != admitted
 
     def stopping(self, admitted: int, handle: Handle, again: Callable[[], object]) -> None:
-        """A stop of that number is about to be sent, by this."""
+        """Registers a stop that is about to be sent, and how to repeat it."""
         self._stopping[handle.key] = admitted, again
 
     def stop_again(self, admitted: int) -> None:
-        """A call of that number was sent, perhaps after a stop that was asked for later: that has the last word."""
+        """Repeats the last stop after a call of that number, which may have been sent after a later stop."""
         for number, again in list(self._stopping.values()):
             if number > admitted:
                 again()
 
     def note(self, run: Run) -> None:
-        """It ends with the client."""
+        """Ties a call to the client's end."""
         self._runs.add(run)
         run.when_done(self._runs.discard)
-        if self.closed:  # meanwhile
+        if self.closed:  # closed meanwhile
             run.ask_to_end()
 
     def cancel(self, run: Run) -> None:
-        """End a call of its own early."""
+        """Cancels a call of this client."""
         with self.speaking():
             run.cancel()
 
     # --- locks
 
     def locking(self) -> None:
-        """Raises TooMany: it has as many as it may."""
+        """Raises TooMany: it has the most locks allowed."""
         if len(self._locks) >= MOST_LOCKS:
             raise TooMany(what="locks of this session", limit=MOST_LOCKS)
 
     def keep(self, lock: Lock, handles: list[Handle]) -> str:
-        """It has taken a lock; returns what names it."""
+        """Stores a taken lock; returns its name."""
         name = secrets.token_hex(4)
         self._locks[name] = Held(lock, frozenset(places(handles)))
-        if self.closed:  # meanwhile
+        if self.closed:  # closed meanwhile
             self.unlock(name)
         return name
 
     def unlock(self, name: str) -> bool:
-        """Give a lock back; returns whether there was one."""
+        """Releases a lock; returns whether it existed."""
         held = self._locks.pop(name, None)
         if held is not None:
             held.lock.release()
         return held is not None
 
     def name_of(self, lock: Lock) -> str:
-        """What names a lock; empty if it has it not, or not yet."""
+        """The name of a lock; empty if the client does not have it, or not yet."""
         return next((name for name, held in list(self._locks.items()) if held.lock is lock), "")
 
     def has_locked(self, handle: Handle) -> bool:
-        """Whether it holds all that a service uses."""
+        """Whether it holds all resources of a service."""
         held = {place for one in list(self._locks.values()) if one.lock.held for place in one.covers}
         return held.issuperset(places([handle]))
 
     # --- its end
 
     def when_closed(self, tell: Callable[[], object]) -> None:
-        """Have this called at its end, on any thread; at once if that has come."""
-        self._told.append(tell)
+        """Registers a callback for its end, on any thread; it runs at once if the client is closed."""
+        self._callbacks.append(tell)
         if self.closed:
             tell()
 
     def close(self) -> None:
-        """It is gone: what it moves stops, its locks fall, its calls are told to end. Idempotent."""
+        """Stops its motion, releases its locks and cancels its calls. Idempotent."""
         with self._guard:
             if self._leaving:
                 return
@@ -156,22 +156,22 @@ class Client:
         self._left(self)
         for run in list(self._runs):
             run.ask_to_end()
-        for tell in list(self._told):
+        for tell in list(self._callbacks):
             tell()
 
 
 class Clients:
-    """All of them."""
+    """The registry of clients."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
         self._all: dict[str, Client] = {}
         self._lasting: dict[object, str] = {}
-        """Whose those are that count."""
+        """Identities of the sessions that count."""
         self._guard = threading.Lock()
 
     def open(self, identity: str) -> Client:
-        """A session that lasts. Waits for others. Raises TooMany."""
+        """Opens a lasting session. May block. Raises TooMany."""
         with self._guard:
             if len(self._lasting) >= MOST_CLIENTS:
                 raise TooMany(what="sessions", limit=MOST_CLIENTS)
@@ -188,13 +188,13 @@ class Clients:
         return client
 
     def open_for_one(self, identity: str) -> Client:
-        """A session for one request; there are as many as there are requests, so that every stop has one (S07)."""
+        """Opens a session for one request. Their number is not limited, so that every stop has one (S07)."""
         client = Client(identity, self._container.open_session(identity), self._left)
         self._all[client.secret] = client
         return client
 
     def of(self, secret: str, identity: str) -> Client:
-        """The client that a request is of. Raises NoSuchSession."""
+        """The client that made a request. Raises NoSuchSession."""
         client = self._all.get(secret)
         if client is None or client.identity != identity or client.closed:
             raise NoSuchSession(session=secret[:8])
@@ -207,25 +207,25 @@ class Clients:
         return iter(list(self._all.values()))
 
     def close(self) -> None:
-        """End all. Idempotent."""
+        """Closes all clients. Idempotent."""
         for client in self:
             client.close()
 
 
 class Quota:
-    """Calls and requests for locks that have not ended; stops are not among them (S07)."""
+    """A limit of pending calls and lock requests; stops do not count (S07)."""
 
     def __init__(self) -> None:
         self._under_way: Counter[str] = Counter()
         self._guard = threading.Lock()
 
     def take(self, who: str) -> Callable[[], None]:
-        """One more; returns what is to be called once when it has ended, on any thread. Raises TooMany."""
+        """Counts one; returns a function to call once at its end, on any thread. Raises TooMany."""
         with self._guard:
             if sum(self._under_way.values()) >= MOST_CALLS:
-                raise TooMany(what="calls under way", limit=MOST_CALLS)
+                raise TooMany(what="pending calls", limit=MOST_CALLS)
             if self._under_way[who] >= MOST_CALLS_OF_ONE:
-                raise TooMany(what=f"calls of {who} under way", limit=MOST_CALLS_OF_ONE)
+                raise TooMany(what=f"pending calls of {who}", limit=MOST_CALLS_OF_ONE)
             self._under_way[who] += 1
         return lambda: self._ended(who)
 
@@ -237,7 +237,7 @@ class Quota:
 
 
 def places(handles: Iterable[Handle]) -> set[Place]:
-    """What services use, and where that is judged; one that names no resource is one itself."""
+    """The resources of services, and their containers; a service without resources counts as one."""
     return {(handle.key.address, name) for handle in handles for name in handle.resources or (_itself(handle),)}
 
 

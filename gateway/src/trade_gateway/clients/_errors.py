@@ -1,4 +1,4 @@
-"""What the HTTP API and the tools of agents refuse, each with its HTTP status."""
+"""The errors of the HTTP API and of agents' tools, each with its HTTP status."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,35 +9,35 @@ from trade.errors import CallerError
 
 
 class Refusal(CallerError):
-    """A request that was not carried out."""
+    """A request that was not executed."""
 
     http_status: ClassVar[HTTPStatus] = HTTPStatus.CONFLICT
 
 
 @dataclass(kw_only=True, eq=False)
 class TooMany(Refusal, BlockingIOError):
-    """More at once than is taken from one client, or from all; nothing was done."""
+    """A limit of one client, or of all, is reached; nothing was done."""
 
     http_status = HTTPStatus.TOO_MANY_REQUESTS
     what: str
     limit: int
 
     def describe(self) -> str:
-        return f"there are {self.limit} {self.what} already, which is the limit; end some, or try again later"
+        return f"there are {self.limit} {self.what} already, which is the limit. End some, or try again later"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchSession(Refusal, LookupError):
-    """There is no such session of this client; nothing was done, and what it had set moving was told to stop."""
+    """This client has no such session. Nothing was done; the motion of a session that has ended stops."""
 
     http_status = HTTPStatus.NOT_FOUND
     session: str
-    """How the id begins that was sent."""
+    """The first characters of the id that was sent."""
 
     def describe(self) -> str:
         return (
-            f"this client has no session {self.session}...: it was closed, or nothing was heard of it within its "
-            "lease; POST /session opens another one"
+            f"this client has no session {self.session}...: it was closed, or it expired after its lease without a "
+            "request. POST /session opens another one"
         )
 
 
@@ -48,57 +48,57 @@ class NoAuditRecord(Refusal, LookupError):
     http_status = HTTPStatus.NOT_FOUND
 
     def describe(self) -> str:
-        return "no audit record is kept; TRADE_AUDIT=FOLDER keeps one"
+        return "no audit record is kept. TRADE_AUDIT=FOLDER enables it"
 
 
 @dataclass(kw_only=True, eq=False)
 class NotLetIn(Refusal, PermissionError):
-    """Nobody knows who asks; nothing was done."""
+    """The client cannot be identified; nothing was done."""
 
     http_status = HTTPStatus.UNAUTHORIZED
     reason: str
 
     def describe(self) -> str:
-        return f"{self.reason}; show a token (Authorization: Bearer ...), which `trade door token NAME` makes"
+        return f"{self.reason}. Send a token (Authorization: Bearer ...), which `trade door token NAME` creates"
 
 
 @dataclass(kw_only=True, eq=False)
 class WrongDoor(Refusal, PermissionError):
-    """A page of another site, or somebody under another name of this host; nothing was done."""
+    """The request came from a page of another site, or names another host; nothing was done."""
 
     http_status = HTTPStatus.FORBIDDEN
     what: str
     remedy: str
 
     def describe(self) -> str:
-        return f"{self.what} is not let in; {self.remedy}"
+        return f"{self.what} is refused; {self.remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
 class NeedsSession(Refusal, LookupError):
-    """What was asked for lives as long as its session, and a plain request has none that lasts."""
+    """The operation needs a session that outlives its request; a plain request has none."""
 
     http_status = HTTPStatus.BAD_REQUEST
     what: str
 
     def describe(self) -> str:
-        return f"{self.what} needs a session: POST /session and send its id as Trade-Session, or speak over /ws"
+        return f"{self.what} needs a session. POST /session and send its id as Trade-Session, or connect to /ws"
 
 
 @dataclass(kw_only=True, eq=False)
 class BadMessage(Refusal, ValueError):
-    """A body or message is no JSON, or not of the form that belongs here; nothing was done."""
+    """A body or message is not JSON, or has the wrong structure; nothing was done."""
 
     http_status = HTTPStatus.BAD_REQUEST
     problem: str
 
     def describe(self) -> str:
-        return f"this cannot be read: {self.problem}; /openapi.json says what belongs here"
+        return f"this cannot be read: {self.problem}. /openapi.json describes the valid messages"
 
 
 @dataclass(kw_only=True, eq=False)
 class HttpError(Refusal):
-    """What HTTP itself refuses."""
+    """An error of HTTP itself."""
 
     status: int
     problem: str
@@ -109,34 +109,34 @@ class HttpError(Refusal):
 
 @dataclass(kw_only=True, eq=False)
 class NeedsLock(Refusal, PermissionError):
-    """An agent moves only what it has locked; nothing was done."""
+    """An agent moves only resources that it has locked; nothing was done."""
 
     service: str
     resources: Sequence[str]
 
     def describe(self) -> str:
-        return f"{self.service} uses {', '.join(self.resources)}; take a lock over its group first (tool lock)"
+        return f"{self.service} uses {', '.join(self.resources)}. Lock its group first with the tool `lock`"
 
 
 @dataclass(kw_only=True, eq=False)
 class NeedsApproval(Refusal, PermissionError):
-    """A person who was asked did not say yes; nothing was done."""
+    """No person has approved the call; nothing was done."""
 
     service: str
     reason: str
 
     def describe(self) -> str:
-        return f"{self.service} needs somebody's approval: {self.reason}"
+        return f"{self.service} needs a person's approval: {self.reason}"
 
 
 @dataclass(kw_only=True, eq=False)
 class NoTwin(Refusal, LookupError):
-    """There is nothing to try it on; nothing was done."""
+    """There is no simulated twin for a dry run; nothing was done."""
 
     reason: str
 
     def describe(self) -> str:
-        return f"{self.reason}; start the server with --twin ROBOT.toml for a simulated one"
+        return f"{self.reason}. Start the server with --twin ROBOT.toml for a simulated one"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -151,10 +151,10 @@ class WrongTool(Refusal, ValueError):
 
 @dataclass(kw_only=True, eq=False)
 class NoSuchTool(Refusal, LookupError):
-    """There is no such tool."""
+    """This tool does not exist."""
 
     name: str
     known: Sequence[str]
 
     def describe(self) -> str:
-        return f"there is no tool {self.name!r}; there is {', '.join(self.known)}"
+        return f"there is no tool {self.name!r}. Use one of {', '.join(self.known)}"

@@ -1,4 +1,4 @@
-"""How an error is shown to a client, whatever protocol carries it: its name, HTTP status, message and data."""
+"""Errors for clients, independent of the protocol: name, HTTP status, message and data."""
 
 from dataclasses import fields
 from http import HTTPStatus
@@ -44,18 +44,18 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
     (errors.CallError, HTTPStatus.BAD_GATEWAY),
     (errors.DeviceError, HTTPStatus.BAD_GATEWAY),
 )
-"""The first that fits; whatever else a provider raises is 500."""
+"""The first match counts; any other exception of a provider is 500."""
 
 
 def status_of(error: BaseException) -> int:
-    """The HTTP status that says most of an error."""
+    """The HTTP status that describes an error best."""
     if isinstance(error, Refusal):
         return error.status if isinstance(error, HttpError) else error.http_status
     return next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
 
 
 def problem_of(error: BaseException) -> Problem:
-    """An error as it is told to clients, without a traceback."""
+    """An error for clients, without a traceback."""
     name, status = type(error).__name__, status_of(error)
     if isinstance(error, HttpError):
         return Problem("about:blank", HTTPStatus(status).phrase, status, str(error))

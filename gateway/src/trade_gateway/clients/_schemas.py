@@ -1,4 +1,4 @@
-"""What clients say and are told, over HTTP and over the WebSocket: records, read strictly."""
+"""Messages of clients and answers to them, over HTTP and WebSocket: records, decoded strictly."""
 
 import sys
 from typing import Annotated, Any, Final, Literal, TypeVar, cast
@@ -13,14 +13,14 @@ from trade_gateway.clients._errors import BadMessage
 T = TypeVar("T")
 
 APPROVALS: Final = "approvals"
-"""Where what waits is a service."""
+"""Group of the services for pending approvals."""
 
 MOST_DEADLINE_S: Final = 86_400.0
 SESSION_LEASE_S: Final = 2.0
 LEAST_INTEGER: Final = -(2**63)
 MOST_INTEGER: Final = 2**64 - 1
 _MOST_DEEP: Final = 100
-"""How deep arguments may be nested."""
+"""The deepest nesting of arguments."""
 _MOST_EXACT: Final = 2**53
 
 Deadline = Annotated[float, Meta(gt=0, le=MOST_DEADLINE_S)]
@@ -35,7 +35,7 @@ Id = Annotated[str, Meta(max_length=80)] | int
 
 class CallBody(Struct, forbid_unknown_fields=True, kw_only=True):
     args: Arguments = {}
-    """By place, or by name."""
+    """Positional (a list) or named (an object)."""
     deadline_s: Deadline = 10.0
     container: str = ""
     """Only the service of this container."""
@@ -55,7 +55,7 @@ class GroupBody(Struct, forbid_unknown_fields=True, kw_only=True):
 
 class RequestBody(Struct, forbid_unknown_fields=True, kw_only=True):
     resources: Annotated[list[str], Meta(min_length=1, max_length=200)]
-    """As ``GET /locks`` names them."""
+    """Names from ``GET /locks``."""
     reason: Annotated[str, Meta(max_length=200)] = ""
 
 
@@ -65,7 +65,7 @@ class EstopBody(Struct, forbid_unknown_fields=True, kw_only=True):
 
 class ClearBody(Struct, forbid_unknown_fields=True, kw_only=True):
     ids: list[str] = []
-    """None: all that are open."""
+    """None: all open e-stops."""
 
 
 class TracingBody(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -74,7 +74,7 @@ class TracingBody(Struct, forbid_unknown_fields=True, kw_only=True):
 
 class SessionBody(Struct, forbid_unknown_fields=True, kw_only=True):
     lease_s: Annotated[float, Meta(ge=0.2, le=60)] = SESSION_LEASE_S
-    """How long it outlives its last request, and what it moves with it."""
+    """Time after its last request until the session and its motion end, in seconds."""
 
 
 # --- messages of the WebSocket
@@ -118,19 +118,19 @@ class Watch(Struct, tag="watch", tag_field="do", forbid_unknown_fields=True, kw_
     name: str | None = None
     occasions: tuple[Occasion, ...] = ("joined", "left", "changed")
     existing: bool = False
-    """Also tell of what is there already, as joined."""
+    """Whether present services are also reported, as joined."""
 
 
 class Logs(Struct, tag="logs", tag_field="do", forbid_unknown_fields=True, kw_only=True):
     id: Id
     level: Annotated[int, Meta(ge=0, le=100)] = 20
-    """The least, as Python counts them: 20 is info, 30 warning, 40 error."""
+    """The lowest level, in Python's numbers: 20 is info, 30 warning, 40 error."""
 
 
 class Calls(Struct, tag="calls", tag_field="do", forbid_unknown_fields=True, kw_only=True):
     id: Id
     reads: bool = False
-    """Also those of services that only read: streams make many of them."""
+    """Whether calls of services that only read are included; streams make many of them."""
 
 
 class Cancel(Struct, tag="cancel", tag_field="do", forbid_unknown_fields=True, kw_only=True):
@@ -148,16 +148,16 @@ Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Logs | Call
 class Me(Struct, frozen=True):
     identity: str
     administers: bool
-    """The system: it may clear e-stops."""
+    """Over the system: it may clear e-stops."""
     reads: bool
-    """The system: its log, calls, notifications, hooks and policy."""
+    """Over the system: it may read its log, calls, notifications, hooks and policy."""
     instruments: bool
-    """The system: it may have calls noted."""
+    """Over the system: it may turn tracing on and off."""
 
 
 class ServiceView(Struct, frozen=True):
     group: str
-    """With the name: where it is called."""
+    """Group and name identify the service in a call."""
     name: str
     groups: tuple[str, ...]
     signature: str
@@ -172,10 +172,10 @@ class ServiceView(Struct, frozen=True):
 
 
 class CallView(Struct, frozen=True):
-    """A call that has ended, as the container noted it that asked for it or that served it."""
+    """A call that has ended, as recorded by its calling or its serving container."""
 
     id: str
-    """As text: it is larger than the numbers that pages can hold."""
+    """As text: it exceeds the range of numbers in JavaScript."""
     service: str
     side: str
     container: str
@@ -202,17 +202,17 @@ class AuditView(Struct, frozen=True, kw_only=True):
 
 
 class IdentityView(Struct, frozen=True):
-    """What the policy lets an identity do, or all that fit a pattern."""
+    """The rights of an identity, or of all that match a pattern."""
 
     name: str
     roles: tuple[str, ...]
     rights: dict[str, list[str]]
-    """Groups by what it may do in them."""
+    """Groups by right."""
 
 
 class PolicyView(Struct, frozen=True):
     governed: bool
-    """Whether there is a policy; without one everybody may do everything."""
+    """Whether there is a policy; without one everything is allowed."""
     identities: tuple[IdentityView, ...]
     revoked: tuple[str, ...]
 
@@ -227,7 +227,7 @@ class LockView(Struct, frozen=True):
     resources: tuple[str, ...]
     container: str
     owner: str
-    """``identity/container``, or the client of a door behind it."""
+    """``identity/container``, or the client of an HTTP gateway behind it."""
     purpose: str
     since: float
     waiting: tuple[str, ...]
@@ -235,17 +235,17 @@ class LockView(Struct, frozen=True):
 
 class LockTaken(Struct, frozen=True):
     lock: str
-    """What releases it."""
+    """The name that releases it."""
     resources: tuple[str, ...]
     missing: tuple[str, ...] = ()
-    """What belongs to the group and was not there; only with ``partial``."""
+    """Resources of the group that were missing; only with ``partial``."""
 
 
 class SessionOpened(Struct, frozen=True):
     session: str
-    """To be sent as ``Trade-Session``; a secret of the client's."""
+    """To be sent as ``Trade-Session``; a secret of the client."""
     name: str
-    """As others see it."""
+    """Its name for other clients."""
     lease_s: float
 
 
@@ -255,7 +255,7 @@ class EstopView(Struct, frozen=True):
     reason: str
     at: float
     told_by: str = ""
-    """Who told of it, if that is not its giver: that one may have made it up."""
+    """The container that reported it, if this is not its giver: the report may be false."""
 
 
 class Stopped(Struct, frozen=True):
@@ -265,7 +265,7 @@ class Stopped(Struct, frozen=True):
     missing: tuple[str, ...]
     failed: dict[str, str]
     apart: dict[str, str] = {}
-    """Endpoints that the door dials and where nobody was found: who is there was not told."""
+    """Endpoints that the gateway dials without an answer: containers there did not receive the e-stop."""
 
 
 def service_view(handle: Handle, *, allowed: bool) -> ServiceView:
@@ -311,20 +311,20 @@ def policy_view(policy: Policy | None) -> PolicyView:
 def lock_view(info: LockInfo) -> LockView:
     holder = info.holder
     client = holder.session.partition(f"{holder.container}/")[2].partition("/")[2]
-    own = client and ":" not in client  # of another system: its owner says so already
+    own = client and ":" not in client  # of another system: its owner contains the client already
     owner = f"{holder.owner} for {client.rpartition('.')[0]}" if own else holder.owner
     return LockView(info.resources, info.container, owner, holder.purpose, holder.since, info.waiting)
 
 
 def plain(value: Any) -> Any:
-    """Values that JSON has no form for."""
+    """Converts values that JSON does not have."""
     if isinstance(value, Handle):
         return {"service": value.label, "container": value.container}
-    raise TypeError(f"a {type(value).__qualname__} has no form in JSON")
+    raise TypeError(f"a {type(value).__qualname__} cannot be expressed in JSON")
 
 
 def numbers(value: Any, deep: int = 0) -> Any:
-    """JSON has one kind of number: 2.0 is an integer where one is asked for, and what no integer holds is a float.
+    """Normalises numbers, as JSON has one kind: 2.0 becomes an integer, and an integer out of range a float.
 
     Raises ValueError: it is nested more than ``_MOST_DEEP`` deep.
     """
@@ -344,7 +344,7 @@ def numbers(value: Any, deep: int = 0) -> Any:
 
 
 def read(text: str | bytes, decoder: msgspec.json.Decoder[T]) -> T:
-    """What a client has sent. Raises BadMessage: it is no JSON, or not of this form."""
+    """Decodes a message of a client. Raises BadMessage: it is not JSON, or has the wrong structure."""
     try:
         return decoder.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as bad:
@@ -352,6 +352,6 @@ def read(text: str | bytes, decoder: msgspec.json.Decoder[T]) -> T:
 
 
 NO_JSON: Final = (TypeError, ValueError, OverflowError, RecursionError)
-"""What encoding raises of values that have no form in JSON."""
+"""What encoding raises for values that JSON does not have."""
 encoder: Final = msgspec.json.Encoder(enc_hook=plain)
 ASKED: Final[msgspec.json.Decoder[Asked]] = msgspec.json.Decoder(Asked)

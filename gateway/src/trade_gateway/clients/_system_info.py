@@ -1,4 +1,4 @@
-"""What clients are told of the system itself, its calls and its audit record, as far as the policy lets them."""
+"""Information for clients about the system itself, its calls and its audit record, within their rights."""
 
 import heapq
 import sqlite3
@@ -21,7 +21,7 @@ from trade_gateway.clients._schemas import AuditView
 
 
 def newest(folder: Path, most: int) -> list[AuditView]:
-    """The newest rows of all records, the newest first.
+    """Returns the newest rows of all records, the newest first.
 
     Raises:
         ConfigurationError: one of them cannot be read.
@@ -56,25 +56,25 @@ def _view(container: str, row: AuditRow) -> AuditView:
 
 
 _MOST: Final = 200
-"""Of what was noted before anybody asked."""
+"""Number of calls that were recorded before the first request."""
 
 
 class CallReader:
-    """Reads on where it was: each call once, or twice if who called and who served it are both traced.
+    """Reads recorded calls incrementally: each once, or twice if caller and callee are both traced.
 
     Args:
-        container: of whose system.
-        reads: also calls of services that only read.
+            container: its system is read.
+            reads: whether calls of services that only read are included.
     """
 
     def __init__(self, container: Container, *, reads: bool) -> None:
         self._container = container
         self._reads = reads
         self._read: dict[Handle, int] = {}
-        """By what tells of a container's calls, the number of the last one told."""
+        """For each source of a container's calls, the number of the last one read."""
 
     def read(self) -> list[Span]:
-        """What has ended since the last time, in the order in which it began; the first time the newest 200.
+        """Returns the calls that have ended since the last read, in order of their start; at first the newest 200.
 
         Raises:
             AccessDenied: the policy does not let this container read group ``trade``.
@@ -86,7 +86,7 @@ class CallReader:
         for outcome in self._container.call_all([one.bind(None, self._read.get(one, 0)) for one in handles]):
             if isinstance(outcome.error, AccessDenied):
                 raise outcome.error
-            if not outcome.ok:  # it has left meanwhile
+            if not outcome.ok:  # it has shut down meanwhile
                 continue
             spans: list[Span] = outcome.result
             self._read[outcome.handle] = spans[-1].number if spans else self._read.get(outcome.handle, 0)
@@ -96,21 +96,21 @@ class CallReader:
 
 
 _ROWS: Final = 200
-"""Of the audit records."""
+"""Number of rows of the audit records."""
 _REACHABILITY_S: Final = 2.0
-"""How old it may be: finding out why there is no link takes as long."""
+"""Longest age of a result, in seconds; finding out why a link is missing takes as long."""
 
 Counted = Callable[..., Coroutine[Any, Any, Any]]
-"""Does something in a thread, as one of what an identity may have under way."""
+"""Runs a function in a thread, counted against the limits of an identity."""
 
 
 class Overview:
-    """Of the system that clients are let into.
+    """Information about the system for its clients.
 
     Args:
-        container: that acts for them.
-        judge: of its clients.
-        counted: called with an identity, what to do, and with which arguments.
+            container: the gateway's container.
+            judge: authorises its clients.
+            counted: runs a function with its arguments for an identity.
     """
 
     def __init__(self, container: Container, judge: ClientAuthorizer, counted: Counted) -> None:
@@ -122,19 +122,19 @@ class Overview:
         self._looked_at = 0.0
 
     def me(self, who: str) -> messages.Me:
-        """What an identity is here."""
+        """Returns the identity and its rights over the system."""
         administers, reads, instruments = (
             self._judge.may_system(who, verb) for verb in ("administer", "read", "instrument")
         )
         return messages.Me(who, administers, reads, instruments)
 
     def policy(self, who: str) -> messages.PolicyView:
-        """Who may do what. Raises AccessDenied."""
+        """Returns the access policy. Raises AccessDenied."""
         self._judge.require_system(who, "read", "policy")
         return messages.policy_view(self._judge.policy)
 
     async def audit(self, who: str) -> list[messages.AuditView]:
-        """The newest rows of the audit records of this host. Raises AccessDenied, NoAuditRecord."""
+        """Returns the newest rows of the audit records of this host. Raises AccessDenied, NoAuditRecord."""
         self._judge.require_system(who, "administer", "audit")
         folder = self._container.settings.audit
         if folder is None:
@@ -142,24 +142,24 @@ class Overview:
         return await self._counted(who, newest, folder, _ROWS)
 
     async def set_tracing(self, who: str, *, on: bool) -> list[str]:
-        """Have the system's containers note calls; which of them do. Raises AccessDenied."""
+        """Turns tracing on or off in the system's containers; returns those that trace. Raises AccessDenied."""
         self._judge.require_system(who, "instrument", "tracing")
         return await self._counted(who, self._container.set_tracing, on)
 
     async def calls(self, who: str, reader: CallReader) -> list[Span]:
-        """What calls have ended since the last time. Raises AccessDenied."""
+        """Returns the calls that have ended since the last read. Raises AccessDenied."""
         self._judge.require_system(who, "read", "calls")
         return await self._counted(who, reader.read)
 
     def ended(self, *, reads: bool) -> CallReader:
-        """Of the calls of the system that are noted, from what is kept of them."""
+        """Returns a reader of the system's recorded calls."""
         return CallReader(self._container, reads=reads)
 
     async def reachability(self, who: str) -> Reachability:
-        """Whom the door has found, and where nobody; looked at once for all who ask within two seconds.
+        """Returns the containers found and the endpoints without any; shared by requests within two seconds.
 
         Raises:
-            AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
+                AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
         """
         self._judge.require_some(who, "sight")
         return await self._counted(who, self._look)
@@ -172,30 +172,30 @@ class Overview:
             return self._reachability
 
     def containers(self, who: str) -> list[messages.ContainerView]:
-        """Those of the system."""
+        """Returns the containers of the system."""
         self._judge.require_some(who, "containers")
         return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
 
     async def loads(self, who: str) -> list[LoadInfo]:
-        """How busy they are; takes a second."""
+        """Returns the containers' load; takes a second."""
         self._judge.require_some(who, "loads")
         return await self._counted(who, loads, self._container)
 
     async def notifications(self, who: str) -> list[NotificationInfo]:
-        """Those that stand. Raises AccessDenied."""
+        """Returns the active notifications. Raises AccessDenied."""
         self._judge.require_system(who, "read", "notifications")
         return await self._counted(who, self._container.notifications)
 
     async def hooks(self, who: str) -> list[HookInfo]:
-        """Those that are attached. Raises AccessDenied."""
+        """Returns the attached hooks. Raises AccessDenied."""
         self._judge.require_system(who, "read", "hooks")
         return await self._counted(who, self._container.hooks)
 
     async def log_lines(self, who: str, reader: LogReader) -> list[LogLine]:
-        """What the system has logged since the last time. Raises AccessDenied."""
+        """Returns the system's log lines since the last read. Raises AccessDenied."""
         self._judge.require_system(who, "read", "log")
         return await self._counted(who, reader.read)
 
     def log(self) -> LogReader:
-        """Of all processes of the system, from what they still have on."""
+        """Returns a reader of all logs of the system, from the lines that are still kept."""
         return LogReader(self._container, "*")

@@ -32,8 +32,8 @@ Answer = Callable[[Request], Awaitable[Response]]
 class Http:
     """The routes."""
 
-    def __init__(self, deeds: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
-        self._deeds = deeds
+    def __init__(self, api: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
+        self._api = api
         self._authenticator = authenticator
         self._leases = leases
 
@@ -72,7 +72,7 @@ class Http:
                     raise BadMessage(problem=f"{', '.join(unknown)} cannot be asked for here, or not twice")
                 return await by_method[method](request)
             except TradeError as error:
-                self._deeds.note_refused(error)
+                self._api.note_refused(error)
                 headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotLetIn) else None
                 return problem_response(error, headers)
 
@@ -81,51 +81,51 @@ class Http:
     # --- looking
 
     async def openapi(self, request: Request) -> Response:
-        return _answer(document(self._deeds.seen(self._who(request))))
+        return _answer(document(self._api.seen(self._who(request))))
 
     async def services(self, request: Request) -> Response:
         asked = request.query_params
         who = self._who(request)
-        found = self._deeds.seen(who, asked.get("group"), asked.get("name"))
-        return _answer([self._deeds.view(who, handle) for handle in found])
+        found = self._api.seen(who, asked.get("group"), asked.get("name"))
+        return _answer([self._api.view(who, handle) for handle in found])
 
     async def me(self, request: Request) -> Response:
-        return _answer(self._deeds.overview.me(self._who(request)))
+        return _answer(self._api.overview.me(self._who(request)))
 
     async def loads(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.loads(self._who(request)))
+        return _answer(await self._api.overview.loads(self._who(request)))
 
     async def notifications(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.notifications(self._who(request)))
+        return _answer(await self._api.overview.notifications(self._who(request)))
 
     async def hooks(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.hooks(self._who(request)))
+        return _answer(await self._api.overview.hooks(self._who(request)))
 
     async def policy(self, request: Request) -> Response:
-        return _answer(self._deeds.overview.policy(self._who(request)))
+        return _answer(self._api.overview.policy(self._who(request)))
 
     async def audit(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.audit(self._who(request)))
+        return _answer(await self._api.overview.audit(self._who(request)))
 
     async def tracing(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.TracingBody)
-        return _answer({"containers": await self._deeds.overview.set_tracing(who, on=body.on)})
+        return _answer({"containers": await self._api.overview.set_tracing(who, on=body.on)})
 
     async def containers(self, request: Request) -> Response:
-        return _answer(self._deeds.overview.containers(self._who(request)))
+        return _answer(self._api.overview.containers(self._who(request)))
 
     async def reachability(self, request: Request) -> Response:
-        return _answer(await self._deeds.overview.reachability(self._who(request)))
+        return _answer(await self._api.overview.reachability(self._who(request)))
 
     # --- calling
 
     async def call(self, request: Request) -> Response:
         who, body = self._authenticator.who(request.scope), await _body(request, messages.CallBody)
-        handle = self._deeds.find(who, request.path_params["group"], request.path_params["name"], body.container)
+        handle = self._api.find(who, request.path_params["group"], request.path_params["name"], body.container)
         named = self._heard(request, who, stops=handle.effect == "stop")
         async with self._client(request, who, named) as (client, alone):
             gone = lambda: _gone(request)  # noqa: E731
-            run = await self._deeds.call(client, handle, body, gone, alone=alone)
+            run = await self._api.call(client, handle, body, gone, alone=alone)
         error = run.exception(0)
         if error is not None:
             return problem_response(error)
@@ -138,7 +138,7 @@ class Http:
 
     async def open_session(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.SessionBody)
-        client = await self._deeds.apart(self._deeds.clients.open, who)
+        client = await self._api.apart(self._api.clients.open, who)
         self._leases.begin(client, body.lease_s, lambda: self._authenticator.still(request.scope, who))
         return _answer(messages.SessionOpened(client.secret, client.session.name, body.lease_s), 201)
 
@@ -148,48 +148,48 @@ class Http:
 
     async def close_session(self, request: Request) -> Response:
         client = self._lasting(request, self._who(request), "this")
-        await self._deeds.apart(client.close, stops=True)
+        await self._api.apart(client.close, stops=True)
         return Response(status_code=204)
 
     # --- locks and stops
 
     async def locks(self, request: Request) -> Response:
-        return _answer(await self._deeds.locks(self._who(request)))
+        return _answer(await self._api.locks(self._who(request)))
 
     async def lock(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.LockBody)
         client = self._lasting(request, who, "a lock")
-        return _answer(await self._deeds.lock(client, body, _lost), 201)
+        return _answer(await self._api.lock(client, body, _lost), 201)
 
     async def unlock(self, request: Request) -> Response:
         client = self._lasting(request, self._who(request), "a lock")
-        if not await self._deeds.apart(client.unlock, request.path_params["lock"]):
+        if not await self._api.apart(client.unlock, request.path_params["lock"]):
             raise HttpError(status=404, problem="this session has no such lock, or it was lost")
         return Response(status_code=204)
 
     async def request_release(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.RequestBody)
-        return _answer({"asked": await self._deeds.request_release(who, body)})
+        return _answer({"asked": await self._api.request_release(who, body)})
 
     async def break_locks(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.RequestBody)
-        return _answer(await self._deeds.break_locks(who, body))
+        return _answer(await self._api.break_locks(who, body))
 
     async def resume(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.GroupBody)
         async with self._client(request, who, self._heard(request, who)) as (client, _):
-            return _answer({"resumed": await self._deeds.resume(client, body)})
+            return _answer({"resumed": await self._api.resume(client, body)})
 
     async def estops(self, request: Request) -> Response:
-        return _answer(self._deeds.estops(self._who(request)))
+        return _answer(self._api.estops(self._who(request)))
 
     async def estop(self, request: Request) -> Response:
         who = self._authenticator.who(request.scope)
         self._heard(request, who, stops=True)
-        return _answer(await self._deeds.estop(who, await _body(request, messages.EstopBody)))
+        return _answer(await self._api.estop(who, await _body(request, messages.EstopBody)))
 
     async def clear(self, request: Request) -> Response:
-        return _answer(await self._deeds.clear(self._who(request), await _body(request, messages.ClearBody)))
+        return _answer(await self._api.clear(self._who(request), await _body(request, messages.ClearBody)))
 
     # --- who, and in which session
 
@@ -207,7 +207,7 @@ class Http:
         if secret is None:
             return None
         try:
-            client = self._deeds.clients.of(secret, who)
+            client = self._api.clients.of(secret, who)
         except NoSuchSession:
             if stops:
                 return None
@@ -228,12 +228,12 @@ class Http:
         if named is not None:
             yield named, False
             return
-        client = await self._deeds.apart(self._deeds.clients.open_for_one, who, stops=True)
+        client = await self._api.apart(self._api.clients.open_for_one, who, stops=True)
         self._leases.begin(client, 0, lambda: self._authenticator.still(request.scope, who))
         try:
             yield client, True
         finally:
-            await asyncio.shield(asyncio.ensure_future(self._deeds.apart(client.close, stops=True)))
+            await asyncio.shield(asyncio.ensure_future(self._api.apart(client.close, stops=True)))
 
 
 def _lost(_name: str, _error: LockLost) -> None:

@@ -72,14 +72,14 @@ class Door:
         hosts: Sequence[str] = (),
     ) -> None:
         host, port = _address(listen)
-        deeds = ClientApi(container)
-        _check_reach(listen, host, deeds, tls)
-        if not tokens and tls is None and not deeds.judge.lets_anybody_in:
+        api = ClientApi(container)
+        _check_reach(listen, host, api, tls)
+        if not tokens and tls is None and not api.judge.lets_anybody_in:
             problem = "nobody could come in: make a token with trade door token NAME"
             raise ConfigurationError(where=f"door {listen}", problem=problem)
-        self._deeds = deeds
+        self._api = api
         names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
-        self._app = _application(deeds, tokens, names, origins)
+        self._app = _application(api, tokens, names, origins)
         context = None if tls is None else _context(tls)
         self._socket = BoundedListener(_bound(host, port), _MOST_DESCRIPTORS)
         self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
@@ -119,7 +119,7 @@ class Door:
 
     def close(self) -> None:
         """Let nobody in any more; what clients have set moving stops. Idempotent."""
-        self._deeds.clients.close()
+        self._api.clients.close()
         self._server.should_exit = True
         if self._thread.ident is not None:
             self._thread.join(_JOINED_WITHIN_S)
@@ -138,8 +138,8 @@ class Door:
         self.close()
 
 
-def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
-    authenticator, leases = Authenticator(tokens, deeds.judge), Leases(deeds)
+def _application(api: ClientApi, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
+    authenticator, leases = Authenticator(tokens, api.judge), Leases(api)
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
@@ -148,7 +148,7 @@ def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origi
             yield
         finally:
             watching.cancel()
-            await deeds.apart(deeds.clients.close, stops=True)
+            await api.apart(api.clients.close, stops=True)
 
     middleware = [Middleware(Gate, hosts=hosts, origins=origins)]
     if origins:
@@ -159,8 +159,8 @@ def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origi
         )
     application = Starlette(
         routes=[
-            *Http(deeds, authenticator, leases).routes(),
-            WebSocketRoute("/ws", Socket(deeds, authenticator, leases).serve),
+            *Http(api, authenticator, leases).routes(),
+            WebSocketRoute("/ws", Socket(api, authenticator, leases).serve),
             *pages(),
         ],
         middleware=middleware,
@@ -181,14 +181,14 @@ def _address(listen: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _check_reach(listen: str, host: str, deeds: ClientApi, tls: Path | None) -> None:
+def _check_reach(listen: str, host: str, api: ClientApi, tls: Path | None) -> None:
     """S21: raises ConfigurationError if it would be reached from a network by accident."""
     if is_loopback(host):
         return
     if tls is None:
         problem = "is beyond this host, where tokens would be read by others: --tls FOLDER, which trade pki issue makes"
         raise ConfigurationError(where=f"listen {listen}", problem=problem)
-    if not deeds.judge.governed:
+    if not api.judge.governed:
         problem = "is beyond this host, and no policy says who may do what: set TRADE_POLICY"
         raise ConfigurationError(where=f"listen {listen}", problem=problem)
 

@@ -23,8 +23,8 @@ class Lease:
 class Leases:
     """Of all sessions. Belongs to the event loop."""
 
-    def __init__(self, deeds: ClientApi) -> None:
-        self._deeds = deeds
+    def __init__(self, api: ClientApi) -> None:
+        self._api = api
         self._leases: dict[Client, Lease] = {}
         self._closing: set[asyncio.Task[None]] = set()
 
@@ -69,7 +69,7 @@ class Leases:
                     self._end(client)
 
     def _end(self, client: Client) -> None:
-        closing = asyncio.ensure_future(self._deeds.apart(client.close, stops=True))
+        closing = asyncio.ensure_future(self._api.apart(client.close, stops=True))
         self._closing.add(closing)
         closing.add_done_callback(self._closing.discard)
 

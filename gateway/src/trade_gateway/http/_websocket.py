@@ -39,8 +39,8 @@ _ENDED: Final = 1008
 class Socket:
     """Its endpoint."""
 
-    def __init__(self, deeds: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
-        self._deeds = deeds
+    def __init__(self, api: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
+        self._api = api
         self._authenticator = authenticator
         self._leases = leases
 
@@ -48,7 +48,7 @@ class Socket:
         """One connection, from its handshake to its end."""
         try:
             who = self._authenticator.who(websocket.scope)
-            client = await self._deeds.apart(self._deeds.clients.open, who, stops=True)
+            client = await self._api.apart(self._api.clients.open, who, stops=True)
         except TradeError as error:
             await websocket.send_denial_response(problem_response(error))
             return
@@ -56,11 +56,11 @@ class Socket:
             offered = SUBPROTOCOL in websocket.scope["subprotocols"]
             await websocket.accept(SUBPROTOCOL if offered else None)
             self._leases.begin(client, 0, lambda: self._authenticator.still(websocket.scope, who))
-            await Conversation(websocket, client, self._deeds).run()
+            await Conversation(websocket, client, self._api).run()
             with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is gone
                 await websocket.close(_ENDED)
         finally:
-            await asyncio.shield(asyncio.ensure_future(self._deeds.apart(client.close, stops=True)))
+            await asyncio.shield(asyncio.ensure_future(self._api.apart(client.close, stops=True)))
 
 
 class _Ongoing:
@@ -118,10 +118,10 @@ class _Line:
 class Conversation:
     """With one client."""
 
-    def __init__(self, websocket: WebSocket, client: Client, deeds: ClientApi) -> None:
+    def __init__(self, websocket: WebSocket, client: Client, api: ClientApi) -> None:
         self._websocket = websocket
         self._client = client
-        self._deeds = deeds
+        self._api = api
         self._tasks = anyio.create_task_group()
         self._ongoing: dict[messages.Id, _Ongoing] = {}
         self._stops: defaultdict[object, _Line] = defaultdict(_Line)
@@ -193,7 +193,7 @@ class Conversation:
         try:
             ongoing = self._admitted(asked)
         except TradeError as error:
-            self._deeds.note_refused(error)
+            self._api.note_refused(error)
             self._note({"id": asked.id, "problem": problem_of(error)})
             return
         self._ongoing[asked.id] = ongoing
@@ -205,7 +205,7 @@ class Conversation:
             raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
         handle = None
         if isinstance(asked, messages.Call | messages.Stream):
-            handle = self._deeds.find(self._client.identity, asked.group, asked.name, asked.container)
+            handle = self._api.find(self._client.identity, asked.group, asked.name, asked.container)
         stop = _stopping(asked, handle)
         if len(self._ongoing) >= MOST_UNDER_WAY and stop is None:
             raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
@@ -224,7 +224,7 @@ class Conversation:
                 result = await (self._done(ongoing) if stop is None else self._stop(stop, ongoing))
             answer = {"id": name, "result": result}
         except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
-            self._deeds.note_refused(error)
+            self._api.note_refused(error)
             answer = {"id": name, "problem": problem_of(error)}
         del self._ongoing[name]
         await self._say(answer)
@@ -242,13 +242,13 @@ class Conversation:
             case messages.Logs() | messages.Calls():
                 return await (self._logs(asked) if isinstance(asked, messages.Logs) else self._calls(asked))
             case messages.TakeLock():
-                return await self._deeds.lock(self._client, asked, self._lock_lost)
+                return await self._api.lock(self._client, asked, self._lock_lost)
             case messages.Unlock():
-                return {"released": await self._deeds.apart(self._client.unlock, asked.lock)}
+                return {"released": await self._api.apart(self._client.unlock, asked.lock)}
             case messages.Resume():
-                return {"resumed": await self._deeds.resume(self._client, asked)}
+                return {"resumed": await self._api.resume(self._client, asked)}
             case messages.Estop():
-                return await self._deeds.estop(self._client.identity, asked)
+                return await self._api.estop(self._client.identity, asked)
             case messages.Cancel():
                 return {"cancelled": await self._cancel(asked.which)}
 
@@ -270,10 +270,10 @@ class Conversation:
 
     async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
         async with nullcontext() if handle.effect == "stop" else self._beginning:
-            run = await self._deeds.begin(self._client, handle, asked, ongoing.admitted)
+            run = await self._api.begin(self._client, handle, asked, ongoing.admitted)
         ongoing.run = run
         if ongoing.unwanted:
-            await self._deeds.end(self._client, run)
+            await self._api.end(self._client, run)
         run.on_progress(lambda value: self._post({"id": asked.id, "progress": value}))
         await run.settled()
         return run.result(0)
@@ -286,7 +286,7 @@ class Conversation:
             case messages.Call():
                 ongoing.unwanted = True
                 if ongoing.run is not None:
-                    await self._deeds.end(self._client, ongoing.run)
+                    await self._api.end(self._client, ongoing.run)
             case messages.Stream() | messages.Watch() | messages.Logs() | messages.Calls():
                 ongoing.scope.cancel()
             case _:
@@ -294,14 +294,14 @@ class Conversation:
         return True
 
     async def _stream(self, asked: messages.Stream, handle: Handle) -> None:
-        samples = await self._deeds.stream(self._client, handle, asked)
+        samples = await self._api.stream(self._client, handle, asked)
         try:
             while True:
                 try:
                     sample = await samples.anext()
-                    self._deeds.judge.require_call(self._client.identity, handle)
+                    self._api.judge.require_call(self._client.identity, handle)
                 except Exception as error:
-                    if samples.ended or not self._deeds.judge.sees(self._client.identity, handle):
+                    if samples.ended or not self._api.judge.sees(self._client.identity, handle):
                         raise
                     await self._say({"id": asked.id, "failed": problem_of(error)})  # this one; others may come
                 else:
@@ -311,10 +311,10 @@ class Conversation:
 
     async def _watch(self, asked: messages.Watch) -> None:
         def tell(occasion: str, handle: Handle) -> None:
-            told = self._deeds.view(self._client.identity, handle)
+            told = self._api.view(self._client.identity, handle)
             self._post({"id": asked.id, "event": occasion, "service": told})
 
-        standing = await self._deeds.apart(self._deeds.watch, self._client, asked, tell)
+        standing = await self._api.apart(self._api.watch, self._client, asked, tell)
         try:
             await anyio.sleep_forever()
         finally:
@@ -322,26 +322,26 @@ class Conversation:
                 await self._apart(one.cancel)
 
     async def _logs(self, asked: messages.Logs) -> None:
-        reader = self._deeds.overview.log()
-        lines = await self._deeds.overview.log_lines(self._client.identity, reader)
+        reader = self._api.overview.log()
+        lines = await self._api.overview.log_lines(self._client.identity, reader)
         lines = lines[-_OLD_LINES:]
         while True:
             for line in lines:
                 if line.level >= asked.level:
                     await self._say({"id": asked.id, "line": line})
             await anyio.sleep(_LOG_EVERY_S)
-            lines = await self._deeds.overview.log_lines(self._client.identity, reader)
+            lines = await self._api.overview.log_lines(self._client.identity, reader)
 
     async def _calls(self, asked: messages.Calls) -> None:
-        reader = self._deeds.overview.ended(reads=asked.reads)
+        reader = self._api.overview.ended(reads=asked.reads)
         while True:
-            for span in await self._deeds.overview.calls(self._client.identity, reader):
+            for span in await self._api.overview.calls(self._client.identity, reader):
                 await self._say({"id": asked.id, "call": messages.call_view(span)})
             await anyio.sleep(_LOG_EVERY_S)
 
     async def _apart(self, close: Callable[[], object]) -> None:
         with anyio.CancelScope(shield=True):
-            await self._deeds.apart(close, stops=True)
+            await self._api.apart(close, stops=True)
 
     def _lock_lost(self, lock: str, error: LockLost) -> None:
         self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})

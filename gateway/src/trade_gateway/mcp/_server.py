@@ -62,9 +62,9 @@ async def converse(
     leave: Callable[[], None],
 ) -> None:
     """As `serve`, over any two streams: what the agent moves stops once nothing more can be heard of it."""
-    deeds = ClientApi(container)
-    client = await deeds.apart(deeds.clients.open, container.address.identity)
-    tools = Tools(container, deeds, client, approvals, lexicon, twin)
+    api = ClientApi(container)
+    client = await api.apart(api.clients.open, container.address.identity)
+    tools = Tools(container, api, client, approvals, lexicon, twin)
     server = _server_of(tools)
     passed_on, heard = anyio.create_memory_object_stream[SessionMessage | Exception](0)
 
@@ -76,7 +76,7 @@ async def converse(
                     await passed_on.send(message)
         finally:
             with anyio.CancelScope(shield=True):
-                await deeds.apart(client.close, stops=True)
+                await api.apart(client.close, stops=True)
 
     async with _signals(client.close, leave), anyio.create_task_group() as tasks:
         tasks.start_soon(hear)

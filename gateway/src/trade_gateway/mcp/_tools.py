@@ -78,7 +78,7 @@ class Tools:
 
     Args:
         container: the agent's own: its identity is the agent's.
-        deeds: what clients have done.
+        api: what clients have done.
         client: the agent.
         approvals: who is asked first, and when.
         lexicon: which sentences mean what.
@@ -88,14 +88,14 @@ class Tools:
     def __init__(
         self,
         container: Container,
-        deeds: ClientApi,
+        api: ClientApi,
         client: Client,
         approvals: Approvals,
         lexicon: Lexicon,
         twin: Twin | None = None,
     ) -> None:
         self._container = container
-        self._deeds = deeds
+        self._api = api
         self._client = client
         self._approvals = approvals
         self._twin = twin
@@ -135,15 +135,15 @@ class Tools:
 
     async def services(self, asked: Find, _: Progress) -> Any:
         """The services there are: what they do, to which joints, whether they are well and may be called."""
-        found = self._deeds.seen(self._client.identity, asked.group or None, asked.name or None)
-        return [self._deeds.view(self._client.identity, handle) for handle in found]
+        found = self._api.seen(self._client.identity, asked.group or None, asked.name or None)
+        return [self._api.view(self._client.identity, handle) for handle in found]
 
     async def describe(self, asked: Named, _: Progress) -> Any:
         """One service with the JSON Schemas of its arguments and its result, and what a call of it needs."""
         handle = self._find(asked.group, asked.name, asked.container)
         schema = handle.schema
         return Described(
-            self._deeds.view(self._client.identity, handle),
+            self._api.view(self._client.identity, handle),
             schema["arguments"],
             schema["result"],
             needs_lock=handle.effect == "actuate",
@@ -155,41 +155,41 @@ class Tools:
 
         It does nothing: the tools `stop` and `estop` stop.
         """
-        return await self._deeds.apart(partial(self._talk.say, asked.sentence, orders=False))
+        return await self._api.apart(partial(self._talk.say, asked.sentence, orders=False))
 
     async def locks(self, _asked: NoArgs, _: Progress) -> Any:
         """Who holds which locks, and those of this agent's that were taken away since it asked last."""
         lost, self._lost = self._lost, []
-        return {"locks": await self._deeds.locks(self._client.identity), "lost": lost}
+        return {"locks": await self._api.locks(self._client.identity), "lost": lost}
 
     # --- doing
 
     async def lock(self, asked: messages.LockBody, _: Progress) -> Any:
         """Take a lock over all that a group uses: rosie.head. Nobody else can move it until it is given back."""
-        return await self._deeds.lock(self._client, asked, self._lock_lost)
+        return await self._api.lock(self._client, asked, self._lock_lost)
 
     async def unlock(self, asked: LockArgs, _: Progress) -> Any:
         """Give a lock back; what moves under it stops."""
-        return {"released": await self._deeds.apart(self._client.unlock, asked.lock)}
+        return {"released": await self._api.apart(self._client.unlock, asked.lock)}
 
     async def call(self, asked: ToCall, progress: Progress) -> Any:
         """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
         handle = self._find(asked.group, asked.name, asked.container)
         self._require_lock(handle)
-        self._deeds.judge.require_call(self._client.identity, handle)
+        self._api.judge.require_call(self._client.identity, handle)
         admitted = self._client.admit(handle)
         if self._approvals.needed(handle):
             progress("waits for somebody's approval")
             await self._approvals.ask(handle, asked.args, asked.why, _APPROVED_WITHIN_S)
             self._require_lock(handle)
-        run = await self._deeds.begin(self._client, handle, asked, admitted)
+        run = await self._api.begin(self._client, handle, asked, admitted)
         run.on_progress(progress)
         try:
             await run.settled()
         finally:
             if not run.done():  # the agent wants it no more, or is gone
                 with anyio.CancelScope(shield=True):
-                    await self._deeds.end(self._client, run)
+                    await self._api.end(self._client, run)
         return {"result": run.result(0)}
 
     async def try_on_twin(self, asked: ToCall, _: Progress) -> Any:
@@ -205,7 +205,7 @@ class Tools:
     async def stop(self, asked: messages.GroupBody, _: Progress) -> Any:
         """Stop all that moves in a group, whoever moves it. Needs no lock and no right."""
         who = self._client.identity
-        stops = [one for one in self._deeds.seen(who, asked.group) if one.effect == "stop"]
+        stops = [one for one in self._api.seen(who, asked.group) if one.effect == "stop"]
         if not stops:
             raise NoSuchService(constraint=f"stop in {asked.group}")
         said: dict[str, str] = {}
@@ -213,7 +213,7 @@ class Tools:
         async def stop(handle: Handle) -> None:
             try:
                 body = messages.CallBody(deadline_s=_STOPS_WITHIN_S)
-                run = await self._deeds.begin(self._client, handle, body, self._client.admit(handle))
+                run = await self._api.begin(self._client, handle, body, self._client.admit(handle))
                 await run.settled()
                 run.result(0)
                 said[handle.label] = "stopped"
@@ -227,12 +227,12 @@ class Tools:
 
     async def estop(self, asked: messages.EstopBody, _: Progress) -> Any:
         """Stop everything in the whole system. A person has to clear that. Not safety-rated."""
-        return await self._deeds.estop(self._client.identity, asked)
+        return await self._api.estop(self._client.identity, asked)
 
     # --- parts of these
 
     def _find(self, group: str, name: str, container: str) -> Handle:
-        return self._deeds.find(self._client.identity, group, name, container)
+        return self._api.find(self._client.identity, group, name, container)
 
     def _require_lock(self, handle: Handle) -> None:
         if handle.effect == "actuate" and not self._client.has_locked(handle):
@@ -246,7 +246,7 @@ class Tools:
             return None
         if reader.effect != "read":  # some other service of that name
             return None
-        run = await self._deeds.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
+        run = await self._api.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
         await run.settled()
         return run.result(0)
 

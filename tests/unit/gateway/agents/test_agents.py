@@ -50,7 +50,9 @@ def test_tools_are_listed_with_schemas_that_stand_alone(agent: Container) -> Non
 def test_nothing_moves_without_a_lock_and_with_one_it_does(robot: Robot, agent: Container) -> None:
     async def moves(client: Client) -> None:
         call = {"group": "rosie.head", "name": "turn", "args": {"angle_rad": 0.5}}
-        assert (await client.refused("call", **call)).startswith("NeedsLock: rosie.head.turn uses head; take a lock")
+        assert (await client.refused("call", **call)).startswith(
+            "NeedsLock: rosie.head.turn uses head. Lock its group first"
+        )
         other = await client("lock", group="rosie.legs", purpose="to walk")
         assert "NeedsLock" in await client.refused("call", **call)
         taken = await client("lock", group="rosie.head", purpose="to look")
@@ -185,7 +187,7 @@ def test_without_the_right_a_lock_is_not_enough(
 
 def test_wrong_words_are_refused_and_say_what_is_right(agent: Container) -> None:
     async def errs(client: Client) -> None:
-        assert "there is no tool 'fly'; there is services" in await client.refused("fly")
+        assert "there is no tool 'fly'. Use one of services" in await client.refused("fly")
         assert "the arguments of call are wrong" in await client.refused("call", group="rosie.head")
         assert "unknown field" in await client.refused("services", colour="red")
         assert "NoSuchService" in await client.refused("call", group="rosie.head", name="sing")
