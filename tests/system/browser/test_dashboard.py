@@ -249,7 +249,7 @@ def test_a_wrong_token_is_told_and_another_one_is_asked_for(browsers: Browsers, 
     anna = browsers.view("anna")
     anna.page.get_by_role("button", name="Sign out").click()
     anna.sign_in("guess")
-    expect(anna.page.locator("#login-problem")).to_contain_text("this token is nobody's")
+    expect(anna.page.locator("#login-problem")).to_contain_text("this token is unknown or revoked")
     anna.sign_in(doorway.token("bert"))
     expect(anna.page.locator("#who")).to_have_text("as bert")
 

@@ -119,7 +119,7 @@ def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory:
         ("Make me a sandwich", "I do not understand that"),
         ("Who has the wings?", "I know no group 'wings'; there is rosie, rosie.eyes, rosie.head"),
         ("What runs on host mars?", "I know no host 'mars'"),
-        ("Who can see(", "is no predicate"),
+        ("Who can see(", "is not a predicate"),
         ("", "I do not understand that"),
     ],
 )
@@ -174,15 +174,15 @@ PHRASE = '[[phrase]]\nhear = ["hello {name}"]\n'
     ("text", "said"),
     [
         ("[[phrase", "own.toml"),
-        (f'{PHRASE}say = "hi"\n', "takes one of ask and call"),
+        (f'{PHRASE}say = "hi"\n', "needs either ask or call"),
         (f'{PHRASE}say = "hi"\nask = "wether"\n', "there is no question 'wether'; there is services, containers"),
         (f'{PHRASE}say = "hi"\nask = "hosts"\n', "question 'hosts' has no use for {name}; it takes none"),
         (
             f'{PHRASE}say = "hi {{nmae}}"\ncall = "a.b"\n',
-            "{nmae} is nothing that can be said; there is {name}, {result}",
+            "{nmae} is not part of the result; there is {name}, {result}",
         ),
-        (f'{PHRASE}say = "hi"\ncall = "greet"\n', "'greet' is no service; write GROUP.NAME"),
-        ('[[phrase]]\nhear = ["who (has"]\nask = "hosts"\nsay = "x"\n', "is no sentence with gaps"),
+        (f'{PHRASE}say = "hi"\ncall = "greet"\n', "'greet' is not a service. Write GROUP.NAME"),
+        ('[[phrase]]\nhear = ["who (has"]\nask = "hosts"\nsay = "x"\n', "is not a sentence with gaps"),
         ('[[phrase]]\nhear = ["who {"]\nask = "hosts"\nsay = "x"\n', "stops making sense at '{'"),
         (f'{PHRASE}say = "hi {{"\ncall = "a.b"\n', "'hi {'"),
         (f"{PHRASE}tell = 1\n", "unknown field `tell`"),

@@ -219,7 +219,7 @@ def test_no_path_leads_out_of_the_door(door: Opened, path: str) -> None:
 def test_a_client_that_breaks_off_leaves_no_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, asks: str, *, reset: bool
 ) -> None:
-    monkeypatch.setattr("trade_gateway.http._protocols._ASKED_WITHIN_S", 0.5)
+    monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
     papers = Papers(tmp_path / "pki").of("door", addresses=["127.0.0.1"])
     trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
     with memory_system() as system, opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):

@@ -350,7 +350,7 @@ def test_a_closing_door_leaves_nothing_moving(door: Opened) -> None:
 
 
 def test_a_connection_that_asks_nothing_is_closed(door: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trade_gateway.http._protocols._ASKED_WITHIN_S", 0.5)
+    monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
     place = urlsplit(door.door.url)
     with socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S) as idle:  # type: ignore[arg-type]
         idle.sendall(b"GET /services HTTP/1.1\r\n")

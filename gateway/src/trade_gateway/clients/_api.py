@@ -45,7 +45,7 @@ _THREADS: Final = MOST_CALLS + 16
 _ANSWERED_S: Final = 1.0
 """How long to wait for an answer of every container, in seconds."""
 _NO_GROUP: Final = "_"
-_NOT_RECEIVED: Final = "no container is known to have received the e-stop. Cut the power with its switch"
+_NOT_RECEIVED: Final = "no container is known to have received it; use the switch that cuts the power"
 
 Gone = Callable[[], Awaitable[object]]
 """Returns when the client that made the request is gone."""
@@ -89,7 +89,7 @@ class ClientApi:
         """Finds a service by group and name; one of exactly this group has priority over those beneath it.
 
         Raises:
-                NoSuchService, TooManyServices: the client may know of none, or of several.
+            NoSuchService, TooManyServices: the client may know of none, or of several.
         """
         inside = self.seen(who, None if group == _NO_GROUP else group)
         found = [one for one in inside if one.name == name and container in ("", one.container)]
@@ -108,13 +108,13 @@ class ClientApi:
         """Starts a call without waiting for its end.
 
         Args:
-                client: the caller.
-                handle: the service.
+            client: the caller.
+            handle: the service.
             body: its arguments.
-                admitted: what `Client.admit` returned for this request.
+            admitted: what `Client.admit` returned for this request.
 
         Raises:
-                TradeError: it is not allowed, or could not begin; Cancelled: the client has requested a stop since.
+            TradeError: it is not allowed, or could not begin; Cancelled: the client has requested a stop since.
         """
         self.judge.require_call(client.identity, handle)
         stops = handle.effect == "stop"
@@ -161,18 +161,18 @@ class ClientApi:
         """Makes a call and waits for its end; cancels it when the client is gone.
 
         Args:
-                client: the caller.
-                handle: the service.
+            client: the caller.
+            handle: the service.
             body: its arguments.
-                gone: returns when the client no longer waits.
-                alone: whether the client exists for this call only, and ends with it.
+            gone: returns when the client no longer waits.
+            alone: whether the client exists for this call only, and ends with it.
 
         Returns:
-                The call, which has ended, with or without success.
+            The call, which has ended, with or without success.
 
         Raises:
             TradeError: it could not begin.
-                Cancelled: the client no longer waits.
+            Cancelled: the client no longer waits.
         """
         run = await self.begin(client, handle, body, client.admit(handle))
 
@@ -200,7 +200,7 @@ class ClientApi:
         """Takes a lock for a client.
 
         Raises:
-                TradeError: see `trade.Container.lock`; and TooMany. It does not wait for services that do not exist.
+            TradeError: see `trade.Container.lock`; and TooMany. It does not wait for services that do not exist.
         """
         client.locking()
         return await self.counted(client.identity, self._lock, client, body, on_lost)
@@ -285,7 +285,7 @@ class ClientApi:
         """Stops everything in the system.
 
         Raises:
-                NobodyFound: no container is known to have received it. It is open here; joining containers receive it.
+            NobodyFound: no container is known to have received it. It is open here; joining containers receive it.
         """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
         report = await self.apart(self._container.estop, reason, stops=True)

@@ -63,8 +63,8 @@ class CallReader:
     """Reads recorded calls incrementally: each once, or twice if caller and callee are both traced.
 
     Args:
-            container: its system is read.
-            reads: whether calls of services that only read are included.
+        container: its system is read.
+        reads: whether calls of services that only read are included.
     """
 
     def __init__(self, container: Container, *, reads: bool) -> None:
@@ -108,9 +108,9 @@ class Overview:
     """Information about the system for its clients.
 
     Args:
-            container: the gateway's container.
-            judge: authorises its clients.
-            counted: runs a function with its arguments for an identity.
+        container: the gateway's container.
+        judge: authorises its clients.
+        counted: runs a function with its arguments for an identity.
     """
 
     def __init__(self, container: Container, judge: ClientAuthorizer, counted: Counted) -> None:
@@ -159,7 +159,7 @@ class Overview:
         """Returns the containers found and the endpoints without any; shared by requests within two seconds.
 
         Raises:
-                AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
+            AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
         """
         self._judge.require_some(who, "sight")
         return await self._counted(who, self._look)

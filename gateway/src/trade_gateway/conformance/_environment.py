@@ -114,10 +114,10 @@ class Stage:
         """Starts the container under test, and waits for its sign of life.
 
         Args:
-                forgetful: whether it gets a new folder for its persistent state.
+            forgetful: whether it gets a new folder for its persistent state.
 
         Raises:
-                NotHeld: it ends, or does not appear.
+            NotHeld: it ends, or does not appear.
             ConfigurationError: there is no such program.
         """
         self._states += forgetful

@@ -94,10 +94,10 @@ def run(
     """Starts the container under test and runs the checks on it.
 
     Args:
-            command: starts it; split into words as in a shell, but run without one.
-            checks: the checks to run.
-            report: called with each outcome at once.
-            motion: whether its arm may be turned; otherwise such checks are skipped, and ``turn`` is never called.
+        command: starts it; split into words as in a shell, but run without one.
+        checks: the checks to run.
+        report: called with each outcome at once.
+        motion: whether its arm may be turned; otherwise such checks are skipped, and ``turn`` is never called.
 
     Raises:
         ConfigurationError: there is no such program.

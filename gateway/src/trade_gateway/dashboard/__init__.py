@@ -1,4 +1,4 @@
-"""The dashboard: one page that people operate a system with. It speaks to the door like any other client."""
+"""The dashboard: a web page for operators of a system. It uses the HTTP API like any other client."""
 
 from trade_gateway.dashboard._files import pages
 

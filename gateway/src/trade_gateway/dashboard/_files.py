@@ -1,4 +1,4 @@
-"""The files of the page, and what a browser is told about them."""
+"""Serves the dashboard's files with their HTTP headers."""
 
 import hashlib
 from importlib.resources import files
@@ -42,11 +42,11 @@ HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
 }
-"""Nothing runs but the scripts of the page itself, and no other site shows the page inside of its own."""
+"""Content security policy: only the page's own scripts run, and no other site may embed the page."""
 
 
 def pages() -> list[Route]:
-    """A route for each file. They say nothing of the system: whoever can reach the door may read them."""
+    """One route for each file. They contain nothing about the system, so anyone who can connect may read them."""
     folder = files(__name__.rpartition(".")[0]) / "static"
     return [_route(path, (folder / name).read_bytes(), kind) for path, name, kind in _FILES]
 

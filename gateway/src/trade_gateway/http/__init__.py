@@ -1,4 +1,4 @@
-"""A door for those who speak nothing of ours: HTTP and WebSocket (the extra ``http``)."""
+"""The HTTP gateway: HTTP and WebSocket for clients without TRADE (the extra ``http``)."""
 
 from trade_gateway.http._authentication import Tokens, add_token
 from trade_gateway.http._server import Door

@@ -21,18 +21,18 @@ _logger = logging.getLogger("trade")
 
 _TABLE: Final = "tokens"
 _BYTES: Final = 32
-"""So many random ones in a token that its hash needs no salt and no slowness."""
-_HEAD: Final = "# Whoever shows a token is that identity. A line taken out takes the token back.\n"
+"""A token has enough random bytes that its hash needs neither salt nor a slow function."""
+_HEAD: Final = "# A client that sends a token has its identity. Remove a line to revoke the token.\n"
 
 
 def add_token(path: Path, identity: str) -> str:
-    """Make a token for an identity, and note it in the file, which need not be there yet.
+    """Creates a token for an identity, and adds it to the file, which it creates if necessary.
 
     Raises:
-        ConfigurationError: no identity has such a name, or the file cannot be read or written.
+        ConfigurationError: this is not a valid identity, or the file cannot be read or written.
     """
     if not is_chunk(identity):
-        problem = f"{identity!r} is no identity; use letters, digits, . _ - (at most 80)"
+        problem = f"{identity!r} is no identity. Use at most 80 letters, digits, . _ -"
         raise ConfigurationError(where="token", problem=problem)
     known = _read(path) if path.exists() else {}
     token = secrets.token_urlsafe(_BYTES)
@@ -48,10 +48,10 @@ def add_token(path: Path, identity: str) -> str:
 
 
 class Tokens:
-    """The tokens in a file, as it is now; without a file none. The file has their hashes alone."""
+    """The tokens in a file at this moment; none without a file. The file has only their hashes."""
 
     def __init__(self, path: Path | None) -> None:
-        """Raises ConfigurationError: the file cannot be read, or is wrong."""
+        """Raises ConfigurationError: the file cannot be read, or is invalid."""
         self._path = path
         self._seen = _seen(path)
         self._known = {} if path is None else _read(path)
@@ -60,19 +60,19 @@ class Tokens:
         return bool(self._known)
 
     def who(self, token: str) -> str | None:
-        """The identity that a token is for; None for one that is not, or no longer, in the file."""
+        """The identity of a token; None if the token is not in the file, or not any more."""
         self._look()
         return self._known.get(_hash(token))
 
     def _look(self) -> None:
-        """Read the file again if it was changed; what is wrong with it is said, and the tokens stay as they were."""
+        """Reads a changed file again; logs an invalid one, and keeps the earlier tokens."""
         if self._path is None or (seen := _seen(self._path)) == self._seen:
             return
         self._seen = seen
         try:
             self._known = _read(self._path)
         except ConfigurationError as wrong:
-            _logger.warning("the tokens stay as they were: %s", wrong)
+            _logger.warning("the tokens file is invalid, so the earlier tokens remain valid: %s", wrong)
 
 
 def _hash(token: str) -> str:
@@ -91,22 +91,22 @@ def _read(path: Path) -> dict[str, str]:
     try:
         known: Any = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap().get(_TABLE, {})
     except OSError as bad:
-        problem = f"cannot be read ({bad.strerror}); trade door token NAME makes a token and the file"
+        problem = f"cannot be read ({bad.strerror}). `trade door token NAME` creates a token and the file"
         raise ConfigurationError(where=str(path), problem=problem) from None
     except (TOMLKitError, UnicodeDecodeError) as bad:
-        raise ConfigurationError(where=str(path), problem=f"is no TOML: {bad}") from None
+        raise ConfigurationError(where=str(path), problem=f"is not TOML: {bad}") from None
     if not isinstance(known, dict):
         problem = f"{_TABLE} must be a table: [{_TABLE}]"
         raise ConfigurationError(where=str(path), problem=problem)
     for digest, identity in cast("dict[str, object]", known).items():
         if len(digest) != hashlib.sha256().digest_size * 2 or not isinstance(identity, str) or not is_chunk(identity):
-            problem = "each line of [tokens] is the SHA-256 of a token = the identity that it is for"
+            problem = "each line of [tokens] must be the SHA-256 of a token = its identity"
             raise ConfigurationError(where=f"{path}, {digest}", problem=problem)
     return cast("dict[str, str]", known)
 
 
 CERTIFIED: Final = "trade.certified"
-"""In the scope: the common name of the certificate that the client has shown."""
+"""Key in the scope: the common name of the client's certificate."""
 SUBPROTOCOL: Final = "trade.v1"
 _BEARER: Final = "bearer."
 
@@ -119,9 +119,9 @@ class Authenticator:
         self._judge = judge
 
     def shown(self, scope: Scope) -> str:
-        """The token that a request shows; empty if it shows none.
+        """The token in a request; empty without one.
 
-        In ``Authorization``, or, as pages cannot set that for a WebSocket, as subprotocol ``bearer.TOKEN``.
+        It is in ``Authorization``; or in the subprotocol ``bearer.TOKEN``, as pages cannot set headers of a WebSocket.
         """
         scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
         if scheme:
@@ -130,19 +130,19 @@ class Authenticator:
         return next((one.removeprefix(_BEARER) for one in offered if one.startswith(_BEARER)), "")
 
     def who(self, scope: Scope) -> str:
-        """The identity of whoever makes a request.
+        """The identity of a request's client.
 
         Raises:
-            NotLetIn: nobody, or a token that nobody has.
-            AccessDenied: it is revoked.
+            NotLetIn: it has no identity, or its token is unknown.
+            AccessDenied: the identity is revoked.
         """
         who = self._identity(self.shown(scope), scope.get(CERTIFIED))
         if not self._judge.admits(who):
-            raise AccessDenied(who=who, verb="call", what="the door", rule=f"{who} is revoked")
+            raise AccessDenied(who=who, verb="call", what="the HTTP gateway", rule=f"{who} is revoked")
         return who
 
     def still(self, scope: Scope, who: str) -> bool:
-        """Whether it is let in now as that identity."""
+        """Whether the client is still admitted as that identity."""
         try:
             return self.who(scope) == who
         except (NotLetIn, AccessDenied):
@@ -152,10 +152,10 @@ class Authenticator:
         if token:
             known = self._tokens.who(token)
             if known is None:
-                raise NotLetIn(reason="this token is nobody's, or was taken back")
+                raise NotLetIn(reason="this token is unknown or revoked")
             return known
         if isinstance(certified, str):
             return certified
         if self._judge.lets_anybody_in:
             return ANONYMOUS
-        raise NotLetIn(reason="this door lets in nobody it does not know")
+        raise NotLetIn(reason="the HTTP gateway admits no clients without an identity")

@@ -1,4 +1,4 @@
-"""The door over HTTP: each request a session of its own, or of one that was opened before."""
+"""The HTTP API: each request has its own session, or names one that was opened before."""
 
 import asyncio
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -23,14 +23,14 @@ from trade_gateway.http._session_timeouts import Leases
 MOST_BODY_BYTES: Final = 1 << 20
 SESSION: Final = "Trade-Session"
 _BODY_S: Final = 10.0
-"""How long a body may take to arrive."""
+"""How long a body may take to arrive, in seconds."""
 
 Body = TypeVar("Body")
 Answer = Callable[[Request], Awaitable[Response]]
 
 
 class Http:
-    """The routes."""
+    """The routes of the HTTP API."""
 
     def __init__(self, api: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
         self._api = api
@@ -38,7 +38,7 @@ class Http:
         self._leases = leases
 
     def routes(self) -> list[Route]:
-        """All of them, for an application."""
+        """Returns all routes, for an application."""
         return [
             self._route("/openapi.json", GET=self.openapi),
             self._route("/services", "group", "name", GET=self.services),
@@ -69,7 +69,7 @@ class Http:
             asked = [name for name, _ in request.query_params.multi_items()]
             try:
                 if unknown := sorted({name for name in asked if name not in query or asked.count(name) > 1}):
-                    raise BadMessage(problem=f"{', '.join(unknown)} cannot be asked for here, or not twice")
+                    raise BadMessage(problem=f"{', '.join(unknown)}: not a parameter here, or repeated")
                 return await by_method[method](request)
             except TradeError as error:
                 self._api.note_refused(error)
@@ -78,7 +78,7 @@ class Http:
 
         return Route(path, answer, methods=list(by_method))
 
-    # --- looking
+    # --- queries
 
     async def openapi(self, request: Request) -> Response:
         return _answer(document(self._api.seen(self._who(request))))
@@ -117,12 +117,12 @@ class Http:
     async def reachability(self, request: Request) -> Response:
         return _answer(await self._api.overview.reachability(self._who(request)))
 
-    # --- calling
+    # --- calls
 
     async def call(self, request: Request) -> Response:
         who, body = self._authenticator.who(request.scope), await _body(request, messages.CallBody)
         handle = self._api.find(who, request.path_params["group"], request.path_params["name"], body.container)
-        named = self._heard(request, who, stops=handle.effect == "stop")
+        named = self._renewed(request, who, stops=handle.effect == "stop")
         async with self._client(request, who, named) as (client, alone):
             gone = lambda: _gone(request)  # noqa: E731
             run = await self._api.call(client, handle, body, gone, alone=alone)
@@ -132,7 +132,7 @@ class Http:
         try:
             return _answer({"result": run.result(0)})
         except messages.NO_JSON as bad:
-            raise InvalidResult(service=handle.label, problem=f"it has no form in JSON: {bad}") from None
+            raise InvalidResult(service=handle.label, problem=f"it cannot be expressed in JSON: {bad}") from None
 
     # --- sessions
 
@@ -164,7 +164,7 @@ class Http:
     async def unlock(self, request: Request) -> Response:
         client = self._lasting(request, self._who(request), "a lock")
         if not await self._api.apart(client.unlock, request.path_params["lock"]):
-            raise HttpError(status=404, problem="this session has no such lock, or it was lost")
+            raise HttpError(status=404, problem="this session has no such lock, or has lost it")
         return Response(status_code=204)
 
     async def request_release(self, request: Request) -> Response:
@@ -177,7 +177,7 @@ class Http:
 
     async def resume(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.GroupBody)
-        async with self._client(request, who, self._heard(request, who)) as (client, _):
+        async with self._client(request, who, self._renewed(request, who)) as (client, _):
             return _answer({"resumed": await self._api.resume(client, body)})
 
     async def estops(self, request: Request) -> Response:
@@ -185,23 +185,23 @@ class Http:
 
     async def estop(self, request: Request) -> Response:
         who = self._authenticator.who(request.scope)
-        self._heard(request, who, stops=True)
+        self._renewed(request, who, stops=True)
         return _answer(await self._api.estop(who, await _body(request, messages.EstopBody)))
 
     async def clear(self, request: Request) -> Response:
         return _answer(await self._api.clear(self._who(request), await _body(request, messages.ClearBody)))
 
-    # --- who, and in which session
+    # --- identities and sessions
 
     def _who(self, request: Request) -> str:
         who = self._authenticator.who(request.scope)
-        self._heard(request, who)
+        self._renewed(request, who)
         return who
 
-    def _heard(self, request: Request, who: str, *, stops: bool = False) -> Client | None:
-        """The session that a request names, which is renewed by it; None if it names none.
+    def _renewed(self, request: Request, who: str, *, stops: bool = False) -> Client | None:
+        """Renews and returns the session that a request names; None if it names none.
 
-        Raises NoSuchSession, but not to a request that stops something: that needs none (S07).
+        Raises NoSuchSession, except for a request that stops something: that needs no session (S07).
         """
         secret = request.headers.get(SESSION)
         if secret is None:
@@ -217,14 +217,14 @@ class Http:
 
     def _lasting(self, request: Request, who: str, what: str) -> Client:
         """The session that a request names. Raises NeedsSession, NoSuchSession."""
-        client = self._heard(request, who)
+        client = self._renewed(request, who)
         if client is None:
             raise NeedsSession(what=what)
         return client
 
     @asynccontextmanager
     async def _client(self, request: Request, who: str, named: Client | None) -> AsyncGenerator[tuple[Client, bool]]:
-        """The session that a request names; else one of its own, for as long as it lasts, and that it is so."""
+        """The session that a request names, or a temporary one; and whether it is temporary."""
         if named is not None:
             yield named, False
             return
@@ -237,17 +237,17 @@ class Http:
 
 
 def _lost(_name: str, _error: LockLost) -> None:
-    """A request cannot be told later; what is done under the lock next says that it is lost."""
+    """Ignores a lost lock, as a request cannot be notified; the next operation under the lock reports the loss."""
 
 
 async def _gone(request: Request) -> None:
-    """Wait until the client's end of the connection is closed."""
+    """Waits until the client closes its end of the connection."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
 async def _body(request: Request, kind: type[Body]) -> Body:
-    """What the client has sent, as the record that belongs here; nothing at all is an empty one."""
+    """Decodes the client's body as the given record; an empty body is an empty record."""
     media_type = request.headers.get("content-type", "application/json").partition(";")[0].strip().lower()
     if media_type != "application/json":
         raise HttpError(status=415, problem=f"send application/json, not {media_type}")
@@ -273,12 +273,12 @@ def _answer(value: Any, status: int = 200) -> Response:
 
 
 async def refused(_request: Request, error: Exception) -> Response:
-    """What HTTP itself refuses, as a problem."""
-    assert isinstance(error, HTTPException)  # noqa: S101 - it is set for these
+    """Returns errors of HTTP itself as a problem."""
+    assert isinstance(error, HTTPException)  # noqa: S101 - the handler is registered for these
     problem = HttpError(status=error.status_code, problem=error.detail)
     return problem_response(problem, dict(error.headers or {}))
 
 
 async def broken(_request: Request, _error: Exception) -> Response:
-    """A fault of the door's own; the server logs what it was."""
-    return problem_response(HttpError(status=500, problem="the door itself failed at this; its log says how"))
+    """Handles an internal error, which the server logs."""
+    return problem_response(HttpError(status=500, problem="internal error of the HTTP gateway. See its log"))

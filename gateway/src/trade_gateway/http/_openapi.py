@@ -1,4 +1,4 @@
-"""The door as an OpenAPI document: what it offers always, and the services that the asking client may know of now."""
+"""The HTTP API as an OpenAPI document: its own operations, and the services that the client may know of now."""
 
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -40,17 +40,17 @@ _COMPONENTS: Final = "#/components/schemas/"
 _FORMATS: Final = {"datetime": "date-time", "date": "date", "time": "time", "UUID": "uuid"}
 _TAG: Final = "door"
 _VALUES: Final = ("const", "default", "enum", "examples")
-"""What these have is no schema."""
+"""Keys whose values are data, not schemas."""
 _SESSION: Final = {
     "name": "Trade-Session",
     "in": "header",
-    "description": "A session that POST /session opened; without it the request is one of its own.",
+    "description": "A session that POST /session opened; without it the request has a session of its own.",
     "schema": {"type": "string"},
 }
 
 
 def document(handles: Sequence[Handle]) -> Schema:
-    """The document, as JSON.
+    """Returns the document, as JSON.
 
     Args:
         handles: the services to describe, each under ``/call/GROUP/NAME``.
@@ -101,7 +101,7 @@ def _call(handle: Handle, call: Schema, schemas: Schema) -> Schema:
 
 
 def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
-    """A service's own schema, with what it refers to among the document's under the service's name."""
+    """Returns a service's schema; moves its definitions into the document, prefixed with the service's name."""
     own = schema.get("$defs", {})
     for title, definition in own.items():
         schemas[f"{name}.{title}"] = _led(definition, name)
@@ -109,10 +109,10 @@ def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
 
 
 def _led(part: Any, name: str) -> Any:
-    """References into the document, formats where there are some, and what an integer holds.
+    """Points references into the document, and adds formats and ranges of integers.
 
-    Titles go, as generators of clients take them for names, which have to be different. So does ``items: false``, which
-    few of them read: the greatest length says the same.
+    Titles are removed, as client generators use them as names, which must be unique. ``items: false`` is removed
+    because few generators support it: the greatest length says the same.
     """
     if isinstance(part, list):
         return [_led(one, name) for one in cast("list[Any]", part)]
@@ -135,13 +135,13 @@ def _led(part: Any, name: str) -> Any:
     return led
 
 
-# --- what is there always
+# --- operations of the API itself
 
 
 def _fixed() -> Schema:
     query = [
         {"name": name, "in": "query", "schema": {"type": "string"}, "description": text}
-        for name, text in (("group", "This group and beneath it."), ("name", "`*` and `?` stand for anything."))
+        for name, text in (("group", "This group and beneath it."), ("name", "`*` and `?` are wildcards."))
     ]
     held = {**_SESSION, "required": True}
     lock = {"name": "lock", "in": "path", "required": True, "schema": {"type": "string"}}
@@ -152,14 +152,14 @@ def _fixed() -> Schema:
     return {
         "/openapi.json": {"get": _operation("document", "This document.", {"type": "object"})},
         "/services": {"get": _operation("services", "Services.", _list("ServiceView"), parameters=query)},
-        "/me": {"get": _operation("me", "As whom the client is known, and its rights over the system.", _ref("Me"))},
+        "/me": {"get": _operation("me", "The client's identity, and its rights over the system.", _ref("Me"))},
         "/containers": {"get": _operation("containers", "Containers.", _list("ContainerView"))},
-        "/sight": {"get": _operation("sight", "Whom the door has found, and where nobody.", _ref("Reachability"))},
+        "/sight": {"get": _operation("sight", "Containers found, and endpoints without any.", _ref("Reachability"))},
         "/loads": {
-            "get": _operation("loads", "How busy they are, over the second that this takes.", _list("LoadInfo"))
+            "get": _operation("loads", "Load of the containers, measured during one second.", _list("LoadInfo"))
         },
-        "/notifications": {"get": _operation("notifications", "Notifications that stand.", _list("NotificationInfo"))},
-        "/hooks": {"get": _operation("hooks", "Hooks that are attached.", _list("HookInfo"))},
+        "/notifications": {"get": _operation("notifications", "Active notifications.", _list("NotificationInfo"))},
+        "/hooks": {"get": _operation("hooks", "Attached hooks.", _list("HookInfo"))},
         "/session": {
             "post": _operation(
                 "open_session", "Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"
@@ -168,7 +168,7 @@ def _fixed() -> Schema:
                 "renew_session", "Renew a session, as any request in it does.", opened, parameters=[held]
             ),
             "delete": _operation(
-                "end_session", "End a session: what it moves stops.", None, parameters=[held], status="204"
+                "end_session", "End a session and stop its motion.", None, parameters=[held], status="204"
             ),
         },
         "/locks": {
@@ -185,11 +185,11 @@ def _fixed() -> Schema:
         },
         "/locks/request": {
             "post": _operation(
-                "request_locks", "Ask their owners to give locks back.", asked, body="RequestBody", needed=True
+                "request_locks", "Ask the owners of locks to release them.", asked, body="RequestBody", needed=True
             )
         },
         "/locks/break": {
-            "post": _operation("break_locks", "Take locks away.", _list("LockView"), body="RequestBody", needed=True)
+            "post": _operation("break_locks", "Break locks.", _list("LockView"), body="RequestBody", needed=True)
         },
         "/locks/{lock}": {
             "delete": _operation("release_lock", "Release a lock.", None, parameters=[lock, held], status="204")
@@ -197,7 +197,7 @@ def _fixed() -> Schema:
         "/resume": {
             "post": _operation(
                 "resume",
-                "Let move again what somebody else stopped.",
+                "Let move again what another client stopped.",
                 resumed,
                 body="GroupBody",
                 needed=True,
@@ -229,7 +229,7 @@ def _operation(
 
 def _responses(answer: Schema | None, status: str = "200") -> Schema:
     done = {"description": "Done.", **({} if answer is None else _content(answer, "application/json"))}
-    return {status: done, "default": {"description": "Why not.", **_content(_ref("Problem"), MEDIA_TYPE)}}
+    return {status: done, "default": {"description": "The error.", **_content(_ref("Problem"), MEDIA_TYPE)}}
 
 
 def _json(schema: Schema, *, required: bool) -> Schema:

@@ -1,4 +1,4 @@
-"""What stands before everything else: under which name the door was called, and by a page of which site."""
+"""Checks the Host and Origin of every request first: the name in use, and the site of the calling page."""
 
 from collections.abc import Collection
 from typing import Final
@@ -13,15 +13,15 @@ from trade_gateway.clients._problems import problem_of
 from trade_gateway.clients._schemas import encoder
 
 MEDIA_TYPE: Final = "application/problem+json"
-"""Of errors, by RFC 9457."""
+"""Media type of errors, by RFC 9457."""
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
 
 
 class Gate:
     """Refuses requests that a page made without its user's knowledge.
 
-    A page of the door itself has as ``Origin`` what ``Host`` says, one of another site something that is not listed.
-    One that let its own name lead to this host (DNS rebinding) has that name in ``Host``.
+    A page of the gateway itself has as ``Origin`` what ``Host`` says; another site's origin is not listed.
+    A site that points its own name to this host (DNS rebinding) has that name in ``Host``.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: Collection[str], origins: Collection[str]) -> None:
@@ -44,22 +44,22 @@ class Gate:
     def _wrong(self, scope: Scope, headers: Headers) -> WrongDoor | None:
         host = _without_port(headers.get("host", "")).lower()
         if host not in self._hosts:
-            remedy = f"this door answers to {', '.join(sorted(self._hosts))}; `trade door --host NAME` adds one"
+            remedy = f"use {', '.join(sorted(self._hosts))}, or allow this name with `trade door --host NAME`"
             return WrongDoor(what=f"host {host!r}", remedy=remedy)
         origin = headers.get("origin")
         if origin is not None and origin not in self._origins and origin != _own_site(scope, headers):
-            return WrongDoor(what=f"a page of {origin!r}", remedy="`trade door --origin URL` lets one in")
+            return WrongDoor(what=f"a page of {origin!r}", remedy="`trade door --origin URL` allows it")
         return None
 
 
 def problem_response(error: BaseException, headers: dict[str, str] | None = None) -> Response:
-    """An error as an answer."""
+    """Returns an error as a response."""
     problem = problem_of(error)
     return Response(encoder.encode(problem), problem.status, headers, MEDIA_TYPE)
 
 
 def _own_site(scope: Scope, headers: Headers) -> str:
-    """The origin of pages that the door itself has given, under the name that it was called by now."""
+    """The origin of the gateway's own pages, under the name in the request."""
     return f"{'https' if scope['scheme'] in ('https', 'wss') else 'http'}://{headers.get('host', '').lower()}"
 
 

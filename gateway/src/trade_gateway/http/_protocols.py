@@ -1,4 +1,4 @@
-"""What uvicorn leaves out: who has shown which certificate, and the end of connections whose other end is frozen."""
+"""Additions to uvicorn's protocols: the client's certificate, and the end of connections whose client is frozen."""
 
 from asyncio import BaseTransport, TimerHandle
 from typing import Any, Final
@@ -9,74 +9,74 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from trade_gateway.http._authentication import CERTIFIED
 
-_ASKED_WITHIN_S: Final = 10.0
-"""How long a connection may stand without a whole request's head."""
+_REQUEST_WITHIN_S: Final = 10.0
+"""How long a connection may exist without a complete request head, in seconds."""
 
 
 class HttpProtocol(H11Protocol):
-    """One connection over HTTP."""
+    """One HTTP connection."""
 
-    _waiting: TimerHandle | None = None
+    _timeout: TimerHandle | None = None
     _over = False
-    """Whether it is gone, or a WebSocket's by now: its transport is then nothing to be asked of."""
+    """Whether the connection is closed, or a WebSocket by now: then its transport must not be used."""
 
     def connection_made(self, transport: Any) -> None:
-        """Let the application know whose certificate was shown."""
+        """Stores the client's certificate for the application."""
         super().connection_made(transport)
-        self.app = _telling(self.app, transport)
-        self._wait()
+        self.app = _with_certificate(self.app, transport)
+        self._start_timeout()
 
     def data_received(self, data: bytes) -> None:
-        """Those that never ask anything would take the place of others."""
+        """Restarts the timeout, as idle connections would take the place of others."""
         super().data_received(data)
-        self._wait()
+        self._start_timeout()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Who is gone is waited for no more."""
-        self._wait_no_more()
+        """Cancels the timeout."""
+        self._cancel_timeout()
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """A WebSocket has asked what it came for."""
-        self._wait_no_more()
+        """Cancels the timeout: the request is complete."""
+        self._cancel_timeout()
         super().handle_websocket_upgrade(event)
 
-    def _wait(self) -> None:
-        if self._waiting is None and self._asks_nothing and not self._over:
-            self._waiting = self.loop.call_later(_ASKED_WITHIN_S, self._waited)
+    def _start_timeout(self) -> None:
+        if self._timeout is None and self._idle and not self._over:
+            self._timeout = self.loop.call_later(_REQUEST_WITHIN_S, self._timed_out)
 
-    def _wait_no_more(self) -> None:
+    def _cancel_timeout(self) -> None:
         self._over = True
-        if self._waiting is not None:
-            self._waiting.cancel()
-            self._waiting = None
+        if self._timeout is not None:
+            self._timeout.cancel()
+            self._timeout = None
 
-    def _waited(self) -> None:
-        self._waiting = None
-        if self._asks_nothing:
+    def _timed_out(self) -> None:
+        self._timeout = None
+        if self._idle:
             self.transport.close()
 
     @property
-    def _asks_nothing(self) -> bool:
+    def _idle(self) -> bool:
         cycle: Any = self.cycle
         return cycle is None or cycle.response_complete
 
 
 class SocketProtocol(WebSocketsSansIOProtocol):
-    """One connection over a WebSocket."""
+    """One WebSocket connection."""
 
     def connection_made(self, transport: BaseTransport) -> None:
         """Likewise."""
         super().connection_made(transport)
-        self.app = _telling(self.app, transport)
+        self.app = _with_certificate(self.app, transport)
 
     def keepalive_timeout(self) -> None:
-        """Who does not answer takes nothing more, either: what is still to be sent must not keep the session alive."""
+        """Aborts the connection: pending output of a frozen client must not keep its session alive."""
         super().keepalive_timeout()
         self.transport.abort()
 
 
-def _telling(app: Any, transport: BaseTransport) -> Any:
+def _with_certificate(app: Any, transport: BaseTransport) -> Any:
     certificate: Any = transport.get_extra_info("peercert")
     subject = certificate.get("subject", ()) if certificate else ()
     names = [text for part in subject for kind, text in part if kind == "commonName"]
@@ -84,7 +84,7 @@ def _telling(app: Any, transport: BaseTransport) -> Any:
         return app
     inner: ASGIApp = app
 
-    async def telling(scope: Scope, receive: Receive, send: Send) -> None:
+    async def wrapped(scope: Scope, receive: Receive, send: Send) -> None:
         await inner({**scope, CERTIFIED: names[0]}, receive, send)
 
-    return telling
+    return wrapped

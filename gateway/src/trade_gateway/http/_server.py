@@ -1,4 +1,4 @@
-"""The door open: a socket that listens, and a thread that serves it."""
+"""The HTTP gateway's server: a listening socket, and the thread that serves it."""
 
 import asyncio
 import logging
@@ -34,11 +34,11 @@ _logger = logging.getLogger("trade")
 
 MOST_CONNECTIONS: Final = 256
 _MOST_DESCRIPTORS: Final = 2 * MOST_CONNECTIONS
-"""Of connections, also of those that have not asked for anything, or shown a certificate, yet."""
+"""Most connections, including those without a request or certificate yet."""
 MOST_MESSAGE_BYTES: Final = 1 << 20
 _PING_EVERY_S: Final = 0.5
 _PONG_WITHIN_S: Final = 1.5
-"""With the ping before it, the 2 s after which who is silent is gone (S05)."""
+"""With the ping before it, this gives the 2 s after which a silent client is gone (S05)."""
 _IDLE_S: Final = 10
 _PARTING_S: Final = 2
 _BACKLOG: Final = 128
@@ -47,18 +47,18 @@ _JOINED_WITHIN_S: Final = 10.0
 
 
 class Door:
-    """A door of a container: HTTP and WebSocket for those who speak nothing else. A context manager.
+    """The HTTP gateway of a container, for clients over HTTP and WebSocket. A context manager.
 
     Args:
-        container: whose system it opens; it stays its maker's.
-        listen: ``HOST:PORT``; port 0 is any.
-        tokens: who is who.
+        container: its system is made accessible; the caller closes it.
+        listen: ``HOST:PORT``; port 0 selects a free one.
+        tokens: the clients' identities.
         tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it.
-        origins: sites whose pages may come in, such as ``http://localhost:5173``.
-        hosts: further names by which it is called.
+        origins: other sites whose pages are allowed, such as ``http://localhost:5173``.
+        hosts: further names of this host.
 
     Raises:
-        ConfigurationError: the address is taken, or would reach a network by accident; nobody could come in.
+        ConfigurationError: the address is in use or exposes it to a network by accident, or no client could connect.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Door:
         api = ClientApi(container)
         _check_reach(listen, host, api, tls)
         if not tokens and tls is None and not api.judge.lets_anybody_in:
-            problem = "nobody could come in: make a token with trade door token NAME"
+            problem = "no client could connect. Create a token with `trade door token NAME`"
             raise ConfigurationError(where=f"door {listen}", problem=problem)
         self._api = api
         names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
@@ -83,7 +83,7 @@ class Door:
         context = None if tls is None else _context(tls)
         self._socket = BoundedListener(_bound(host, port), _MOST_DESCRIPTORS)
         self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
-        """Where it is."""
+        """Its address."""
         config = uvicorn.Config(
             self._app,
             loop="asyncio",
@@ -95,7 +95,7 @@ class Door:
             ws_per_message_deflate=False,
             lifespan="on",
             log_config=None,
-            log_level="info",  # more would tell of headers, and of the tokens in them
+            log_level="info",  # a lower level would log headers, and the tokens in them
             access_log=False,
             proxy_headers=False,
             server_header=False,
@@ -108,17 +108,17 @@ class Door:
         self._thread = threading.Thread(target=self._serve, name="trade-door", daemon=True)
 
     def open(self) -> "Door":
-        """Let clients in; who comes before it is ready waits."""
+        """Accepts clients; those that connect before it is ready wait."""
         self._thread.start()
         return self
 
     @property
     def serving(self) -> bool:
-        """Whether it goes on."""
+        """Whether it still serves."""
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Let nobody in any more; what clients have set moving stops. Idempotent."""
+        """Accepts no more clients; motion of the connected ones stops. Idempotent."""
         self._api.clients.close()
         self._server.should_exit = True
         if self._thread.ident is not None:
@@ -129,7 +129,7 @@ class Door:
         try:
             asyncio.run(self._server.serve(sockets=[self._socket]))
         except Exception:
-            _logger.exception("the door at %s has ended", self.url)
+            _logger.exception("the HTTP gateway at %s has ended", self.url)
 
     def __enter__(self) -> "Door":
         return self.open()
@@ -171,7 +171,7 @@ def _application(api: ClientApi, tokens: Tokens, hosts: Collection[str], origins
     return application
 
 
-# --- where it listens
+# --- the address
 
 
 def _address(listen: str) -> tuple[str, int]:
@@ -182,14 +182,14 @@ def _address(listen: str) -> tuple[str, int]:
 
 
 def _check_reach(listen: str, host: str, api: ClientApi, tls: Path | None) -> None:
-    """S21: raises ConfigurationError if it would be reached from a network by accident."""
+    """S21: raises ConfigurationError if it would be reachable from a network by accident."""
     if is_loopback(host):
         return
     if tls is None:
-        problem = "is beyond this host, where tokens would be read by others: --tls FOLDER, which trade pki issue makes"
+        problem = "is beyond this host, where others could read tokens. Use --tls FOLDER from `trade pki issue`"
         raise ConfigurationError(where=f"listen {listen}", problem=problem)
     if not api.judge.governed:
-        problem = "is beyond this host, and no policy says who may do what: set TRADE_POLICY"
+        problem = "is beyond this host, but there is no policy. Set TRADE_POLICY"
         raise ConfigurationError(where=f"listen {listen}", problem=problem)
 
 
@@ -206,7 +206,7 @@ def _bound(host: str, port: int) -> socket:
 
 
 def _context(folder: Path) -> ssl.SSLContext:
-    """Encryption as our own end, and certificates of the system's authority, if shown, as the clients'."""
+    """The TLS context: our certificate, and optional client certificates of the system's authority."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.verify_mode = ssl.CERT_OPTIONAL
@@ -214,6 +214,6 @@ def _context(folder: Path) -> ssl.SSLContext:
         context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
         context.load_verify_locations(folder / "ca.pem")
     except (OSError, ssl.SSLError) as bad:
-        problem = f"has no ca.pem, cert.pem and key.pem that fit together ({bad.strerror or bad}); trade pki issue NAME"
+        problem = f"has no matching ca.pem, cert.pem and key.pem ({bad.strerror or bad}). Run `trade pki issue NAME`"
         raise ConfigurationError(where=str(folder), problem=problem) from None
     return context

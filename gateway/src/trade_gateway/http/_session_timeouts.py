@@ -1,4 +1,4 @@
-"""How long sessions last of which nothing is heard, and whether their clients are still let in."""
+"""Ends silent sessions, and those of clients that are no longer admitted."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,11 +8,11 @@ from typing import Final
 from trade_gateway.clients import Client, ClientApi
 
 _LOOK_EVERY_S: Final = 1.0
-"""How soon a token that was taken back ends a session."""
+"""How soon a revoked token ends a session, in seconds."""
 
 
 class Lease:
-    """Of one session."""
+    """The lease of one session."""
 
     def __init__(self, lease_s: float, still: Callable[[], bool]) -> None:
         self.lease_s = lease_s
@@ -21,7 +21,7 @@ class Lease:
 
 
 class Leases:
-    """Of all sessions. Belongs to the event loop."""
+    """The leases of all sessions. Belongs to the event loop."""
 
     def __init__(self, api: ClientApi) -> None:
         self._api = api
@@ -29,30 +29,30 @@ class Leases:
         self._closing: set[asyncio.Task[None]] = set()
 
     def begin(self, client: Client, lease_s: float, still: Callable[[], bool]) -> None:
-        """A session begins.
+        """Adds a session.
 
         Args:
-            client: whose.
+            client: its client.
             lease_s: how long it lasts without a request, in seconds; 0 for one that lasts as its connection does.
-            still: whether the client is let in now.
+            still: whether the client is still admitted.
         """
         self._leases[client] = Lease(lease_s, still)
         loop = asyncio.get_running_loop()
 
         def forget() -> None:
-            with suppress(RuntimeError):  # that loop has ended
+            with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(self._forget, client)
 
         client.when_closed(forget)
         self.renew(client)
 
     def lease_s(self, client: Client) -> float:
-        """How long it may be silent."""
+        """How long the session may be silent, in seconds."""
         lease = self._leases.get(client)
         return 0.0 if lease is None else lease.lease_s
 
     def renew(self, client: Client) -> None:
-        """Something was heard of it."""
+        """Renews the lease."""
         lease = self._leases.get(client)
         if lease is None or not lease.lease_s:
             return
@@ -61,7 +61,7 @@ class Leases:
         lease.timer = asyncio.get_running_loop().call_later(lease.lease_s, self._end, client)
 
     async def keep_watch(self) -> None:
-        """End the sessions of those who are no longer let in, until this is cancelled."""
+        """Ends the sessions of clients that are no longer admitted, until this task is cancelled."""
         while True:
             await asyncio.sleep(_LOOK_EVERY_S)
             for client, lease in list(self._leases.items()):

@@ -1,4 +1,4 @@
-"""The door over a WebSocket: one client, one session, for as long as the connection lasts."""
+"""The WebSocket API: one client with one session, for as long as the connection lasts."""
 
 import asyncio
 from collections import defaultdict, deque
@@ -20,24 +20,24 @@ from trade_gateway.http._origin_check import problem_response
 from trade_gateway.http._session_timeouts import Leases
 
 MOST_UNDER_WAY: Final = 64
-"""Calls, streams and watches of one connection; stops do not count."""
+"""Most calls, streams and watches of one connection; stops do not count."""
 _MOST_STOPS: Final = 4
-"""Of one service, or e-stops, of one connection, that are under way at once; further ones share the next."""
+"""Concurrent stops of one service, or e-stops, of one connection; further requests share the next one."""
 _MOST_ANSWERS: Final = 256
-"""To stops of one connection, that are waited for."""
+"""Most stops of one connection that wait for their answer."""
 _MOST_WAITING: Final = 256
-"""Events that wait for a slow client; the oldest goes first."""
+"""Most events that wait for a slow client; the oldest is dropped first."""
 _SENT_WITHIN_S: Final = 2.0
-"""A client that takes nothing for so long is gone (S05)."""
+"""Time limit for sending; a client that accepts nothing for so long is gone (S05)."""
 _LOG_EVERY_S: Final = 0.5
 _OLD_LINES: Final = 200
-"""Of the log, that are told at first."""
+"""Number of earlier log lines that are sent at first."""
 
 _ENDED: Final = 1008
 
 
 class Socket:
-    """Its endpoint."""
+    """The endpoint of the WebSocket."""
 
     def __init__(self, api: ClientApi, authenticator: Authenticator, leases: Leases) -> None:
         self._api = api
@@ -45,7 +45,7 @@ class Socket:
         self._leases = leases
 
     async def serve(self, websocket: WebSocket) -> None:
-        """One connection, from its handshake to its end."""
+        """Serves one connection, from its handshake to its end."""
         try:
             who = self._authenticator.who(websocket.scope)
             client = await self._api.apart(self._api.clients.open, who, stops=True)
@@ -57,56 +57,56 @@ class Socket:
             await websocket.accept(SUBPROTOCOL if offered else None)
             self._leases.begin(client, 0, lambda: self._authenticator.still(websocket.scope, who))
             await Conversation(websocket, client, self._api).run()
-            with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is gone
+            with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is closed
                 await websocket.close(_ENDED)
         finally:
             await asyncio.shield(asyncio.ensure_future(self._api.apart(client.close, stops=True)))
 
 
 class _Ongoing:
-    """What one message has begun."""
+    """The operation that a message has begun."""
 
     def __init__(self, asked: messages.Asked, handle: Handle | None, admitted: int) -> None:
         self.asked: Final = asked
         self.handle: Final = handle
-        """Of what to call or stream."""
+        """The service to call or stream."""
         self.admitted = admitted
-        """At which of the client's stops."""
+        """The number of the client's stops before it."""
         self.scope = anyio.CancelScope()
         self.run: Run | None = None
         self.unwanted = False
-        """Whether a call was cancelled, if only before it had begun."""
+        """Whether a call was cancelled, even before it began."""
 
 
 class _Line:
-    """Stops of one kind: a few at once, and one that is shared by all who come meanwhile."""
+    """Stops of one kind: a few run at once, and later requests share one that has not begun."""
 
     def __init__(self) -> None:
         self._places = anyio.Semaphore(_MOST_STOPS)
         self._next: asyncio.Future[Any] | None = None
-        """What those get who come before it has begun."""
+        """The result of the next stop, for those that share it."""
 
     @property
     def idle(self) -> bool:
-        """Whether none is under way."""
+        """Whether no stop is running."""
         return self._next is None and self._places.value == _MOST_STOPS
 
     @property
     def shared(self) -> bool:
-        """Whether one is about to begin that counts for whoever comes now, too."""
+        """Whether a stop is about to begin that also counts for a request now."""
         return self._next is not None
 
     async def take(self, do: Callable[[], Awaitable[Any]]) -> Any:
-        """Do it, or share it: it begins after this was called in any case."""
+        """Runs or shares a stop; it begins after this call in any case."""
         if self._next is not None:
             return await asyncio.shield(self._next)
         shared = self._next = asyncio.get_running_loop().create_future()
-        shared.add_done_callback(lambda told: told.cancelled() or told.exception())  # perhaps nobody shares it
+        shared.add_done_callback(lambda told: told.cancelled() or told.exception())  # it may be shared by no request
         try:
             async with self._places:
                 self._next = None
                 shared.set_result(await do())
-        except Exception as error:  # noqa: BLE001 - whatever comes of it is for all of them
+        except Exception as error:  # noqa: BLE001 - the result is for all requests that share it
             shared.set_exception(error)
         finally:
             if not shared.done():
@@ -116,7 +116,7 @@ class _Line:
 
 
 class Conversation:
-    """With one client."""
+    """The messages of one connection."""
 
     def __init__(self, websocket: WebSocket, client: Client, api: ClientApi) -> None:
         self._websocket = websocket
@@ -125,47 +125,47 @@ class Conversation:
         self._tasks = anyio.create_task_group()
         self._ongoing: dict[messages.Id, _Ongoing] = {}
         self._stops: defaultdict[object, _Line] = defaultdict(_Line)
-        """By the service that stops."""
+        """For each stop service, its running stops."""
         self._speaking = anyio.Lock()
         self._beginning = anyio.Lock()
-        """Calls begin in the order in which they were asked for: of two set-points the later one counts."""
+        """Keeps calls in the order of their requests: of two set-points the later one counts."""
         self._waiting: deque[dict[str, Any]] = deque(maxlen=_MOST_WAITING)
         self._missed = 0
         self._more = asyncio.Event()
         self._loop = asyncio.get_running_loop()
 
     async def run(self) -> None:
-        """Until one of both ends it. What was begun ends with it."""
+        """Runs until one side closes. All its operations end with it."""
         async with self._tasks:
             self._client.when_closed(lambda: self._soon(self._tasks.cancel_scope.cancel))
             self._tasks.start_soon(self._carry)
             while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
                 self._hear(message.get("text") or "")
-                await asyncio.sleep(0)  # what it has begun goes on before the next one, however many wait
+                await asyncio.sleep(0)  # the operation begins before the next one, however many wait
             await self._end()
 
     async def _end(self) -> None:
-        """First what moves stops, then the rest is put away."""
+        """Stops all motion first, then ends the other operations."""
         await self._apart(self._client.close)
         self._tasks.cancel_scope.cancel()
 
-    # --- speaking
+    # --- sending
 
     async def _say(self, message: dict[str, Any]) -> None:
         text = _text(message)
         with anyio.move_on_after(_SENT_WITHIN_S) as limit:
             async with self._speaking:
-                with suppress(WebSocketDisconnect, RuntimeError):  # it is gone; who listens hears of it
+                with suppress(WebSocketDisconnect, RuntimeError):  # it is closed; the reader sees that too
                     await self._websocket.send_text(text)
         if limit.cancelled_caught:
             await self._end()
 
     def _post(self, message: dict[str, Any]) -> None:
-        """Say it as soon as it can be said; from any thread."""
+        """Queues a message from any thread."""
         self._soon(self._note, message)
 
     def _soon(self, do: Callable[..., None], *args: Any) -> None:
-        with suppress(RuntimeError):  # that loop has ended
+        with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(do, *args)
 
     def _note(self, message: dict[str, Any]) -> None:
@@ -182,7 +182,7 @@ class Conversation:
                 self._missed = 0
                 await self._say({**message, "missed": missed} if missed else message)
 
-    # --- hearing
+    # --- receiving
 
     def _hear(self, text: str) -> None:
         try:
@@ -200,9 +200,9 @@ class Conversation:
         self._tasks.start_soon(self._do, ongoing)
 
     def _admitted(self, asked: messages.Asked) -> _Ongoing:
-        """Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot be begun."""
+        """Checks a request. Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot begin."""
         if asked.id in self._ongoing:
-            raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
+            raise BadMessage(problem=f"the operation with id {asked.id!r} has not ended yet. Use another id")
         handle = None
         if isinstance(asked, messages.Call | messages.Stream):
             handle = self._api.find(self._client.identity, asked.group, asked.name, asked.container)
@@ -212,7 +212,7 @@ class Conversation:
         admitted = 0 if handle is None else self._client.admit(handle)
         if len(self._ongoing) >= _MOST_ANSWERS and stop in self._stops and self._stops[stop].shared:
             raise TooMany(
-                what="stops of this connection that wait for their answer; they are carried out", limit=_MOST_ANSWERS
+                what="stops of this connection that wait for their answer (they are executed)", limit=_MOST_ANSWERS
             )
         return _Ongoing(asked, handle, admitted)
 
@@ -223,7 +223,7 @@ class Conversation:
                 stop = _stopping(ongoing.asked, ongoing.handle)
                 result = await (self._done(ongoing) if stop is None else self._stop(stop, ongoing))
             answer = {"id": name, "result": result}
-        except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
+        except Exception as error:  # noqa: BLE001 - reported to the client, whatever a provider raises
             self._api.note_refused(error)
             answer = {"id": name, "problem": problem_of(error)}
         del self._ongoing[name]
@@ -232,7 +232,7 @@ class Conversation:
     async def _done(self, ongoing: _Ongoing) -> Any:
         match asked := ongoing.asked:
             case messages.Call():
-                assert ongoing.handle is not None  # noqa: S101 - it was found when this was admitted
+                assert ongoing.handle is not None  # noqa: S101 - the check of the request has found it
                 return await self._call(asked, ongoing.handle, ongoing)
             case messages.Stream():
                 assert ongoing.handle is not None  # noqa: S101 - likewise
@@ -252,10 +252,10 @@ class Conversation:
             case messages.Cancel():
                 return {"cancelled": await self._cancel(asked.which)}
 
-    # --- doing
+    # --- operations
 
     async def _stop(self, which: object, ongoing: _Ongoing) -> Any:
-        """It counts for all that was asked for before it begins."""
+        """Runs a stop; it counts for all requests before its start."""
 
         async def stop() -> Any:
             ongoing.admitted = self._client.stops
@@ -303,7 +303,7 @@ class Conversation:
                 except Exception as error:
                     if samples.ended or not self._api.judge.sees(self._client.identity, handle):
                         raise
-                    await self._say({"id": asked.id, "failed": problem_of(error)})  # this one; others may come
+                    await self._say({"id": asked.id, "failed": problem_of(error)})  # this sample; others may follow
                 else:
                     await self._say({"id": asked.id, "sample": sample})
         finally:
@@ -348,7 +348,7 @@ class Conversation:
 
 
 def _stopping(asked: messages.Asked, handle: Handle | None) -> object:
-    """Which stop is asked for; None: something else."""
+    """The key of a requested stop; None for other requests."""
     match asked:
         case messages.Estop():
             return "estop"
@@ -363,5 +363,5 @@ def _text(message: dict[str, Any]) -> str:
         return messages.encoder.encode(message).decode()
     except messages.NO_JSON as bad:
         what = "problem" if "result" in message else "failed"
-        wrong = InvalidResult(service=str(message["id"]), problem=f"it has no form in JSON: {bad}")
+        wrong = InvalidResult(service=str(message["id"]), problem=f"it cannot be expressed in JSON: {bad}")
         return messages.encoder.encode({"id": message["id"], what: problem_of(wrong)}).decode()

@@ -1,4 +1,4 @@
-"""Words into calls, and answers into words: the lexicon says which sentences mean what."""
+"""Sentences as questions and calls, and their answers as sentences, by a lexicon of phrases."""
 
 from trade_gateway.language._dialogue import Reply, Talk
 from trade_gateway.language._lexicon import Lexicon, NotUnderstood, read_lexicon

@@ -18,22 +18,22 @@ _NUMBERS: Final = ("number", "other_number")
 
 
 class Reply(Struct, frozen=True):
-    """What came of a sentence."""
+    """The reply to a sentence."""
 
     text: str
     means: str
-    """The question that was asked, or the service that was called."""
+    """The question or service behind the sentence."""
     data: Any
-    """What was found, for programs."""
+    """The result, for programs."""
 
 
 class Talk:
-    """Understands sentences by a lexicon, and asks and calls as the container that it is given.
+    """Understands sentences by a lexicon, and executes them as a given container.
 
     Args:
-        container: whose rights hold, and whose session: what it moves ends with it.
-        lexicon: which sentences mean what.
-        memory: for what is new.
+        container: provides rights and session: its motion ends with it.
+        lexicon: the known sentences.
+        memory: the services of the last look, for changes.
     """
 
     def __init__(self, container: Container, lexicon: Lexicon, memory: Memory) -> None:
@@ -42,15 +42,15 @@ class Talk:
         self._memory = memory
 
     def say(self, sentence: str, *, orders: bool = True) -> Reply:
-        """Do what a sentence asks.
+        """Executes a sentence.
 
         Args:
-            sentence: in words of the lexicon.
-            orders: whether it may call services; otherwise it is understood as a question alone.
+            sentence: in the phrases of the lexicon.
+            orders: whether it may call services; otherwise only questions are answered.
 
         Raises:
-            NotUnderstood: it fits no phrase, or names something that there is not.
-            TradeError: what the call led to.
+            NotUnderstood: it matches no phrase, or names something that does not exist.
+            TradeError: the call failed.
         """
         phrase, gaps = self._lexicon.hear(sentence)
         if not orders:
@@ -91,7 +91,7 @@ def _require_question(sentence: str, phrase: Phrase) -> None:
 
 
 def _filled(value: Any, gaps: Mapping[str, str]) -> Any:
-    """An argument with what stood in the gaps: a number where the whole of it is one, else text."""
+    """Fills the gaps of an argument: a number if the gap is all of it, else text."""
     if isinstance(value, list):
         return [_filled(one, gaps) for one in value]  # pyright: ignore[reportUnknownVariableType]
     if not isinstance(value, str):

@@ -1,4 +1,4 @@
-"""The lexicon: sentences with gaps, what each asks or calls, and how its answer is said. Checked as a whole."""
+"""The lexicon: sentences with gaps, the question or call of each, and its answer. It is checked as a whole."""
 
 import re
 import string
@@ -28,30 +28,30 @@ _Text = Annotated[str, Meta(min_length=1)]
 
 
 class NotUnderstood(UsageError):
-    """A sentence fits no phrase, or names something that is not there."""
+    """A sentence matches no phrase, or names something that does not exist."""
 
 
 class Phrase(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Sentences that mean the same, and what that is."""
+    """Sentences with the same meaning, and that meaning."""
 
     hear: Annotated[list[_Text], Meta(min_length=1)]
-    """``who (has|holds) [the] {group}``: one of, may be left out, a gap."""
+    """``who (has|holds) [the] {group}``: alternatives, an optional word, a gap."""
     ask: str = ""
     """A question, or"""
     call: str = ""
     """a service: ``rosie.head.move_to``."""
     args: list[Any] | dict[str, Any] = []
-    """Of the call; ``"{number}"`` is what stood in that gap."""
+    """Arguments of the call; ``"{number}"`` is the content of that gap."""
     say: _Text
-    """The answer; ``{names}`` and the like are what came of it."""
+    """The answer; ``{names}`` and the like are parts of the result."""
     one: str = ""
-    """The answer if there is exactly one."""
+    """The answer for exactly one."""
     none: str = ""
-    """The answer if there is none."""
+    """The answer for none."""
 
 
 class Heard(NamedTuple):
-    """A sentence as it was understood."""
+    """The phrase that matches a sentence, and its gaps."""
 
     phrase: Phrase
     gaps: Mapping[str, str]
@@ -67,10 +67,10 @@ class Lexicon:
     def __init__(self, phrases: Sequence[Phrase]) -> None:
         self._patterns = [(_pattern(text), phrase) for phrase in phrases for text in phrase.hear]
         self.sentences: Final = [text for phrase in phrases for text in phrase.hear[:1]]
-        """One of each phrase, for help."""
+        """One sentence of each phrase, for help."""
 
     def hear(self, sentence: str) -> Heard:
-        """What a sentence means. Raises NotUnderstood."""
+        """Finds the phrase of a sentence. Raises NotUnderstood."""
         heard = " ".join(_NOISE.sub("", sentence).split())
         for pattern, phrase in self._patterns:
             if found := pattern.fullmatch(heard):
@@ -80,10 +80,10 @@ class Lexicon:
 
 
 def read_lexicon(path: Path | None = None) -> Lexicon:
-    """The lexicon that comes with this; the phrases of a file go before its own.
+    """Reads the built-in lexicon; the phrases of a file have priority over it.
 
     Raises:
-        ConfigurationError: names the file, the phrase, and what would be right.
+        ConfigurationError: names the file, the phrase, and what is valid.
     """
     own = files("trade_gateway.language").joinpath("lexicon.toml").read_text(encoding="utf-8")
     read = list(_phrases(own, "lexicon.toml"))
@@ -93,7 +93,7 @@ def read_lexicon(path: Path | None = None) -> Lexicon:
         except OSError as bad:
             raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
         except UnicodeDecodeError as bad:
-            raise ConfigurationError(where=str(path), problem=f"is no UTF-8: {bad}") from None
+            raise ConfigurationError(where=str(path), problem=f"is not UTF-8: {bad}") from None
     return Lexicon(read)
 
 
@@ -101,7 +101,7 @@ def _phrases(text: str, where: str) -> Iterator[Phrase]:
     try:
         raw = read_toml_text(text)
         file = msgspec.convert(raw, _File)
-    except ValueError as bad:  # no TOML, or of another shape
+    except ValueError as bad:  # not TOML, or another structure
         raise ConfigurationError(where=where, problem=str(bad)) from None
     for phrase in file.phrase:
         _check(phrase, f"{where}: {phrase.hear[0]!r}")
@@ -109,17 +109,17 @@ def _phrases(text: str, where: str) -> Iterator[Phrase]:
 
 
 def _check(phrase: Phrase, where: str) -> None:
-    """Raises ConfigurationError: what it asks there is not, or it names gaps or fields that there are not."""
+    """Raises ConfigurationError: its question does not exist, or it uses unknown gaps or fields."""
     if bool(phrase.ask) == bool(phrase.call):
-        raise ConfigurationError(where=where, problem="takes one of ask and call")
+        raise ConfigurationError(where=where, problem="needs either ask or call")
     if phrase.ask and phrase.ask not in QUESTIONS:
         problem = f"there is no question {phrase.ask!r}; there is {', '.join(QUESTIONS)}"
         raise ConfigurationError(where=where, problem=problem)
     if phrase.call and "." not in phrase.call:
-        problem = f"{phrase.call!r} is no service; write GROUP.NAME, such as rosie.head.move_to"
+        problem = f"{phrase.call!r} is not a service. Write GROUP.NAME, such as rosie.head.move_to"
         raise ConfigurationError(where=where, problem=problem)
     if phrase.args and not phrase.call:
-        raise ConfigurationError(where=where, problem="args go with call; leave them out")
+        raise ConfigurationError(where=where, problem="args are only for call. Remove them")
     gaps = [_gaps(text, where) for text in phrase.hear]
     known = QUESTIONS[phrase.ask] if phrase.ask else None
     if known is not None and (strange := set[str]().union(*gaps) - set(known.gaps)):
@@ -129,7 +129,7 @@ def _check(phrase: Phrase, where: str) -> None:
     always = set[str].intersection(*gaps)
     for template in (phrase.say, phrase.one, phrase.none):
         if strange := _fields(template, where) - fields - always:
-            problem = f"{_listed(strange)} is nothing that can be said; there is {_listed(fields | always)}"
+            problem = f"{_listed(strange)} is not part of the result; there is {_listed(fields | always)}"
             raise ConfigurationError(where=where, problem=problem)
 
 
@@ -137,7 +137,7 @@ def _gaps(text: str, where: str) -> set[str]:
     try:
         return set(_pattern(text).groupindex)
     except (re.error, ValueError) as bad:
-        raise ConfigurationError(where=where, problem=f"{text!r} is no sentence with gaps: {bad}") from None
+        raise ConfigurationError(where=where, problem=f"{text!r} is not a sentence with gaps: {bad}") from None
 
 
 def _fields(template: str, where: str) -> set[str]:
@@ -152,7 +152,7 @@ def _listed(names: Sequence[str] | set[str] | frozenset[str]) -> str:
 
 
 def _pattern(text: str) -> re.Pattern[str]:
-    """Each word ends where a word ends; spaces between them may be missing where something is left out."""
+    """Compiles a sentence. Words match as a whole; spaces around an omitted word are optional."""
     made, at = "", 0
     for atom in _ATOM.finditer(text):
         if atom.start() != at:

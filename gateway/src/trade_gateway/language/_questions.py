@@ -1,4 +1,4 @@
-"""What can be asked: each question is calls and look-ups that any program could make, and what came of them."""
+"""The questions: each makes calls and look-ups that any program could make, and returns their result."""
 
 import contextlib
 import re
@@ -21,10 +21,10 @@ _MOST_BYTES: Final = 16 << 20
 
 
 class Memory:
-    """Which services there were, and where; kept in a file, or for as long as this lives.
+    """The services at the last look and their containers, in a file or in this object only.
 
     Args:
-        path: the file, which need not be there; None: nothing is kept.
+        path: the file, which need not exist; None: nothing is stored.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -32,14 +32,14 @@ class Memory:
         self._known: Mapping[str, str] | None = None if path is None else _read(path)
 
     def news(self, services: Mapping[str, str]) -> tuple[list[str], list[str]] | None:
-        """Who has come and who has gone since this was asked last; None: it never was.
+        """Returns the services that joined and left since the last look; None at the first one.
 
         Args:
-            services: the services that there are, and the container of each.
+            services: the present services, and the container of each.
         """
         before, self._known = self._known, dict(services)
         if self._path is not None:
-            with contextlib.suppress(OSError):  # what cannot be noted is told again
+            with contextlib.suppress(OSError):  # an unsaved change is reported again
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 replace(self._path, msgspec.json.encode(self._known), 0o600)
         if before is None:
@@ -52,39 +52,39 @@ def _read(path: Path) -> dict[str, str] | None:
     try:
         with path.open("rb") as file:
             return msgspec.json.decode(file.read(_MOST_BYTES), type=dict[str, str])
-    except (OSError, *UNREADABLE):  # spoiled is as good as none
+    except (OSError, *UNREADABLE):  # a damaged file counts as none
         return None
 
 
 _SPLIT: Final = re.compile(r"[\s._]+")
 _NAMED: Final = 12
-"""More names are counted, and not said."""
+"""Further names are only counted."""
 
 
 class Unknown(Exception):
-    """There is nothing of that name; says what there is."""
+    """Nothing has that name; the text lists what exists."""
 
 
 class Answer(Struct, frozen=True):
-    """What came of a question."""
+    """The result of a question."""
 
     count: int
     fields: Mapping[str, object]
-    """What the answer can say."""
+    """The parts of the answer."""
     data: Any
     """The same for programs."""
 
 
 class Question(NamedTuple):
-    """Something that can be asked."""
+    """A question that can be asked."""
 
     gaps: tuple[str, ...]
-    """What it can be told."""
+    """Its gaps."""
     fields: tuple[str, ...]
-    """What its answer can say."""
+    """The parts of its answer."""
     ask: Callable[[Container, Memory, Mapping[str, str]], Answer]
     is_order: bool = False
-    """Whether it does something."""
+    """Whether it acts on the system."""
 
 
 def _services(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
@@ -118,7 +118,7 @@ def _able(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
     try:
         found = container.services(where(achieves=goal if "(" in goal else f"{_SPLIT.sub('_', goal)}(?x)"))
     except ConfigurationError as bad:
-        raise Unknown(f"{goal!r} is no predicate such as see(?x): {bad.problem}") from None
+        raise Unknown(f"{goal!r} is not a predicate such as see(?x): {bad.problem}") from None
     return _names(sorted({handle.label for handle in found}))
 
 
@@ -177,10 +177,10 @@ def _load(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
 
 
 def _estop(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
-    report = container.estop(gaps.get("reason", "somebody said so"))
+    report = container.estop(gaps.get("reason", "requested in a sentence"))
     troubles = [f"{name} did not answer" for name in report.missing]
     troubles += [f"{name} failed: {why}" for name, why in report.failed.items()]
-    said = f"confirmed by {_said(list(report.confirmed)) or 'nobody'}{'; ' if troubles else ''}{'; '.join(troubles)}"
+    said = f"confirmed by {_said(list(report.confirmed)) or 'none'}{'; ' if troubles else ''}{'; '.join(troubles)}"
     return Answer(len(report.confirmed), {"count": len(report.confirmed), "report": said, "id": report.id}, report)
 
 
@@ -199,16 +199,16 @@ QUESTIONS: Final[Mapping[str, Question]] = {
     "load": Question(("container",), ("count", "loads", "busiest"), _load),
     "estop": Question(("reason",), ("count", "report", "id"), _estop, is_order=True),
 }
-"""By the name that a lexicon gives it."""
+"""By the name in the lexicon."""
 
 
 def _others(container: Container) -> list[Handle]:
-    """Whatever there is besides the middleware's own services and this very container."""
+    """All services except the middleware's own and those of this container."""
     return container.services(~where(group="trade") & ~where.local)
 
 
 def _matching(container: Container, gaps: Mapping[str, str]) -> list[Handle]:
-    """The services that are meant. Raises Unknown."""
+    """The services that match the gaps. Raises Unknown."""
     found = _others(container)
     if host := _one_of("host", gaps.get("host"), [handle.host for handle in found]):
         found = [handle for handle in found if handle.host == host]
@@ -222,7 +222,7 @@ def _matching(container: Container, gaps: Mapping[str, str]) -> list[Handle]:
 
 
 def _groups(handle: Handle) -> list[str]:
-    """The groups of a service, with those above them."""
+    """The groups of a service, and those above them."""
     return [group[:end] for group in handle.groups for end in _ends(group)]
 
 
@@ -231,10 +231,10 @@ def _ends(group: str) -> list[int]:
 
 
 def _ending(said: str, handles: Sequence[Handle], names: Callable[[Handle], Iterable[str]], kind: str) -> list[Handle]:
-    """Those with a name that ends in these words: the legs are ``rosie.legs``, the left arm is ``rosie.left.arm``."""
+    """Services whose name ends in these words: the legs are ``rosie.legs``, the left arm is ``rosie.left.arm``."""
     words = [word for word in _SPLIT.split(said.lower().removesuffix("'s")) if word not in ("", "the", "a", "an")]
     found = _with(words, handles, names)
-    if words and not found and words[-1].endswith("s"):  # the cameras: each is a camera
+    if words and not found and words[-1].endswith("s"):  # "the cameras" also matches each camera
         found = _with([*words[:-1], words[-1][:-1]], handles, names)
     if not found:
         known = sorted({name for handle in handles for name in names(handle)})
@@ -253,7 +253,7 @@ def _words(name: str) -> list[str]:
 
 
 def _one_of(kind: str, said: str | None, known: Iterable[str]) -> str:
-    """A name as it is written; empty if none was said. Raises Unknown."""
+    """The name with the right spelling; empty if the gap is. Raises Unknown."""
     if said is None:
         return ""
     names = sorted(set(known))

@@ -1,4 +1,4 @@
-"""A system for agents: tools of the Model Context Protocol, guarded by rights, locks and, where marked, a person."""
+"""A server of the Model Context Protocol for agents, guarded by rights, locks and, if configured, human approval."""
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.mcp._approvals import Approvals, Request

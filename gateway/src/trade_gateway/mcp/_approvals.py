@@ -1,4 +1,4 @@
-"""Calls that wait for a person's word: what policy or the command line marks is asked for, and done once."""
+"""Human approval of calls: a call that the policy or the command line marks waits, and runs once when approved."""
 
 import asyncio
 import secrets
@@ -22,11 +22,11 @@ __all__ = ["Approvals", "Request"]
 
 _MOST: Final = 16
 _MOST_TEXT: Final = 2_000
-"""Characters of the arguments that are shown; who cannot be shown all of them is not asked."""
+"""Greatest length of the arguments; a call that cannot be shown in full is refused."""
 
 
 class Request(Struct, frozen=True):
-    """A call that waits."""
+    """A call that waits for approval."""
 
     id: str
     agent: str
@@ -38,24 +38,24 @@ class Request(Struct, frozen=True):
     asked_at: float
     """``time.time()``"""
     until: float
-    """Then it is refused by itself."""
+    """The time of its automatic refusal."""
 
 
 class _Waiting(Struct):
     request: Request
     group: str
     tell: Callable[[str], None]
-    """Told once: why not; empty for yes."""
+    """Called once: with the reason for a refusal, or empty for an approval."""
 
 
 class Approvals:
     """Requests of one agent's process, as services of group ``approvals``.
 
-    Whoever may call these and administers what is asked for may say yes, but for the agent itself.
+    Clients that may call these services and administer the target may approve, except for the agent itself.
 
     Args:
-        container: the agent's.
-        ask_first: groups of which everything that does something needs a word, whatever the policy says.
+        container: the agent's container.
+        ask_first: groups in which every call with an effect needs approval, whatever the policy says.
     """
 
     def __init__(self, container: Container, ask_first: Sequence[str] = ()) -> None:
@@ -70,37 +70,37 @@ class Approvals:
 
     @service(effect="read")
     def pending(self) -> list[Request]:
-        """The calls that wait for a word, oldest first."""
+        """The calls that wait for approval, oldest first."""
         with self._guard:
             return [one.request for one in self._waiting.values()]
 
     @service(effect="note")
     def approve(self, id: str) -> Request:  # noqa: A002 - as `pending` names it
-        """Let that call be made, once, as it was asked for.
+        """Approve one call, exactly as requested.
 
         Raises:
-            ConfigurationError: nothing of that id waits.
-            AccessDenied: the caller does not administer what it is about, or is the agent itself.
+            ConfigurationError: no call with that id waits.
+            AccessDenied: the caller does not administer the target, or is the agent itself.
         """
         return self._settle(id, "")
 
     @service(effect="note")
     def refuse(self, id: str, reason: str = "") -> Request:  # noqa: A002
-        """Have that call not be made. Raises like ``approve``."""
+        """Refuse one call. Raises like ``approve``."""
         by = current_call()
-        return self._settle(id, f"{by.caller if by else 'somebody'} refused{f': {reason}' if reason else ''}")
+        return self._settle(id, f"{by.caller if by else 'a client'} refused{f': {reason}' if reason else ''}")
 
     def _settle(self, name: str, verdict: str) -> Request:
         with self._guard:
             waiting = self._waiting.get(name)
         if waiting is None:
             raise ConfigurationError(
-                where=f"approval {name!r}", problem="nothing of that id waits; see trade approvals"
+                where=f"approval {name!r}", problem="no call with that id waits. See `trade approvals`"
             )
         self._require(waiting)
         with self._guard:
             if self._waiting.pop(name, None) is None:
-                raise ConfigurationError(where=f"approval {name!r}", problem="somebody else has just decided that")
+                raise ConfigurationError(where=f"approval {name!r}", problem="another client has just decided it")
         waiting.tell(verdict)
         return waiting.request
 
@@ -116,12 +116,12 @@ class Approvals:
             raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
         self._container.access.require(call.caller, "administer", waiting.group, waiting.request.service)
 
-    # --- asking
+    # --- requests
 
     def needed(self, handle: Handle) -> bool:
-        """Whether somebody has to say yes before the agent may call that.
+        """Whether a call of the agent needs approval.
 
-        What a marked group moves is asked for whichever service moves it: the head also as two joints of the neck.
+        Calls that move a marked group need it whichever service moves it: the head also as two joints of the neck.
         """
         if handle.effect in ("read", "stop"):
             return False
@@ -141,10 +141,10 @@ class Approvals:
         return policy is not None and policy.asks_first(self._container.address.identity, domain)
 
     async def ask(self, handle: Handle, args: Any, why: str, wait_s: float) -> None:
-        """Wait for somebody's yes. Raises NeedsApproval: there was none within ``wait_s``."""
+        """Waits for approval. Raises NeedsApproval: there was none within ``wait_s``."""
         text = msgspec.json.encode(args).decode()
         if len(text) > _MOST_TEXT:
-            raise NeedsApproval(service=handle.label, reason="its arguments are too long to be shown to anybody")
+            raise NeedsApproval(service=handle.label, reason="its arguments are too long to be shown")
         async with self._offering:
             await run_sync(self._offer, handle)
         now, name, loop = time.time(), secrets.token_hex(3), asyncio.get_running_loop()
@@ -164,7 +164,7 @@ class Approvals:
         try:
             verdict = await asyncio.wait_for(said, wait_s)
         except asyncio.TimeoutError:
-            verdict = f"nobody said yes within {wait_s:g} s (trade approvals shows what waits)"
+            verdict = f"it was not approved within {wait_s:g} s (`trade approvals` shows what waits)"
         finally:
             with self._guard:
                 self._waiting.pop(name, None)
@@ -172,13 +172,13 @@ class Approvals:
             raise NeedsApproval(service=handle.label, reason=verdict)
 
     def _offer(self, handle: Handle) -> None:
-        """They are services only once they are needed: who never needs them needs no right to offer them."""
+        """Offers the services at the first request, so that an agent without requests needs no right to offer them."""
         if self._offered:
             return
         try:
             self._container.register(self, f"{APPROVALS}.{self._container.name}")
         except AccessDenied as denied:
-            raise NeedsApproval(service=handle.label, reason=f"it cannot be asked for: {denied}") from None
+            raise NeedsApproval(service=handle.label, reason=f"approval cannot be requested: {denied}") from None
         self._offered = True
 
 

@@ -1,4 +1,4 @@
-"""The tools over the Model Context Protocol, on standard input and output."""
+"""The server of the Model Context Protocol, on standard input and output."""
 
 import asyncio
 import os
@@ -30,23 +30,23 @@ __all__ = ["converse", "serve"]
 Hears = MemoryObjectReceiveStream[SessionMessage | Exception]
 Says = MemoryObjectSendStream[SessionMessage]
 
-_TOLD: Final = """Robots as services. Look with `services` and `describe` first. Whatever moves something needs a lock \
-over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves nothing. Give \
-locks back with `unlock`. What you have set moving stops when you disconnect. `stop` and `estop` need no lock."""
+_INSTRUCTIONS: Final = """Robots as services. Look with `services` and `describe` first. Whatever moves something \
+needs a lock over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves nothing. \
+Release locks with `unlock`. Motion that you started stops when you disconnect. `stop` and `estop` need no lock."""
 _KILLED_BY: Final = 128
 
 
 async def serve(
     container: Container, approvals: Approvals, lexicon: Lexicon, twin: Twin | None, leave: Callable[[], None]
 ) -> None:
-    """Serve the agent that has started this process, until it closes our standard input; what it moves stops then.
+    """Serves the agent that has started this process, until it closes our standard input; then its motion stops.
 
     Args:
-        container: the agent's: it is what the agent may do.
-        approvals: who is asked first, and when.
-        lexicon: which sentences mean what.
+        container: the agent's container; its rights are the agent's.
+        approvals: human approval of calls.
+        lexicon: the known sentences.
         twin: for dry runs.
-        leave: ends all that is the process's own; called when a signal ends it.
+        leave: ends everything else of the process; called when a signal ends it.
     """
     async with stdio_server() as (hears, says):
         await converse(container, approvals, lexicon, twin, hears, says, leave)
@@ -61,7 +61,7 @@ async def converse(
     says: Says,
     leave: Callable[[], None],
 ) -> None:
-    """As `serve`, over any two streams: what the agent moves stops once nothing more can be heard of it."""
+    """As `serve`, over any two streams: the agent's motion stops at the end of its stream."""
     api = ClientApi(container)
     client = await api.apart(api.clients.open, container.address.identity)
     tools = Tools(container, api, client, approvals, lexicon, twin)
@@ -69,7 +69,7 @@ async def converse(
     passed_on, heard = anyio.create_memory_object_stream[SessionMessage | Exception](0)
 
     async def hear() -> None:
-        """Its end is the agent's end; the server would first wait for all that was asked of it."""
+        """Ends with the agent's stream; the server itself would first wait for pending requests."""
         try:
             async with hears, passed_on:
                 async for message in hears:
@@ -85,7 +85,7 @@ async def converse(
 
 
 def _server_of(tools: Tools) -> "Server[Any, Any]":
-    server: Server[Any, Any] = Server("trade", version=version("trade-gateway"), instructions=_TOLD)
+    server: Server[Any, Any] = Server("trade", version=version("trade-gateway"), instructions=_INSTRUCTIONS)
 
     async def listed() -> list[types.Tool]:
         return [
@@ -113,7 +113,7 @@ def _server_of(tools: Tools) -> "Server[Any, Any]":
 
 @asynccontextmanager
 async def _reporting(server: "Server[Any, Any]") -> AsyncGenerator[Callable[[Any], None]]:
-    """Passes the newest word of how far a call is on to the agent, if it has asked for that."""
+    """Sends the latest progress of a call to the agent, if it has requested that."""
     context = server.request_context
     token = context.meta.progressToken if context.meta is not None else None
     if token is None:
@@ -136,7 +136,7 @@ async def _reporting(server: "Server[Any, Any]") -> AsyncGenerator[Callable[[Any
             text = said if isinstance(said, str) else messages.encoder.encode(said).decode()
             await context.session.send_progress_notification(token, float(count), message=text)
 
-    reporting = asyncio.ensure_future(report())  # no group of tasks: that would wrap what the call raises
+    reporting = asyncio.ensure_future(report())  # not a task group: that would wrap the call's exceptions
     try:
         yield note
     finally:
@@ -157,7 +157,7 @@ def _content(result: Any) -> list[types.ContentBlock]:
 
 @asynccontextmanager
 async def _signals(stop: Callable[[], None], leave: Callable[[], None]) -> AsyncGenerator[None]:
-    """SIGTERM, SIGINT: what moves stops, and the process ends; nothing else ends one that reads its standard input."""
+    """On SIGTERM and SIGINT stops motion and ends the process, which would otherwise not end."""
 
     async def wait() -> None:
         with anyio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:

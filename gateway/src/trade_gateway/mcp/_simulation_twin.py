@@ -1,4 +1,4 @@
-"""A simulated robot of its own, on which a call is tried before the real one is asked."""
+"""A simulated twin of the robot for dry runs of calls."""
 
 import os
 import secrets
@@ -29,24 +29,24 @@ _PLACES: Final = "TRADE_RUNTIME_DIR"
 
 
 class Tried(Struct, frozen=True):
-    """What came of a call on the twin."""
+    """The result of a call on the twin."""
 
     ok: bool
     error: str
-    """Why not; empty if it went well."""
+    """The error; empty on success."""
     result: Any
     took_s: float
-    """As long as it takes in simulation."""
+    """Duration in simulation, in seconds."""
     began_where_the_robot_is: bool
-    """Whether the twin could be brought there first."""
+    """Whether the twin was first brought to the robot's position."""
     before: Any
-    """What its ``state`` said before, and"""
+    """Its ``state`` before the call, and"""
     after: Any
-    """after the call."""
+    """after it."""
 
 
 class Twin:
-    """``trade up ROBOT.toml --sim`` in a system of its own, started when it is needed first.
+    """``trade up ROBOT.toml --sim`` in a separate system, started at its first use.
 
     Args:
         robot: the robot file.
@@ -61,16 +61,16 @@ class Twin:
         self._container: Container | None = None
 
     def call(self, handle: Handle, args: Any, deadline_s: float, state: Any) -> Tried:
-        """Bring the twin to where the robot is, make the call there, and see what came of it; one at a time.
+        """Brings the twin to the robot's position and makes the call there; one at a time.
 
         Args:
             handle: the service of the real robot.
-            args: by place or by name.
-            deadline_s: of the call.
-            state: what the real robot's ``state`` of the same group says; None if it has none.
+            args: positional or named.
+            deadline_s: the call's deadline in seconds.
+            state: the ``state`` of the same group of the real robot; None if it has none.
 
         Raises:
-            NoTwin: it does not come up, or has no such service.
+            NoTwin: the twin does not start, or has no such service.
         """
         with self._lock:
             here = self._up()
@@ -83,7 +83,7 @@ class Twin:
             result, error = None, ""
             try:
                 result = _called(tried, args, deadline_s)
-            except Exception as failed:  # noqa: BLE001 - whatever a provider raises is what is asked for
+            except Exception as failed:  # noqa: BLE001 - any exception of a provider is the result of the dry run
                 error = f"{type(failed).__name__}: {failed}"
             took_s = time.monotonic() - began
             return Tried(not error, error, result, round(took_s, 3), placed, before, self._state(here, group))
@@ -107,7 +107,7 @@ class Twin:
         return self._container
 
     def _place(self, here: Container, group: str, state: Any) -> bool:
-        """Bring what belongs to a group where the real one is; returns whether it is there."""
+        """Brings a group to the real one's position; returns whether it arrived."""
         told = msgspec.to_builtins(state)
         try:
             match told:
@@ -143,16 +143,16 @@ class Twin:
             return None
 
     def _find(self, here: Container, group: str, name: str, wait_s: float = 0.0) -> Handle | None:
-        """Those of one provider are seen together: only the first is waited for."""
+        """Finds a service. All services of a provider appear together, so only the first search waits."""
         try:
             return find(here, f"{group}.{name}", None, wait_s)
         except NoSuchService:
             return None
 
     def close(self) -> None:
-        """End it, whatever is tried there. Idempotent."""
+        """Ends the twin and any call on it. Idempotent."""
         if process := self._process:
-            process.kill()  # what is tried there ends by that
+            process.kill()  # this also ends a running call
         with self._lock:
             self._end()
             shutil.rmtree(self._folder, ignore_errors=True)

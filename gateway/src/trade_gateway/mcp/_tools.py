@@ -1,4 +1,4 @@
-"""The tools of an agent: what it may see, and what it may do under a lock."""
+"""The tools of an agent: queries within its rights, and motion under its locks."""
 
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -22,7 +22,7 @@ from trade_gateway.mcp._simulation_twin import Tried, Twin
 __all__ = ["TOOLS", "Tool", "Tools"]
 
 Progress = Callable[[Any], None]
-"""Told how far a call is; any thread."""
+"""Receives the progress of a call; on any thread."""
 _APPROVED_WITHIN_S: Final = 120.0
 _STOPS_WITHIN_S: Final = 10.0
 _TRIED_WITHIN_S: Final = 120.0
@@ -31,9 +31,9 @@ _TEXT: Final = Meta(max_length=500)
 
 class Find(Struct, forbid_unknown_fields=True, kw_only=True):
     group: str = ""
-    """This group and what is beneath it: ``rosie.head``. Empty: all."""
+    """This group and those beneath it: ``rosie.head``. Empty: all."""
     name: str = ""
-    """``*`` and ``?`` stand for anything."""
+    """``*`` and ``?`` are wildcards."""
 
 
 class Named(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -47,7 +47,7 @@ class ToCall(messages.CallBody, forbid_unknown_fields=True, kw_only=True):
     group: messages.Group
     name: Annotated[str, Meta(min_length=1)]
     why: Annotated[str, _TEXT] = ""
-    """For the person who may be asked to approve it."""
+    """For the person who may have to approve it."""
 
 
 class Sentence(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -56,7 +56,7 @@ class Sentence(Struct, forbid_unknown_fields=True, kw_only=True):
 
 class LockArgs(Struct, forbid_unknown_fields=True, kw_only=True):
     lock: str
-    """As the tool ``lock`` named it."""
+    """The name that the tool ``lock`` returned."""
 
 
 class NoArgs(Struct, forbid_unknown_fields=True):
@@ -74,15 +74,15 @@ class Described(Struct, frozen=True):
 
 
 class Tools:
-    """What one agent does; it is a client with a session of its own, which ends with it.
+    """The tools of one agent; it is a client with its own session, which ends with it.
 
     Args:
-        container: the agent's own: its identity is the agent's.
-        api: what clients have done.
+        container: the agent's container; its identity is the agent's.
+        api: the operations of clients.
         client: the agent.
-        approvals: who is asked first, and when.
-        lexicon: which sentences mean what.
-        twin: what is tried there moves nothing; None: there is none.
+        approvals: human approval of calls.
+        lexicon: the known sentences.
+        twin: the simulated twin for dry runs; None: there is none.
     """
 
     def __init__(
@@ -103,12 +103,12 @@ class Tools:
         self._lost: list[str] = []
 
     async def use(self, name: str, given: Any, progress: Progress = lambda _: None) -> Any:
-        """Use a tool; it is on the record of the agent's container, if one is kept.
+        """Runs a tool, and audits that if an audit record is kept.
 
         Raises:
-            NoSuchTool: there is none of that name.
-            NotThatWay: its arguments are wrong.
-            TradeError: what came of it; also whatever a provider raises.
+            NoSuchTool: there is no tool of that name.
+            WrongTool: its arguments are wrong.
+            TradeError: the operation failed; also any exception of a provider.
         """
         tool = TOOLS.get(name)
         if tool is None:
@@ -122,24 +122,24 @@ class Tools:
             about = _about(asked)
             result = await tool.do(self, asked, progress)
         except Exception as error:
-            self._note(name, about, began, type(error).__name__, str(error) if isinstance(error, TradeError) else "")
+            self._record(name, about, began, type(error).__name__, str(error) if isinstance(error, TradeError) else "")
             raise
-        self._note(name, about, began, "ok", "")
+        self._record(name, about, began, "ok", "")
         return result
 
-    def _note(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
+    def _record(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
         took_ns = time.monotonic_ns() - began
         self._container.note_asked(f"agent's tool {tool}", about, outcome=outcome, why=why, took_ns=took_ns)
 
-    # --- looking
+    # --- queries
 
     async def services(self, asked: Find, _: Progress) -> Any:
-        """The services there are: what they do, to which joints, whether they are well and may be called."""
+        """List services: what they do, which resources they use, their health, and whether they may be called."""
         found = self._api.seen(self._client.identity, asked.group or None, asked.name or None)
         return [self._api.view(self._client.identity, handle) for handle in found]
 
     async def describe(self, asked: Named, _: Progress) -> Any:
-        """One service with the JSON Schemas of its arguments and its result, and what a call of it needs."""
+        """Describe one service: JSON Schemas of its arguments and result, and what a call of it needs."""
         handle = self._find(asked.group, asked.name, asked.container)
         schema = handle.schema
         return Described(
@@ -151,25 +151,25 @@ class Tools:
         )
 
     async def ask(self, asked: Sentence, _: Progress) -> Any:
-        """A question about the system in plain English: what runs where, who holds what, what failed, what is new.
+        """Answer a question about the system in plain English: what runs where, lock owners, failures, changes.
 
-        It does nothing: the tools `stop` and `estop` stop.
+        It changes nothing: to stop, use the tools `stop` and `estop`.
         """
         return await self._api.apart(partial(self._talk.say, asked.sentence, orders=False))
 
     async def locks(self, _asked: NoArgs, _: Progress) -> Any:
-        """Who holds which locks, and those of this agent's that were taken away since it asked last."""
+        """List all locks, and those of this agent that were lost since it last asked."""
         lost, self._lost = self._lost, []
         return {"locks": await self._api.locks(self._client.identity), "lost": lost}
 
-    # --- doing
+    # --- actions
 
     async def lock(self, asked: messages.LockBody, _: Progress) -> Any:
-        """Take a lock over all that a group uses: rosie.head. Nobody else can move it until it is given back."""
+        """Take a lock over all that a group uses: rosie.head. No other client can move it until you release it."""
         return await self._api.lock(self._client, asked, self._lock_lost)
 
     async def unlock(self, asked: LockArgs, _: Progress) -> Any:
-        """Give a lock back; what moves under it stops."""
+        """Release a lock; motion under it stops."""
         return {"released": await self._api.apart(self._client.unlock, asked.lock)}
 
     async def call(self, asked: ToCall, progress: Progress) -> Any:
@@ -179,7 +179,7 @@ class Tools:
         self._api.judge.require_call(self._client.identity, handle)
         admitted = self._client.admit(handle)
         if self._approvals.needed(handle):
-            progress("waits for somebody's approval")
+            progress("waits for a person's approval")
             await self._approvals.ask(handle, asked.args, asked.why, _APPROVED_WITHIN_S)
             self._require_lock(handle)
         run = await self._api.begin(self._client, handle, asked, admitted)
@@ -187,23 +187,23 @@ class Tools:
         try:
             await run.settled()
         finally:
-            if not run.done():  # the agent wants it no more, or is gone
+            if not run.done():  # the agent has cancelled it, or is gone
                 with anyio.CancelScope(shield=True):
                     await self._api.end(self._client, run)
         return {"result": run.result(0)}
 
     async def try_on_twin(self, asked: ToCall, _: Progress) -> Any:
-        """What a call would do, tried on a simulated twin that is brought to where the robot is. Nothing real moves."""
+        """Try a call on a simulated twin, brought to the robot's position. Nothing real moves."""
         if self._twin is None:
             raise NoTwin(reason="this server has no twin")
         handle = self._find(asked.group, asked.name, asked.container)
         state = await self._state_of(handle)
         trying = partial(self._twin.call, handle, asked.args, min(asked.deadline_s, _TRIED_WITHIN_S), state)
-        tried: Tried = await run_sync(trying, abandon_on_cancel=True)  # nothing of the robot's waits for it
+        tried: Tried = await run_sync(trying, abandon_on_cancel=True)  # nothing of the real robot waits for it
         return tried
 
     async def stop(self, asked: messages.GroupBody, _: Progress) -> Any:
-        """Stop all that moves in a group, whoever moves it. Needs no lock and no right."""
+        """Stop all motion in a group, by any client. Needs no lock and no right."""
         who = self._client.identity
         stops = [one for one in self._api.seen(who, asked.group) if one.effect == "stop"]
         if not stops:
@@ -217,7 +217,7 @@ class Tools:
                 await run.settled()
                 run.result(0)
                 said[handle.label] = "stopped"
-            except Exception as error:  # noqa: BLE001 - the others stop all the same
+            except Exception as error:  # noqa: BLE001 - the other stops must still run
                 said[handle.label] = f"{type(error).__name__}: {error}"
 
         async with anyio.create_task_group() as tasks:
@@ -226,10 +226,10 @@ class Tools:
         return said
 
     async def estop(self, asked: messages.EstopBody, _: Progress) -> Any:
-        """Stop everything in the whole system. A person has to clear that. Not safety-rated."""
+        """Stop everything in the whole system. A person has to clear it. Not safety-rated."""
         return await self._api.estop(self._client.identity, asked)
 
-    # --- parts of these
+    # --- helpers
 
     def _find(self, group: str, name: str, container: str) -> Handle:
         return self._api.find(self._client.identity, group, name, container)
@@ -239,12 +239,12 @@ class Tools:
             raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
 
     async def _state_of(self, handle: Handle) -> Any:
-        """What the robot says of what the service moves; None if it says nothing."""
+        """The robot's `state` for a service's group; None if it has none."""
         try:
             reader = self._find(handle.key.domain, "state", handle.container)
         except TradeError:
             return None
-        if reader.effect != "read":  # some other service of that name
+        if reader.effect != "read":  # another service of that name
             return None
         run = await self._api.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
         await run.settled()
@@ -255,7 +255,7 @@ class Tools:
 
 
 class Tool(NamedTuple):
-    """One tool, as it is offered."""
+    """The description of one tool."""
 
     asked: type[Struct]
     do: Callable[..., Awaitable[Any]]
@@ -264,12 +264,12 @@ class Tool(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What it is for."""
+        """Its description."""
         return self.do.__doc__ or ""
 
     @property
     def schema(self) -> dict[str, Any]:
-        """JSON Schema of its arguments, nothing in it refers to anything else."""
+        """JSON Schema of its arguments, without references."""
         [schema], parts = msgspec.json.schema_components([self.asked])
         return {key: value for key, value in parts[schema["$ref"].rpartition("/")[2]].items() if key != "title"}
 
@@ -290,6 +290,6 @@ TOOLS: Final = {
 
 
 def _about(asked: Struct) -> str:
-    """What a request is about, without its arguments, which may be nobody's business."""
+    """The target of a request, without its arguments, which may be confidential."""
     group, name = getattr(asked, "group", ""), getattr(asked, "name", "")
     return ".".join(filter(None, (group, name))) or getattr(asked, "sentence", "") or getattr(asked, "lock", "")

@@ -57,13 +57,13 @@ class Bridge:
     """Maps services in both directions until it is closed.
 
     Args:
-            container: the bridge's container and identity in TRADE.
-            graph: the ROS system.
-            file: the entries to map.
-            say: receives one line for each entry that is mapped, ends or fails.
+        container: the bridge's container and identity in TRADE.
+        graph: the ROS system.
+        file: the entries to map.
+        say: receives one line for each entry that is mapped, ends or fails.
 
     Raises:
-            ConfigurationError: a type is not known, or does not fit.
+        ConfigurationError: a type is not known, or does not fit.
         AccessDenied: the policy does not let this container register group ``ros``, or one that the file names.
     """
 

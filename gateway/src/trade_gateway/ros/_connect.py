@@ -31,8 +31,8 @@ def join(read: RosFile, path: Path) -> Graph:
     """Joins the ROS system that the file names, as a node.
 
     Raises:
-            ConfigurationError: support for that ROS is not installed, or the file has keys of the other version.
-            RosUnreachable: the system does not answer.
+        ConfigurationError: support for that ROS is not installed, or the file has keys of the other version.
+        RosUnreachable: the system does not answer.
     """
     side = _SIDES[read.ros.version]
     _refuse_others(read, path)
@@ -59,7 +59,7 @@ def planned(read: RosFile, path: Path) -> list[str]:
     """Returns one line for each mapping of a file.
 
     Raises:
-            ConfigurationError: a type is not known, or has the wrong kind.
+        ConfigurationError: a type is not known, or has the wrong kind.
     """
     _refuse_others(read, path)
     types = Types(read.ros.version, read.folders(path))

@@ -30,14 +30,14 @@ class RequestMapping:
         fixed: Mapping[str, Any] | None = None,
     ) -> None:
         """Args:
-                types: the types of the ROS side.
-                type_name: of the message: a topic's, or of a service's request.
+            types: the types of the ROS side.
+            type_name: of the message: a topic's, or of a service's request.
             handle: the service.
-                args: for each parameter, its field; not needed for equal names, or for a single field called ``data``.
-                fixed: arguments that do not come from the message.
+            args: for each parameter, its field; not needed for equal names, or for a single field called ``data``.
+            fixed: arguments that do not come from the message.
 
         Raises:
-                ConfigurationError: the message and the service do not match.
+            ConfigurationError: the message and the service do not match.
         """
         self._fixed = dict(fixed or {})
         fields = {field.name: field for field in types.fields(type_name)}
@@ -83,12 +83,12 @@ class ResponseMapping:
 
     def __init__(self, types: Types, type_name: str, fields: Mapping[str, str] | None = None) -> None:
         """Args:
-                types: the types of the ROS side.
+            types: the types of the ROS side.
             type_name: of the message.
-                fields: for each field, the part of the result; by default by equal names, or the only field.
+            fields: for each field, the part of the result; by default by equal names, or the only field.
 
         Raises:
-                ConfigurationError: the type has no such field.
+            ConfigurationError: the type has no such field.
         """
         self._type = type_name
         known = {field.name: field.type for field in types.fields(type_name)}
@@ -108,11 +108,11 @@ class ResponseMapping:
         """Returns the message.
 
         Args:
-                value: the result of the service.
-                at_s: its time, in seconds since the epoch, for types with a header.
+            value: the result of the service.
+            at_s: its time, in seconds since the epoch, for types with a header.
 
         Raises:
-                ConfigurationError: no part of the value fits the type.
+            ConfigurationError: no part of the value fits the type.
         """
         plain: Any = msgspec.to_builtins(value, enc_hook=str)
         message = self._filled(plain)

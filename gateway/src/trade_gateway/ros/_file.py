@@ -257,7 +257,7 @@ def read_ros_file(path: Path) -> RosFile:
     """Reads and checks a file.
 
     Raises:
-            ConfigurationError: the file cannot be read, or an entry is wrong; the error says where, and what is valid.
+        ConfigurationError: the file cannot be read, or an entry is wrong; the error says where, and what is valid.
     """
     try:
         raw = read_toml_text(path.read_text(encoding="utf-8"))

@@ -95,12 +95,12 @@ class RosJoints:
         """Move all joints to angles, arriving together; return the angles after the end.
 
         Raises:
-                InvalidArgument: the number of angles is wrong, or the speed is invalid.
-                RosUnreachable: the angles are unknown, or no node serves the action, or the joints have arrived, but no
-                        state was received since.
-                RosRefused: the goal was rejected.
-                DeviceFault: the goal was aborted, or whether it has ended is unknown.
-                MotionStopped: it was stopped, or the call's deadline expired first.
+            InvalidArgument: the number of angles is wrong, or the speed is invalid.
+            RosUnreachable: the angles are unknown, or no node serves the action, or the joints have arrived, but no
+                state was received since.
+            RosRefused: the goal was rejected.
+            DeviceFault: the goal was aborted, or whether it has ended is unknown.
+            MotionStopped: it was stopped, or the call's deadline expired first.
         """
         if len(positions_rad) != len(self._names):
             problem = f"{len(positions_rad)} for {len(self._names)} joints"

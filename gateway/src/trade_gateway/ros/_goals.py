@@ -68,12 +68,12 @@ def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | 
     """Converts a goal's trajectory to one of TRADE.
 
     Args:
-            goal: the whole goal.
-            names: the joints' names.
-            here: the current angles, by TRADE name, prepended if the first point is later. None: it must be at 0 s.
+        goal: the whole goal.
+        names: the joints' names.
+        here: the current angles, by TRADE name, prepended if the first point is later. None: it must be at 0 s.
 
     Raises:
-            Unacceptable: it has other joints, or points without angles.
+        Unacceptable: it has other joints, or points without angles.
     """
     said: Sequence[str] = goal["trajectory"]["joint_names"]
     if sorted(said) != sorted(names.ours):
@@ -147,7 +147,7 @@ def goal_of(joints: Sequence[str], points: Sequence[Mapping[str, Any]]) -> Messa
 
     Args:
         joints: their names.
-            points: as in TRADE trajectories, in the order of the joints.
+        points: as in TRADE trajectories, in the order of the joints.
     """
     return {
         "trajectory": {

@@ -127,8 +127,8 @@ class Pursuit(Protocol):
         """Waits for its end.
 
         Raises:
-                RosRefused: it was rejected.
-                RosUnreachable: its server is gone, or no end was received in time.
+            RosRefused: it was rejected.
+            RosUnreachable: its server is gone, or no end was received in time.
         """
         ...
 
@@ -164,7 +164,7 @@ class Graph(Protocol):
         """Calls a ROS service; stops: regardless of the number of pending calls.
 
         Raises:
-                RosUnreachable: it does not exist, or did not answer in time.
+            RosUnreachable: it does not exist, or did not answer in time.
             RosRefused: it failed.
         """
         ...

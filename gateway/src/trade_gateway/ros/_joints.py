@@ -28,12 +28,12 @@ class JointNames:
     """The names of joints in ROS and in TRADE.
 
     Args:
-            joints: full names in TRADE.
-            short: whether the ROS names are the last parts of the TRADE names.
-            named: for each other ROS name, the TRADE name.
+        joints: full names in TRADE.
+        short: whether the ROS names are the last parts of the TRADE names.
+        named: for each other ROS name, the TRADE name.
 
     Raises:
-            ConfigurationError: two joints would have the same name, or a name belongs to no joint.
+        ConfigurationError: two joints would have the same name, or a name belongs to no joint.
     """
 
     def __init__(self, joints: Sequence[str], *, short: bool, named: Mapping[str, str]) -> None:

@@ -31,11 +31,11 @@ class Mailbox(Generic[_T]):
     ) -> None:
         """Args:
         name: of the thread.
-            tell: called with each item; its exceptions are logged.
-            most: how many items wait at most; None: any number.
-            longest_s: how long an item waits at most, in seconds.
-            drop: called with each dropped item.
-            end_s: how long closing waits for running callbacks, in seconds.
+        tell: called with each item; its exceptions are logged.
+        most: how many items wait at most; None: any number.
+        longest_s: how long an item waits at most, in seconds.
+        drop: called with each dropped item.
+        end_s: how long closing waits for running callbacks, in seconds.
         """
         self._tell = tell
         self._most = most

@@ -64,9 +64,9 @@ class Following:
     """Opens and closes mappings as services come and go.
 
     Args:
-            container: its system has the services.
-            mappings: the entries; the first one that wants a name gets it.
-            say: receives one line for each mapping that opens, closes or fails.
+        container: its system has the services.
+        mappings: the entries; the first one that wants a name gets it.
+        say: receives one line for each mapping that opens, closes or fails.
     """
 
     def __init__(self, container: Container, mappings: Sequence[Mapping], say: Callable[[str], object]) -> None:
@@ -196,7 +196,7 @@ def named_services(service: str, found: Sequence[Handle]) -> list[Handle]:
     """Selects services by group and name; those of exactly this group have priority over those beneath it.
 
     Raises:
-            ConfigurationError: there are several.
+        ConfigurationError: there are several.
     """
     group, _, name = service.rpartition(".")
     inside = [handle for handle in found if handle.name == name]

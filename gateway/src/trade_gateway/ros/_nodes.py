@@ -38,12 +38,12 @@ class NodeLocks:
         """Holds locks on services for the node inside the context.
 
         Args:
-                handles: the services that move something.
-                purpose: the purpose shown to others.
-                wait_s: how long to wait for other owners, in seconds.
+            handles: the services that move something.
+            purpose: the purpose shown to others.
+            wait_s: how long to wait for other owners, in seconds.
 
         Raises:
-                LockedByOther: another client has locked one of them, or moves it.
+            LockedByOther: another client has locked one of them, or moves it.
             TradeError: see `trade.Container.lock`.
         """
         taken = self._take(handles, purpose, wait_s)
@@ -135,14 +135,14 @@ class Guest:
         Args:
             handle: what to call.
             args: by name.
-                deadline_s: the call's deadline in seconds.
-                came_at: arrival of the node's request (``time.monotonic()``), before any wait; None: the bridge itself
-                        makes the call.
-                admitted: what `Client.admit` returned on arrival; by default it is called now.
+            deadline_s: the call's deadline in seconds.
+            came_at: arrival of the node's request (``time.monotonic()``), before any wait; None: the bridge itself
+                makes the call.
+            admitted: what `Client.admit` returned on arrival; by default it is called now.
 
         Raises:
-                Cancelled: a stop was requested meanwhile.
-                SessionEnded: the node is gone.
+            Cancelled: a stop was requested meanwhile.
+            SessionEnded: the node is gone.
         """
         client = self.client
         if handle.effect == "stop" and came_at is not None:
@@ -180,8 +180,8 @@ class Nodes:
     Args:
         container: the bridge's.
         graph: the ROS system.
-            grace_s: how long ROS may be lost before all nodes count as gone, in seconds.
-            told: receives ROS's problem, or an empty text, at each change.
+        grace_s: how long ROS may be lost before all nodes count as gone, in seconds.
+        told: receives ROS's problem, or an empty text, at each change.
     """
 
     def __init__(self, container: Container, graph: Graph, grace_s: float, told: Callable[[str], object]) -> None:
@@ -205,12 +205,12 @@ class Nodes:
         """Returns the client that represents a node.
 
         Args:
-                who: its name, from ROS.
-                came_at: arrival of its request, by ``time.monotonic()``.
-                stops: whether it wants to stop something, which is always allowed.
+            who: its name, from ROS.
+            came_at: arrival of its request, by ``time.monotonic()``.
+            stops: whether it wants to stop something, which is always allowed.
 
         Raises:
-                RosUnreachable: the node's end would be invisible, or it has ended, or the bridge is shutting down.
+            RosUnreachable: the node's end would be invisible, or it has ended, or the bridge is shutting down.
         """
         with self._guard:
             if self._closing.is_set() and not stops:

@@ -36,9 +36,9 @@ def provider(kind: str, methods: Sequence[Method], resources: Sequence[Resource]
     """Builds an object with these services.
 
     Args:
-            kind: name of its class.
+        kind: name of its class.
         methods: the services.
-            resources: what the services that actuate use.
+        resources: what the services that actuate use.
     """
     members: dict[str, Any] = {method.name: _made(method) for method in methods}
     return type(kind, (), {**members, "resources": tuple(resources)})()
@@ -91,7 +91,7 @@ class Records:
         """Returns the fields as parameters of a service, and which are optional: headers.
 
         Raises:
-                ConfigurationError: the name of a field cannot be one of a parameter.
+            ConfigurationError: the name of a field cannot be one of a parameter.
         """
         fields = self._types.fields(type_name)
         for field in fields:

@@ -56,7 +56,7 @@ class Types:
 
     def __init__(self, ros: Literal[1, 2], folders: Iterable[Path] = ()) -> None:
         """Args:
-                ros: the version whose encoding applies.
+            ros: the version whose encoding applies.
             folders: each with packages as ROS lays them out: ``PACKAGE/msg/NAME.msg``, ``srv``, ``action``.
 
         Raises:
@@ -106,7 +106,7 @@ class Types:
         """Encodes a message; missing fields are zero.
 
         Raises:
-                ConfigurationError: it has a field that is not in the type, or a value that does not fit.
+            ConfigurationError: it has a field that is not in the type, or a value that does not fit.
         """
         made = self.object(type_name, message)
         write = self._store.serialize_ros1 if self.ros == 1 else self._store.serialize_cdr
@@ -119,7 +119,7 @@ class Types:
         """Decodes a message.
 
         Raises:
-                ValueError: the bytes are not a message of this type.
+            ValueError: the bytes are not a message of this type.
         """
         self.fields(type_name)
         read = self._store.deserialize_ros1 if self.ros == 1 else self._store.deserialize_cdr

@@ -44,7 +44,7 @@ def test_what_is_marked_waits_for_a_persons_word(
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(run_sync, lambda: _decide(person, "approve"))
             assert await client("call", **call) == {"result": 0.5}
-        assert "waits for somebody's approval" in client.progress
+        assert "waits for a person's approval" in client.progress
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(run_sync, lambda: _decide(person, "refuse", "somebody stands there"))
             refusal = await client.refused("call", **{**call, "args": [0.7]})

@@ -120,15 +120,15 @@ class Ros1(Graph):
         """Returns at once; `healthy` shows when the node is registered with the master.
 
         Args:
-                master: the master's URI; else ``ROS_MASTER_URI``, or ``http://localhost:11311``.
-                node: the bridge's name in ROS.
-                python: an interpreter that has rospy.
-                folders: folders of type definitions, see `Types`.
-                ip: address under which others reach us (``ROS_IP``). Without it, the environment decides (``ROS_IP``,
-                        ``ROS_HOSTNAME``); else loopback if the master is on loopback, and otherwise the choice of ROS.
+            master: the master's URI; else ``ROS_MASTER_URI``, or ``http://localhost:11311``.
+            node: the bridge's name in ROS.
+            python: an interpreter that has rospy.
+            folders: folders of type definitions, see `Types`.
+            ip: address under which others reach us (``ROS_IP``). Without it, the environment decides (``ROS_IP``,
+                ``ROS_HOSTNAME``); else loopback if the master is on loopback, and otherwise the choice of ROS.
 
         Raises:
-                ConfigurationError: a name is not a name of ROS, or a definition cannot be read.
+            ConfigurationError: a name is not a name of ROS, or a definition cannot be read.
         """
         self._types = Types(1, folders)
         self._nodes = Nodes()

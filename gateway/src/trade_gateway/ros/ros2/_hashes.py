@@ -8,7 +8,7 @@ adds (``rosidl_parser/definition.py``, ``rosidl_generator_type_description``):
 - An action ``Name`` has the services ``Name_SendGoal`` (goal id and goal; accepted and stamp) and ``Name_GetResult``
   (goal id; status and result), and the message ``Name_FeedbackMessage`` (goal id and feedback).
 - ``char`` is an unsigned number of 8 bits. rosbags takes it for a character of IDL, which gives wrong hashes to all
-    services, as their events contain one; this module corrects that.
+  services, as their events contain one; this module corrects that.
 """
 
 import threading
@@ -59,7 +59,7 @@ class Hashes:
         """Adds the types that ROS generates for an action, so that they can be read and written as bytes.
 
         Raises:
-                ConfigurationError: the type is not known, or is not an action.
+            ConfigurationError: the type is not known, or is not an action.
         """
         goal, result, feedback = _three(type_name, self._types.parts(type_name))
         with self._lock:

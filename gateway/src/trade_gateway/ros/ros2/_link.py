@@ -87,7 +87,7 @@ class Link:
         """Makes a declaration, now or once there is a session.
 
         Args:
-                declare: receives the session, returns what to undeclare, in this order. It is called with a lock held.
+            declare: receives the session, returns what to undeclare, in this order. It is called with a lock held.
         """
         declared = Declared(self, declare)
         with self._lock:

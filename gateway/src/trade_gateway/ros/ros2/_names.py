@@ -5,7 +5,7 @@ Facts, all from ros2/rmw_zenoh (``docs/design.md``, ``rmw_zenoh_cpp/src/detail/l
 - Topics and services are at ``<domain>/<name without its first slash>/<DDS type>/<type hash>``; the DDS type of
   ``package/msg/Name`` is ``package::msg::dds_::Name_``.
 - Liveliness tokens announce nodes: ``@ros2_lv/<domain>/<session>/<node id>/<entity id>/<kind>/<enclave>/
-    <namespace>/<node>``, and endpoints add ``/<name>/<DDS type>/<type hash>/<QoS>``. In all of these a slash is
+  <namespace>/<node>``, and endpoints add ``/<name>/<DDS type>/<type hash>/<QoS>``. In all of these a slash is
   written ``%``. Kinds are NN, MP, MS, SS, SC: node, publisher, subscription, service server and client.
 - QoS is ``reliability:durability:history,depth:deadline:lifespan:liveliness``, each empty where it is the default:
   reliable, volatile, keep last, depth 42, no deadlines.
@@ -65,7 +65,7 @@ def absolute(name: str) -> str:
     """Returns a name of a topic, service, action or node unchanged.
 
     Raises:
-            ConfigurationError: it is not an absolute name of ROS.
+        ConfigurationError: it is not an absolute name of ROS.
     """
     if _NAME.fullmatch(name) is None or "__" in name:
         raise ConfigurationError(where="ROS name", problem=f"{name!r} must be absolute, such as /like/this_1")

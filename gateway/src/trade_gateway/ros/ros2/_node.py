@@ -41,7 +41,7 @@ class Attachment(NamedTuple):
         """Parses a received attachment.
 
         Raises:
-                ValueError: these bytes are not an attachment, or come from an older rmw_zenoh.
+            ValueError: these bytes are not an attachment, or come from an older rmw_zenoh.
         """
         if len(data) != _FORMAT.size:
             raise ValueError(f"an attachment has {_FORMAT.size} bytes, not {len(data)}")

@@ -61,7 +61,7 @@ class Pursuing:
         """Sends the goal. If its outcome is unknown, the goal is canceled and counts as running until it ends.
 
         Raises:
-                RosUnreachable: no node serves the action, so the goal was not sent.
+            RosUnreachable: no node serves the action, so the goal was not sent.
             ConfigurationError: the goal does not fit.
         """
         try:

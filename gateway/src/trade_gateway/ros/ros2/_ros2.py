@@ -39,13 +39,13 @@ class Ros2(Graph):
         """Returns without waiting for the router; see `healthy`.
 
         Args:
-                router: where ``rmw_zenohd`` listens, as an endpoint of zenoh.
+            router: where ``rmw_zenohd`` listens, as an endpoint of zenoh.
             domain_id: ``ROS_DOMAIN_ID`` of that system.
-                node: the bridge's name in it, absolute and unique.
-                folders: folders of type definitions, see `Types`.
+            node: the bridge's name in it, absolute and unique.
+            folders: folders of type definitions, see `Types`.
 
         Raises:
-                ConfigurationError: one of these is invalid.
+            ConfigurationError: one of these is invalid.
         """
         if domain_id < 0:
             raise ConfigurationError(where="ROS domain", problem=f"{domain_id} must be 0 or more, as ROS_DOMAIN_ID is")
@@ -75,7 +75,7 @@ class Ros2(Graph):
         While a call of `heard` lasts, at most ten messages wait, each for at most a second.
 
         Raises:
-                ConfigurationError: its name or type is invalid.
+            ConfigurationError: its name or type is invalid.
         """
         return self._keep(TopicHeard(self._node, topic, type_name, heard, latched=latched))
 
@@ -112,8 +112,8 @@ class Ros2(Graph):
         meanwhile; `Pursuit.wait` then raises RosUnreachable, which says whether the goal was canceled.
 
         Raises:
-                RosUnreachable: no node serves the action, so the goal was not sent.
-                ConfigurationError: the name or type is invalid, or the goal does not fit.
+            RosUnreachable: no node serves the action, so the goal was not sent.
+            ConfigurationError: the name or type is invalid, or the goal does not fit.
         """
         pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))
         pursuing.begin(goal)

@@ -157,7 +157,7 @@ class Client:
         """The same for callers that must know whether the request was sent.
 
         Raises:
-                RosRefused: the service failed.
+            RosRefused: the service failed.
             ConfigurationError: the request does not fit.
         """
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)

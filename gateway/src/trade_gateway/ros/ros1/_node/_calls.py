@@ -37,8 +37,8 @@ def call(master: str, node: str, name: str, service: Any, body: bytes, timeout_s
     """Returns the bytes of the response.
 
     Raises:
-            Unreachable: no node offers the service, or no answer arrived in time.
-            Refused: it failed, or has another type.
+        Unreachable: no node offers the service, or no answer arrived in time.
+        Refused: it failed, or has another type.
     """
     deadline = time.monotonic() + timeout_s
     try:

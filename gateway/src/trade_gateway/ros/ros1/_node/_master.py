@@ -34,8 +34,8 @@ def ask(uri: str, method: str, *arguments: Any, timeout_s: float = 2.0) -> Any:
     """Calls a method of a ROS API and unwraps its (code, text, value).
 
     Raises:
-            Unreachable: no answer within timeout_s.
-            Refused: the callee reported a failure, with its text.
+        Unreachable: no answer within timeout_s.
+        Refused: the callee reported a failure, with its text.
     """
     transport = _Transport(max(timeout_s, 0.05))
     try:
