@@ -31,8 +31,9 @@ Hears = MemoryObjectReceiveStream[SessionMessage | Exception]
 Says = MemoryObjectSendStream[SessionMessage]
 
 _INSTRUCTIONS: Final = """Robots as services. Look with `services` and `describe` first. Whatever moves something \
-needs a lock over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves nothing. \
-Release locks with `unlock`. Motion that you started stops when you disconnect. `stop` and `estop` need no lock."""
+needs a lock over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves \
+nothing. Release locks with `unlock`. Motion that you started stops when you disconnect. `stop` and `estop` need no \
+lock."""
 _KILLED_BY: Final = 128
 
 
