@@ -171,7 +171,7 @@ class BusyStand:
     def __init__(self, failures: int) -> None:
         self.failures, self.calls, self.dismissed = failures, 0, 0
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         self.calls += 1
         if self.calls <= self.failures:
             raise DrillFailed(problem="too busy")
@@ -213,16 +213,16 @@ def test_a_bar_ends_with_the_page_however_long_it_took() -> None:
 
 
 class ScriptedStand:
-    """A stand whose joint does what a script says: times relative to the deed, and whether it moves from then on."""
+    """A stand whose joint does what a script says: times relative to the failure, and whether it moves from then on."""
 
     def __init__(self, log: Path, script: list[tuple[float, bool]], after_mending: list[tuple[float, bool]]) -> None:
         self._log, self._script, self._after_mending = log, script, after_mending
-        self._mended = 0
+        self._recovered = 0
         self.judge = Judge(log)
 
-    def mend(self) -> None:
-        self._mended += 1
-        if self._mended == 2:  # the first time is before the deed
+    def recover(self) -> None:
+        self._recovered += 1
+        if self._recovered == 2:  # the first time is before the failure
             self._write(time.monotonic(), self._after_mending)
 
     def call(self, scene: Scene, targets: list[Target]) -> "ScriptedStand":
@@ -285,4 +285,4 @@ def test_a_joint_that_rested_before_the_deed_has_shown_nothing(monkeypatch: pyte
     stand = ScriptedStand(tmp_path / "log.jsonl", [(-0.001, False)], [])
     played = play(stand, BY_NAME["unplug"], targets, Drill())
     assert not played.ok
-    assert all("rested already" in problem for problem in played.problems)
+    assert all("was at rest before the failure" in problem for problem in played.problems)

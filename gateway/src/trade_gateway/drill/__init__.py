@@ -1,4 +1,4 @@
-"""``trade drill``: while a simulated twin of a robot moves, what it hangs on is taken away, and the time is taken."""
+"""``trade drill``: fails a moving simulated twin's processes and connections, and measures the time until it stops."""
 
 from trade_gateway.drill._report import Played, Report, Stop, as_data, page
 from trade_gateway.drill._runner import play

@@ -1,8 +1,8 @@
-"""The caller of a drill, as a process that can be killed: moves what it is told to, and stays.
+"""The caller of a drill, as a process that can be killed: it moves what its orders say, and stays.
 
-``_caller ORDERS`` (JSON, a list of `Order`) says ``{"ready": true}`` once all is enabled, begins at the first line of
-standard input, falls silent but lives on at the second, and ends with it. It says ``{"error": ...}`` of what it cannot
-do.
+``_caller ORDERS`` (JSON, a list of `Order`) prints ``{"ready": true}`` once everything is enabled. It begins at the
+first line of standard input, stops sending but lives on at the second, and ends with it. It prints
+``{"error": ...}`` for a failure.
 """
 
 import json
@@ -24,30 +24,30 @@ __all__ = ["Order"]
 
 _FOUND_S: Final = 30.0
 _ENABLED_S: Final = 30.0
-"""How long devices may take until they can be enabled: those of a bus that was away come back one by one."""
+"""How long devices may take to become enabled, in seconds: those of a lost bus return one by one."""
 _PAUSE_S: Final = 0.25
 _MOVE_S: Final = 120.0
 _PERIOD_S: Final = 0.05
-"""Between two set-points."""
+"""Time between two set-points, in seconds."""
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """What to move, how."""
+    """What to move, and how."""
 
     group: str
     arm: bool
     stream: bool
-    """With set-points given again and again, instead of one move; an arm goes for a far one as fast as it may."""
+    """Whether to send set-points repeatedly instead of one move; an arm streams to a far one at full speed."""
     from_rad: list[float]
-    """Where it is: one angle, or those of an arm."""
+    """Its position: one angle, or those of an arm."""
     goal_rad: list[float]
     speed_rad_s: float
     valid_s: float
-    """How long a set-point holds."""
+    """Validity of a set-point in seconds."""
 
 
 def main() -> None:
-    """Do as the module says."""
+    """Runs the caller. See the module."""
     orders = msgspec.json.decode(sys.argv[1], type=list[Order])
     hushed = threading.Event()
     try:
@@ -57,19 +57,19 @@ def main() -> None:
             _say({"ready": True})
             sys.stdin.readline()
             for each in begin:
-                threads.submit(_told, each, hushed)
+                threads.submit(_moved, each, hushed)
             sys.stdin.readline()
             hushed.set()
             while sys.stdin.readline():
                 pass
-            trade.close()  # what it moves ends with it
+            trade.close()  # its motion ends with it
     except TradeError as problem:
         _say({"error": f"{type(problem).__name__}: {problem}"})
         sys.exit(1)
 
 
 def _beginning(order: Order) -> Callable[[threading.Event], None]:
-    """What to do about an order."""
+    """Returns the function that executes an order."""
     if not order.stream:
         move = _service(order.group, "move_joints" if order.arm else "move_to").with_(deadline_s=_MOVE_S)
         goal = order.goal_rad if order.arm else order.goal_rad[0]
@@ -85,7 +85,7 @@ def _beginning(order: Order) -> Callable[[threading.Event], None]:
     return stream
 
 
-def _told(motion: Callable[[threading.Event], None], hushed: threading.Event) -> None:
+def _moved(motion: Callable[[threading.Event], None], hushed: threading.Event) -> None:
     try:
         motion(hushed)
     except TradeError as problem:
@@ -93,7 +93,7 @@ def _told(motion: Callable[[threading.Event], None], hushed: threading.Event) ->
 
 
 def _enable(group: str) -> None:
-    """As soon as its device lets itself be enabled."""
+    """Enables a device as soon as it allows that."""
     until, pause, steps = time.monotonic() + _ENABLED_S, threading.Event(), _steps(group)
     while not _done(steps, give_up=time.monotonic() > until):
         pause.wait(_PAUSE_S)
@@ -111,7 +111,7 @@ def _done(steps: Callable[[], Sequence[Handle]], *, give_up: bool) -> bool:
 
 
 def _steps(group: str) -> Callable[[], Sequence[Handle]]:
-    """What has to be called before it moves, as things stand when it is asked."""
+    """Returns a function for the services to call before it can move, by its current state."""
     state = _service(group, "state")
     names = {handle.name: handle for handle in trade.services(where(group=group)) if group in handle.groups}
     if "enable" in names:
@@ -130,20 +130,20 @@ def _steps(group: str) -> Callable[[], Sequence[Handle]]:
 
 
 def _service(group: str, name: str) -> Handle:
-    """Of that very group, and none beneath it."""
+    """The service of exactly that group, not of one beneath it."""
     until, pause = time.monotonic() + _FOUND_S, threading.Event()
     while True:
         for handle in trade.services(where(name=name, group=group)):
             if group in handle.groups:
                 return handle
         if time.monotonic() > until:
-            return trade.find(where(name=name, group=group))  # which says what there is instead
+            return trade.find(where(name=name, group=group))  # its error lists what exists
         pause.wait(_PAUSE_S)
 
 
 def _say(what: dict[str, object]) -> None:
     line = json.dumps(what) + "\n"
-    os.write(sys.stdout.fileno(), line.encode())  # whole, whichever threads have something to say at once
+    os.write(sys.stdout.fileno(), line.encode())  # atomic, also with several threads
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A process of a drill: started with a lifeline to this one, heard line by line, killed, frozen and woken."""
+"""A child process of a drill: started, read line by line, killed, frozen and resumed."""
 
 import json
 import os
@@ -21,7 +21,7 @@ _END_S: Final = 20.0
 
 @dataclass(kw_only=True, eq=False)
 class DrillFailed(TradeError):
-    """A drill cannot be held: what it needs does not come up, or does not move."""
+    """A drill cannot run: a process or device that it needs does not start, or does not move."""
 
     problem: str
 
@@ -30,26 +30,26 @@ class DrillFailed(TradeError):
 
 
 class Actor:
-    """``python -m WORDS`` as a child process that speaks JSON, a line at a time.
+    """``python -m WORDS`` as a child process that prints one JSON object per line.
 
     Args:
         name: for messages.
         words: module and arguments.
         environment: of the process; whole.
-        complaints: a file for what it writes to standard error.
+        complaints: the file for its standard error.
     """
 
     def __init__(self, name: str, words: Sequence[str], environment: Mapping[str, str], complaints: Path) -> None:
         self.name = name
         self._complaints = complaints
         with complaints.open("ab") as errors:
-            self._process = subprocess.Popen(  # noqa: S603 - modules of ours
+            self._process = subprocess.Popen(  # noqa: S603 - our own modules
                 [sys.executable, "-m", *words],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env=dict(environment),
-                start_new_session=True,  # Ctrl-C is for this process, which ends the others in their order
+                start_new_session=True,  # Ctrl-C is for this process, which ends the others in order
             )
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, name=f"drill-{name}", daemon=True)
@@ -67,7 +67,7 @@ class Actor:
         return self._process.poll() is None
 
     def said(self, within_s: float) -> dict[str, Any]:
-        """What it says next; raises DrillFailed: nothing in time, or that it cannot do what it should."""
+        """Its next message; raises DrillFailed if there is none in time, or if it reports an error."""
         try:
             line = self._lines.get(timeout=within_s)
         except queue.Empty:
@@ -80,7 +80,7 @@ class Actor:
         return told
 
     def objection(self) -> str:
-        """What it says it cannot do; empty if it has said nothing more."""
+        """The error that it reports; empty if there is no message."""
         if self._lines.empty():
             return ""
         try:
@@ -90,7 +90,7 @@ class Actor:
         return ""
 
     def tell(self) -> None:
-        """Give it its next cue: a line."""
+        """Sends its next cue: a line."""
         assert self._process.stdin is not None  # noqa: S101 - a pipe
         try:
             self._process.stdin.write(b"\n")
@@ -99,19 +99,19 @@ class Actor:
             raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}") from None
 
     def kill(self) -> None:
-        """As kill -9 does."""
+        """Kills it with SIGKILL."""
         self._process.kill()
 
     def freeze(self) -> None:
-        """It does nothing any more, and its links stay open."""
+        """Freezes it; its connections stay open."""
         self._process.send_signal(signal.SIGSTOP)
 
     def wake(self) -> None:
-        """Go on; harmless if it is not frozen."""
+        """Resumes it; harmless if it is not frozen."""
         self._process.send_signal(signal.SIGCONT)
 
     def close(self, *, gently: bool) -> None:
-        """End it, in order if there is one, and wait for that. Idempotent."""
+        """Ends it, in order if requested, and waits for that. Idempotent."""
         self.wake()
         if gently:
             self._process.terminate()
@@ -133,5 +133,5 @@ class Actor:
 
 
 def bare_environment() -> dict[str, str]:
-    """This one's, without what would lead a container into another system."""
+    """The environment without variables that would connect a container to another system."""
     return {name: value for name, value in os.environ.items() if not name.startswith("TRADE_")}

@@ -1,4 +1,4 @@
-"""What a drill has found, as records and as a page: of each scene, how long each joint moved on and may move on."""
+"""The results of a drill, as records and as a page: for each scene, how long each joint moved and may move."""
 
 from html import escape
 from typing import Any, Final, Literal
@@ -17,14 +17,14 @@ class Stop(Struct, frozen=True, kw_only=True):
     joint: str
     bus: str
     took_s: float | None
-    """From the deed until it rested for good; None: it was still moving when nobody waited any longer."""
+    """Time from the failure until the final rest, in seconds; None: it still moved after the longest wait."""
     limit_s: float
     again_s: float | None = None
-    """So long after the deed it moved once more, when all was mended and nobody had told it to; None: it did not."""
+    """Time of an unrequested motion after the recovery, in seconds from the failure; None: there was none."""
 
     @property
     def verdict(self) -> Verdict:
-        """What to think of it."""
+        """The verdict on this stop."""
         if self.took_s is None:
             return "did not stop"
         if self.again_s is not None:
@@ -33,28 +33,28 @@ class Stop(Struct, frozen=True, kw_only=True):
 
     @property
     def part(self) -> float:
-        """How much of its limit it took; infinite if it did not stop."""
+        """The used fraction of its limit; infinite if it did not stop."""
         return float("inf") if self.took_s is None else self.took_s / self.limit_s
 
 
 class Played(Struct, frozen=True, kw_only=True):
-    """One scene."""
+    """The results of one scene."""
 
     scene: str
     what: str
     shows: str
     stops: list[Stop] = []
     problems: list[str] = []
-    """Why it could not be held, each time that it could not; it was in the end if there are stops."""
+    """Why attempts were invalid; the last one was valid if there are stops."""
 
     @property
     def ok(self) -> bool:
-        """Whether it was held, and each joint kept its limit."""
+        """Whether it ran, and each joint kept its limit."""
         return bool(self.stops) and all(stop.verdict == "ok" for stop in self.stops)
 
 
 class Report(Struct, frozen=True, kw_only=True):
-    """A whole drill."""
+    """The results of a whole drill."""
 
     robot: str
     file: str
@@ -64,16 +64,16 @@ class Report(Struct, frozen=True, kw_only=True):
     """Date and time, ISO 8601."""
     scenes: list[Played]
     left_out: dict[str, str]
-    """Parts of the robot and scenes that were not held, and why."""
+    """Parts of the robot and scenes that were skipped, and why."""
 
     @property
     def ok(self) -> bool:
-        """Whether there was a scene, and all of them were."""
+        """Whether there was a scene, and all of them are ok."""
         return bool(self.scenes) and all(played.ok for played in self.scenes)
 
 
 def as_data(report: Report) -> dict[str, Any]:
-    """The report as plain data, with what to think of it."""
+    """The report as plain data, with the verdicts."""
     data: dict[str, Any] = msgspec.to_builtins(report)
     for played, told in zip(report.scenes, data["scenes"], strict=True):
         told["ok"] = played.ok
@@ -83,7 +83,7 @@ def as_data(report: Report) -> dict[str, Any]:
 
 
 _LIMIT_PERCENT: Final = 70.0
-"""Where in a bar the limit is."""
+"""Position of the limit in a bar."""
 
 _STYLE: Final = """
 :root { color-scheme: light dark; --ok: #2e7d32; --bad: #c62828; --line: #8886; }
@@ -103,7 +103,7 @@ td.bar { width: 50%; }
 
 
 def page(report: Report) -> str:
-    """The page: what is worst comes first."""
+    """Returns the page: the worst results come first."""
     verdict = '<strong class="ok">passed</strong>' if report.ok else '<strong class="bad">failed</strong>'
     facts = f"{escape(report.file)}, TRADE {escape(report.version)}, on {escape(report.host)}, {escape(report.at)}"
     parts = [
@@ -112,8 +112,8 @@ def page(report: Report) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>Drill of {escape(report.robot)}</title><style>{_STYLE}</style></head><body>",
         f"<h1>Drill of {escape(report.robot)}: {verdict}</h1><p>{facts}</p>",
-        "<p>Simulated devices; the times are from their log: from the deed until a joint was at rest for good.",
-        "The mark in a bar is the limit. Nothing of this is safety-rated.</p>",
+        "<p>Simulated devices; the times are from their log: from the failure until a joint was finally at rest.",
+        "The mark in a bar is the limit. This measurement is not safety-rated.</p>",
         *(_scene(played) for played in sorted(report.scenes, key=_severity)),
         _left_out(report),
         "</body></html>",
@@ -129,7 +129,7 @@ def _scene(played: Played) -> str:
     colour, word = ("ok", "ok") if played.ok else ("bad", "failed")
     head = f'<h2>{escape(played.scene)} <small class="{colour}">{word}</small></h2>'
     what = f"<p>{escape(played.what)} (shows {escape(played.shows)} of docs/safety.md)</p>"
-    what += "".join(f"<p>not held: {escape(problem)}</p>" for problem in played.problems)
+    what += "".join(f"<p>not run: {escape(problem)}</p>" for problem in played.problems)
     if not played.stops:
         return f"<section>{head}{what}</section>"
     rows = "".join(map(_row, sorted(played.stops, key=lambda stop: -stop.part)))
@@ -140,7 +140,7 @@ def _scene(played: Played) -> str:
 def _row(stop: Stop) -> str:
     took = "-" if stop.took_s is None else f"{stop.took_s:.3f} s"
     colour = "ok" if stop.verdict == "ok" else "bad"
-    again = f", {stop.again_s:.3f} s after the deed" if stop.again_s is not None else ""
+    again = f", {stop.again_s:.3f} s after the failure" if stop.again_s is not None else ""
     width = min(100.0, stop.part * _LIMIT_PERCENT)
     over = ' class="over"' if stop.part > 1 else ""
     bar = f'<div><i{over} style="width: {width:.1f}%"></i><b style="left: {_LIMIT_PERCENT:.1f}%"></b></div>'

@@ -1,4 +1,4 @@
-"""Holding one scene: something moves, the deed is done, and the judge says how long it went on."""
+"""Runs one scene: starts a motion, causes the failure, and measures how long the motion continues."""
 
 import threading
 import time
@@ -17,19 +17,19 @@ __all__ = ["play"]
 _TRIES: Final = 3
 _BEGUN_S: Final = 20.0
 _ON_ITS_WAY_S: Final = 0.5
-"""From the first to move until the deed at least."""
+"""Shortest time from the first motion until the failure, in seconds."""
 _REST_S: Final = 12.0
-"""Nobody waits longer for a joint to rest."""
+"""Longest wait for a joint to rest, in seconds."""
 _QUIET_S: Final = 1.0
-"""Who has rested so long rests for good."""
+"""A joint at rest for so long is finally at rest, in seconds."""
 _LOOK_EVERY_S: Final = 0.05
 
 
 def play(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
-    """Hold a scene with those it concerns.
+    """Runs a scene with the targets that it concerns.
 
-    One that comes to no measurement, as on a computer so busy that a watchdog runs out before the deed, is held again.
-    What was measured stands.
+    An attempt without a measurement is repeated, for example if a watchdog expires too early on a busy computer.
+    A measurement is final.
     """
     concerned = [target for target in targets if scene.concerns(target)]
     problems: list[str] = []
@@ -45,18 +45,18 @@ def play(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) ->
 
 
 def _played(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> list[Stop]:
-    stand.mend()
+    stand.recover()
     _begin(stand, stand.call(scene, targets), targets)
     done_at = stand.strike(scene, targets)
     _wait(lambda: _quiet(stand, targets, done_at), _REST_S)
     stand.look()
     if short := [target.name for target in targets if not stand.judge.moves(target.name, at=done_at)]:
-        raise DrillFailed(problem=f"{', '.join(short)} rested already when it was done; the computer is too busy")
+        raise DrillFailed(problem=f"{', '.join(short)} was at rest before the failure; the computer is too busy")
     rested = {
         target.name: None if stand.judge.moves(target.name) else stand.judge.rested(target.name) for target in targets
     }
     looked_until = time.monotonic()
-    stand.mend()
+    stand.recover()
     threading.Event().wait(_QUIET_S)
     stand.look()
     return [
@@ -72,7 +72,7 @@ def _played(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill)
 
 
 def _begin(stand: Stand, caller: Actor, targets: Sequence[Target]) -> None:
-    """Have it move. Raises DrillFailed."""
+    """Starts the motion. Raises DrillFailed."""
     caller.tell()
 
     def moving() -> bool:
@@ -88,7 +88,7 @@ def _begin(stand: Stand, caller: Actor, targets: Sequence[Target]) -> None:
 
 
 def _quiet(stand: Stand, targets: Sequence[Target], done_at: float) -> bool:
-    """Whether all of them have rested for long enough since the deed."""
+    """Whether all of them have rested for long enough since the failure."""
     stand.look()
     if any(stand.judge.moves(target.name) for target in targets):
         return False

@@ -1,4 +1,4 @@
-"""The scenes of a drill: what is done to whom while something moves, and how soon it has to be at rest. Pure data."""
+"""The scenes of a drill: what fails during a motion, and how soon the motion must end. Pure data."""
 
 from typing import Final, Literal
 
@@ -7,40 +7,40 @@ from msgspec import Struct
 from trade_drivers.robotfile import Drill
 from trade_gateway.drill._targets import Target
 
-__all__ = ["ALLOWANCE_S", "SCENES", "Deed", "Motion", "Scene", "limit_s"]
+__all__ = ["ALLOWANCE_S", "SCENES", "Failure", "Motion", "Scene", "limit_s"]
 
 ALLOWANCE_S: Final = 0.5
-"""For a busy computer: so much later than a rule alone would have it may a joint be at rest."""
+"""Extra time for a joint to rest beyond the rules' limits, for a busy computer, in seconds."""
 LEASE_S: Final = 2.0
-"""A silent neighbour is taken for gone after this (S05)."""
+"""A silent neighbour counts as gone after this time (S05), in seconds."""
 BRIDGE_S: Final = 1.0
-"""Who is behind a bridge that goes is given so long to come back (S05)."""
+"""Time for a bridge to return before the clients behind it count as gone (S05), in seconds."""
 VALID_S: Final = 0.5
-"""How long each set-point of a drill holds."""
+"""Validity of each set-point of a drill, in seconds."""
 
 Motion = Literal["move", "stream"]
-Deed = Literal["kill", "freeze", "hush", "unplug", "bus_off"]
+Failure = Literal["kill", "freeze", "hush", "unplug", "bus_off"]
 
 
 class Scene(Struct, frozen=True, kw_only=True):
-    """One thing that goes wrong."""
+    """One failure during a motion."""
 
     name: str
     """Also the key of its limit in the robot file."""
     what: str
-    """For people."""
+    """A description for people."""
     shows: str
-    """The rule of docs/safety.md."""
+    """The rule in docs/safety.md."""
     motion: Motion
-    deed: Deed
+    failure: Failure
     whom: Literal["caller", "driver", "gateway", "link", ""] = ""
-    """A process of the stand; empty: the simulated line."""
+    """The process that fails; empty: the simulated line."""
     noticed_s: float | None
-    """How late it is noticed at most; None: the device's watchdog notices."""
+    """Longest time until its detection, in seconds; None: the device's watchdog detects it."""
 
     def concerns(self, target: Target) -> bool:
-        """Whether it can happen to what moves on this bus."""
-        return target.can if self.deed == "bus_off" else target.streams or self.motion != "stream"
+        """Whether it can happen to a target on this bus."""
+        return target.can if self.failure == "bus_off" else target.streams or self.motion != "stream"
 
 
 SCENES: Final = (
@@ -49,7 +49,7 @@ SCENES: Final = (
         what="kill -9 of the caller",
         shows="S05",
         motion="move",
-        deed="kill",
+        failure="kill",
         whom="caller",
         noticed_s=0.0,
     ),
@@ -58,7 +58,7 @@ SCENES: Final = (
         what="the caller freezes",
         shows="S05",
         motion="move",
-        deed="freeze",
+        failure="freeze",
         whom="caller",
         noticed_s=LEASE_S,
     ),
@@ -67,7 +67,7 @@ SCENES: Final = (
         what="the caller lives, but its set-points stop coming",
         shows="S04",
         motion="stream",
-        deed="hush",
+        failure="hush",
         whom="caller",
         noticed_s=VALID_S,
     ),
@@ -76,7 +76,7 @@ SCENES: Final = (
         what="kill -9 of the robot's gateway",
         shows="S05",
         motion="move",
-        deed="kill",
+        failure="kill",
         whom="gateway",
         noticed_s=BRIDGE_S,
     ),
@@ -85,7 +85,7 @@ SCENES: Final = (
         what="nothing passes between the robot's gateway and the caller's",
         shows="S05",
         motion="move",
-        deed="freeze",
+        failure="freeze",
         whom="link",
         noticed_s=LEASE_S + BRIDGE_S,
     ),
@@ -94,7 +94,7 @@ SCENES: Final = (
         what="kill -9 of the driver",
         shows="S06",
         motion="move",
-        deed="kill",
+        failure="kill",
         whom="driver",
         noticed_s=None,
     ),
@@ -103,7 +103,7 @@ SCENES: Final = (
         what="the driver freezes",
         shows="S06",
         motion="move",
-        deed="freeze",
+        failure="freeze",
         whom="driver",
         noticed_s=None,
     ),
@@ -112,15 +112,17 @@ SCENES: Final = (
         what="serial and CAN adapters are unplugged, controllers leave the network",
         shows="S06",
         motion="move",
-        deed="unplug",
+        failure="unplug",
         noticed_s=None,
     ),
-    Scene(name="bus_off", what="CAN adapters go bus-off", shows="S06", motion="move", deed="bus_off", noticed_s=None),
+    Scene(
+        name="bus_off", what="CAN adapters go bus-off", shows="S06", motion="move", failure="bus_off", noticed_s=None
+    ),
 )
 
 
 def limit_s(scene: Scene, target: Target, given: Drill) -> float:
-    """How soon after the deed a joint has to be at rest, in seconds: what the robot file says, or the rule does."""
+    """How soon after the failure a joint must be at rest, in seconds: by the robot file, or by the rule."""
     told: float | None = getattr(given, scene.name)
     if told is not None:
         return told

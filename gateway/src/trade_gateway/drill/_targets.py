@@ -1,4 +1,4 @@
-"""What a drill moves: of each bus the joint with the widest range, rather one that is not coupled, or the arm."""
+"""The joints that a drill moves: on each bus the one with the widest range, preferably not coupled, or the arm."""
 
 from collections.abc import Sequence
 
@@ -10,44 +10,44 @@ from trade_drivers.robotfile import Arm, Bus, CanBus, Joint, Robot
 __all__ = ["LASTS_S", "Target", "targets_of"]
 
 LASTS_S = 20.0
-"""How long a motion of a drill would last if nothing ended it."""
+"""How long a motion of a drill would last if nothing ended it, in seconds."""
 _STREAMS_S = 2.5
-"""So long a stream takes at least until it falls silent and its last set-point is over, on a busy computer."""
+"""Shortest time until a stream stops and its last set-point expires, on a busy computer, in seconds."""
 _MARGIN = 0.05
-"""The fraction of its range that a joint keeps off either end."""
+"""The fraction of its range that a joint keeps free at either end."""
 
 
 class Target(Struct, frozen=True, kw_only=True):
     """One joint, or the first joint of an arm, that moves in a drill."""
 
     name: str
-    """As in the robot file."""
+    """Its name in the robot file."""
     group: str
-    """Where its services are: ``rosie.neck.pan``."""
+    """The group of its services: ``rosie.neck.pan``."""
     bus: str
     can: bool
-    """Its bus is a CAN bus."""
+    """Whether its bus is a CAN bus."""
     arm: bool
     min_rad: float
     max_rad: float
     max_speed_rad_s: float
     max_accel_rad_s2: float
     watchdog_s: float
-    """After this silence of the driver its device stops by itself, or has reached the last goal it got."""
+    """After this silence of the driver, its device stops by itself or has reached its last goal, in seconds."""
 
     @property
     def brakes_s(self) -> float:
-        """How long it takes to brake from its greatest speed."""
+        """How long it takes to brake from its greatest speed, in seconds."""
         return self.max_speed_rad_s / self.max_accel_rad_s2
 
     @property
     def streams(self) -> bool:
-        """Whether it is still on its way when a stream of set-points falls silent: an arm goes as fast as it may."""
+        """Whether it still moves when a stream of set-points stops: an arm moves as fast as it may."""
         shortest = (0.5 - _MARGIN) * (self.max_rad - self.min_rad)
         return not self.arm or shortest / self.max_speed_rad_s > _STREAMS_S
 
     def way(self, angle_rad: float) -> tuple[float, float]:
-        """Where to send it from an angle, so that it is on its way for `LASTS_S`, and how fast: rad and rad/s."""
+        """The goal and speed of a motion from an angle that lasts `LASTS_S`, in rad and rad/s."""
         margin = _MARGIN * (self.max_rad - self.min_rad)
         ends = (self.min_rad + margin, self.max_rad - margin)
         goal = max(ends, key=lambda end: abs(end - angle_rad))
@@ -55,7 +55,7 @@ class Target(Struct, frozen=True, kw_only=True):
 
 
 def targets_of(robot: Robot) -> tuple[list[Target], dict[str, str]]:
-    """What moves in a drill of a robot, one on each bus; and of each part that does not take part, why."""
+    """Returns what moves in a drill, one target on each bus, and why other parts do not."""
     coupled = {joint for pair in robot.coupled for joint in pair.joints}
     found: list[Target] = []
     left_out: dict[str, str] = {}
@@ -71,7 +71,7 @@ def targets_of(robot: Robot) -> tuple[list[Target], dict[str, str]]:
 
 
 def _target(robot: Robot, bus: Bus, coupled: set[str]) -> Target | str:
-    """What moves on a bus, or why nothing does."""
+    """Returns the target on a bus, or why there is none."""
     if missing := load_driver(bus.driver, bus.name, Driver).missing():
         return f"its driver needs {', '.join(missing)}"
     for arm in robot.arms_on(bus.name):

@@ -1,6 +1,6 @@
-"""A cable between two gateways, as a process that can be frozen: ``_relay PORT PORT`` passes on to those of this host.
+"""A TCP relay between two gateways, as a process that can be frozen: ``_relay PORT PORT`` forwards to these ports.
 
-It says where it listens for the one and for the other, and ends with standard input.
+It prints the two ports on which it listens, and ends with standard input.
 """
 
 import asyncio
@@ -17,19 +17,19 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         while data := await reader.read(_CHUNK):
             writer.write(data)
             await writer.drain()
-    except OSError:  # the other end is gone, so is this one
+    except OSError:  # the other end is closed, so this one is too
         pass
     finally:
         writer.close()
 
 
 async def _listen(port: int) -> asyncio.Server:
-    """Who connects here is connected to that port."""
+    """Listens on a port whose connections are forwarded to the given one."""
 
     async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             there, back = await asyncio.open_connection("127.0.0.1", port)
-        except OSError:  # nobody listens there at present
+        except OSError:  # the target does not listen now
             writer.close()
             return
         await asyncio.gather(_pass_on(reader, back), _pass_on(there, writer))

@@ -1,7 +1,7 @@
-"""Where a drill is held: a simulator, the driver, two linked gateways and a caller, each in a process of its own.
+"""The testbed of a drill: a simulator, the driver, two linked gateways and a caller, each in its own process.
 
-The driver and the caller reach each other only by way of the gateways, and these only by way of a cable that can be
-cut. All of it is on the loopback interface, in a system of its own.
+The driver and the caller reach each other only through the gateways, and these only through a relay that can be
+frozen. Everything is on the loopback interface, in a separate system.
 """
 
 import json
@@ -26,7 +26,7 @@ __all__ = ["Judge", "Stand", "standing"]
 
 
 class _Event(msgspec.Struct, frozen=True):
-    """What is needed of a line of the byte log."""
+    """The fields of a line of the byte log that a drill needs."""
 
     t: float
     name: str = ""
@@ -47,7 +47,7 @@ class Judge:
         self._moves: dict[str, list[tuple[float, bool]]] = {}
 
     def look(self) -> None:
-        """Read what is new."""
+        """Reads the new lines."""
         with self._log.open("rb") as file:
             file.seek(self._at)
             whole, ended, _ = file.read().rpartition(b"\n")
@@ -58,19 +58,19 @@ class Judge:
                 self._moves.setdefault(event.joint, []).append((event.t, event.name == "motion_started"))
 
     def moves(self, joint: str, at: float | None = None) -> bool:
-        """Whether it moved at that time on CLOCK_MONOTONIC; without one, as far as was looked."""
+        """Whether the joint moved at that time on CLOCK_MONOTONIC; without one, at the last line read."""
         known = [moving for t, moving in self._moves.get(joint, []) if at is None or t <= at]
         return bool(known) and known[-1]
 
     def rested(self, joint: str) -> float:
-        """When it came to rest last; KeyError: it never did."""
+        """The time at which it last came to rest; KeyError: it never did."""
         times = [t for t, moving in self._moves.get(joint, []) if not moving]
         if not times:
             raise KeyError(joint)
         return times[-1]
 
     def began(self, joint: str, since: float) -> float | None:
-        """When it first began to move after that time; None: it did not."""
+        """The time of its first motion after that time; None: it did not move."""
         return next((t for t, moving in self._moves.get(joint, []) if moving and t > since), None)
 
 
@@ -79,17 +79,17 @@ if TYPE_CHECKING:
 
 
 UP_S: Final = 60.0
-"""How long a process may take to be up; a busy computer needs seconds to import."""
+"""Time for a process to start, in seconds; a busy computer needs seconds to import."""
 
 
 class Stand:
-    """All that takes part, up until it is closed.
+    """All processes of a drill, until it is closed.
 
     Args:
-        robot: as its file has it.
-        left_out: the parts that are not brought up.
+        robot: the robot of the robot file.
+        left_out: the parts that are not started.
         sim: simulates the buses of the targets.
-        folder: for files of its own.
+        folder: for the drill's own files.
     """
 
     def __init__(self, robot: Robot, left_out: Sequence[str], sim: "SimProcess", folder: Path) -> None:
@@ -107,7 +107,7 @@ class Stand:
         self._near, self._far = _free_ports(2)
 
     def begin(self) -> None:
-        """Bring it up. Raises DrillFailed."""
+        """Starts the processes. Raises DrillFailed."""
         self._actors["link"] = self._actor(
             "link", ["trade_gateway.drill._tcp_relay", str(self._near), str(self._far)], {}
         )
@@ -118,7 +118,7 @@ class Stand:
             self._start(name)
 
     def call(self, scene: Scene, targets: Sequence[Target]) -> Actor:
-        """A caller that has found and enabled what it will move, and waits for its cue. Raises DrillFailed."""
+        """Starts a caller that has found and enabled its targets, and waits for its cue. Raises DrillFailed."""
         orders = [self._order(scene, target) for target in targets]
         words = ["trade_gateway.drill._caller", msgspec.json.encode(orders).decode()]
         caller = self._actors["caller"] = self._actor("caller", words, self._settings("caller", self._far))
@@ -126,9 +126,9 @@ class Stand:
         return caller
 
     def strike(self, scene: Scene, targets: Sequence[Target]) -> float:
-        """Do what the scene says; the time on CLOCK_MONOTONIC right before."""
+        """Causes the scene's failure; returns the time on CLOCK_MONOTONIC immediately before."""
         done_at = time.monotonic()
-        match scene.deed:
+        match scene.failure:
             case "kill":
                 self._actors[scene.whom].kill()
             case "freeze":
@@ -145,8 +145,8 @@ class Stand:
                     self._switch(bus, off=True)
         return done_at
 
-    def mend(self) -> None:
-        """Wake who is frozen, start who was killed, plug in what was unplugged. Raises DrillFailed."""
+    def recover(self) -> None:
+        """Reverses the failure: resumes, restarts or reconnects. Raises DrillFailed."""
         for actor in self._actors.values():
             actor.wake()
         for bus in self._unplugged:
@@ -160,24 +160,24 @@ class Stand:
                 self._start(name)
 
     def dismiss(self) -> None:
-        """The caller has done its part."""
+        """Ends the caller."""
         if caller := self._actors.pop("caller", None):
             caller.close(gently=False)
 
     def look(self) -> None:
-        """Have the judge see what has happened up to now."""
-        self._sim.control.state()  # simulated devices work out what has become of them when they are asked
+        """Has the judge read the log up to now."""
+        self._sim.control.state()  # simulated devices update their state when it is requested
         self.judge.look()
 
     def close(self) -> None:
-        """End all of it, the driver before its gateway. Idempotent."""
+        """Ends all processes, the driver before its gateway. Idempotent."""
         self.dismiss()
         for name in ("driver", "lab", "link", "gateway"):
             if actor := self._actors.pop(name, None):
                 actor.close(gently=name != "link")
 
     def _start(self, name: str) -> None:
-        """A command of ours."""
+        """Starts a `trade` command."""
         words = self._driver if name == "driver" else ["gateway", str(self._folder / f"{name}.toml"), "--json"]
         settings = self._settings("driver", self._near) if name == "driver" else self._places(name)
         self._actors[name] = actor = self._actor(name, ["trade_gateway", "--with-stdin", *words], settings)
@@ -187,7 +187,7 @@ class Stand:
         return Actor(name, words, {**bare_environment(), **settings}, self._folder / f"{name}.complaints")
 
     def _places(self, name: str) -> dict[str, str]:
-        """Folders of its own: nobody finds another one on this host."""
+        """The process's own folders, in which it finds no other process of this host."""
         own = self._folder / name
         return {"TRADE_RUNTIME_DIR": str(own / "runtime"), "TRADE_STATE_DIR": str(own / "state")}
 
@@ -229,17 +229,17 @@ class Stand:
 
 @contextmanager
 def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], folder: Path) -> Generator[Stand]:
-    """A stand that is up; all of it is ended afterwards.
+    """A running testbed; all of it is ended afterwards.
 
     Raises:
         ConfigurationError: there is no simulator, or it refuses this robot.
-        DrillFailed: something does not come up.
+        DrillFailed: a process does not start.
     """
     try:
         from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only a drill needs it
     except ImportError:
         raise ConfigurationError(
-            where="trade drill", problem="needs trade-hil-sim; pip install trade-hil-sim"
+            where="trade drill", problem="needs trade-hil-sim. Run `pip install trade-hil-sim`"
         ) from None
     remove_leftovers()
     try:
@@ -255,7 +255,7 @@ def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], f
 
 
 def _free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 that nobody listens on at present."""
+    """Returns ports of 127.0.0.1 that are free now."""
     with ExitStack() as held:
         found = [held.enter_context(socket.socket()) for _ in range(count)]
         for each in found:
