@@ -171,7 +171,7 @@ def test_a_viewer_that_does_not_read_misses_messages_and_holds_nobody_up(live: L
 
 def test_where_something_listens_already_is_said(live: Live) -> None:
     port = int(live.url.rpartition(":")[2])
-    with pytest.raises(ConfigurationError, match=f"127.0.0.1:{port}: cannot be listened at: .*in use"):
+    with pytest.raises(ConfigurationError, match=f"127.0.0.1:{port}: cannot be used: .*in use"):
         Live("127.0.0.1", port, "other")
 
 

@@ -139,7 +139,7 @@ def test_a_gap_in_which_a_joint_moved_is_refused_and_one_in_which_it_stood_is_no
 def test_joints_must_be_the_same_all_through_and_measured() -> None:
     with pytest.raises(ConfigurationError, match=r"other joints later: rosie.neck.tilt instead of rosie.neck.pan"):
         motion_of("rosie.head", [_state(1, 0), _state(2, 0, "rosie.neck.tilt")])
-    with pytest.raises(ConfigurationError, match="less than three times"):
+    with pytest.raises(ConfigurationError, match="fewer than three measurements"):
         motion_of("rosie.head", [_state(1, 0), _state(2, 0)])
 
 

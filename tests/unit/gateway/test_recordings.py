@@ -154,7 +154,7 @@ def test_wherever_a_file_is_cut_off_all_before_the_last_whole_chunk_is_read(tmp_
 
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("hello, this is a text")
-    with pytest.raises(ConfigurationError, match="is no recording"):
+    with pytest.raises(ConfigurationError, match="is not a recording"):
         list(entries(tmp_path / "a.mcap"))
     with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
         list(entries(tmp_path / "b.mcap"))

@@ -1,4 +1,4 @@
-"""Recordings of a system as MCAP files: what was measured, called, locked and wrong; made, read, replayed, exported."""
+"""Recordings of a system as MCAP files: measurements, calls, locks and faults; recorded, read, replayed, exported."""
 
 from importlib import import_module
 
@@ -8,9 +8,9 @@ __all__ = ["require"]
 
 
 def require(library: str, extra: str) -> None:
-    """Raises ConfigurationError: a library of an extra is missing."""
+    """Raises ConfigurationError: a library of an extra is not installed."""
     try:
         import_module(library)
     except ImportError:
-        problem = f'needs {library}; pip install "trade-gateway[{extra}]"'
+        problem = f'needs {library}. Run `pip install "trade-gateway[{extra}]"`'
         raise ConfigurationError(where="recordings", problem=problem) from None

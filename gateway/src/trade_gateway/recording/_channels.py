@@ -1,4 +1,4 @@
-"""What a recording holds: the channels, the messages on them, and the JSON Schemas that say so in the file."""
+"""The channels of a recording, their messages, and the JSON Schemas that describe them in the file."""
 
 import base64
 from collections.abc import Mapping
@@ -38,25 +38,25 @@ Index = Annotated[int, Meta(ge=0)]
 
 
 class JointStates(Struct, frozen=True, kw_only=True):
-    """What was measured at the joints of a group; all lists are in the order of the names."""
+    """The measurements at the joints of a group; all lists are in the order of the names."""
 
     names: list[str]
     position_rad: list[float]
     velocity_rad_s: list[float]
     load: list[float]
-    """Effort as a fraction of the most a motor can give; empty: the device does not tell."""
+    """Effort as a fraction of the motor's maximum; empty: the device does not report it."""
     enabled: list[bool]
     fault: list[str]
     stamp_s: list[float]
-    """When each was measured: seconds since the epoch by the clock of its host."""
+    """Times of the measurements: seconds since the epoch by the clock of their host."""
 
 
 class Call(Struct, frozen=True, kw_only=True):
-    """One call, as a container noted it. Without arguments and results."""
+    """One call, as a container traced it. Without arguments and results."""
 
     call_id: str
     calls: list[str]
-    """Ids of those that led to it, nearest first."""
+    """Ids of the calls that led to it, nearest first."""
     service: str
     side: Literal["asked", "served"]
     container: str
@@ -72,7 +72,7 @@ class Call(Struct, frozen=True, kw_only=True):
 
 
 class Lock(Struct, frozen=True, kw_only=True):
-    """One lock that holds in one container."""
+    """One lock in one container."""
 
     container: str
     resources: list[str]
@@ -90,31 +90,31 @@ class Locks(Struct, frozen=True, kw_only=True):
 
 
 class Fault(Struct, frozen=True, kw_only=True):
-    """A change of what is wrong."""
+    """A change of a fault."""
 
     about: str
-    """A group whose health it is or whose services are gone, a service that cannot be read, a joint, an e-stop."""
+    """A group with its health or its lost services, an unreadable service, a joint, or an e-stop."""
     kind: FaultKind
     text: str
-    """What is wrong; empty: nothing any more."""
+    """The fault; empty: it has ended."""
     new: bool = True
-    """False: it was so when the recording began."""
+    """False: it existed when the recording began."""
 
 
 class Time(Struct, frozen=True):
-    """A moment, as Foxglove writes it."""
+    """A time, as Foxglove writes it."""
 
     sec: Index
     nsec: Annotated[int, Meta(ge=0, le=999_999_999)]
 
     @classmethod
     def of(cls, at_ns: int) -> "Time":
-        """A moment in nanoseconds since the epoch."""
+        """Converts nanoseconds since the epoch."""
         return cls(*divmod(at_ns, 1_000_000_000))
 
 
 class CompressedImage(Struct, frozen=True, kw_only=True):
-    """A picture as a whole file; named and laid out as Foxglove knows it."""
+    """An encoded picture; with Foxglove's name and fields."""
 
     timestamp: Time
     frame_id: str
@@ -123,7 +123,7 @@ class CompressedImage(Struct, frozen=True, kw_only=True):
 
 
 class RawImage(Struct, frozen=True, kw_only=True):
-    """Pixels row by row; named and laid out as Foxglove knows it."""
+    """Pixels row by row; with Foxglove's name and fields."""
 
     timestamp: Time
     frame_id: str
@@ -135,12 +135,12 @@ class RawImage(Struct, frozen=True, kw_only=True):
 
 
 class Channel(NamedTuple):
-    """Where messages of one shape go."""
+    """A topic whose messages have one schema."""
 
     topic: str
     schema_name: str
     schema: bytes
-    """JSON Schema of an object."""
+    """The JSON Schema of an object."""
 
 
 class Message(NamedTuple):
@@ -148,14 +148,14 @@ class Message(NamedTuple):
 
     channel: Channel
     arrived_ns: int
-    """When it arrived here, in nanoseconds since the epoch."""
+    """Its time of arrival here, in nanoseconds since the epoch."""
     stamp_ns: int
-    """When it was so, by the clock of its source."""
+    """The time of its content, by the clock of its source."""
     data: bytes
 
 
 def inlined(schema: Mapping[str, Any]) -> dict[str, Any]:
-    """A schema that refers to nothing, as viewers follow no references; what contains itself is left open."""
+    """Inlines all references of a schema, as viewers do not follow them; a recursive part accepts anything."""
     definitions = cast("Mapping[str, Any]", schema.get("$defs", {}))
 
     def within(node: Any, open_: tuple[str, ...]) -> Any:
@@ -187,31 +187,31 @@ FAULTS: Final = _channel("/faults", Fault, "trade.Fault")
 
 @cache
 def joints_channel(group: str) -> Channel:
-    """Of the joints of a group: ``/rosie.head/joints``."""
+    """The channel of a group's joints: ``/rosie.head/joints``."""
     return _channel(f"/{group}{_JOINTS}", JointStates, "trade.JointStates")
 
 
 def group_of(topic: str) -> str | None:
-    """The group whose joints are on a topic; None: it has others."""
+    """The group of a joint topic; None: it is another topic."""
     return topic[1 : -len(_JOINTS)] if topic.endswith(_JOINTS) else None
 
 
 @cache
 def camera_channel(group: str, raw: bool) -> Channel:
-    """Of the pictures of a camera: ``/cameras/rosie.eye``."""
+    """The channel of a camera's pictures: ``/cameras/rosie.eye``."""
     if raw:
         return _channel(f"/cameras/{group}", RawImage, "foxglove.RawImage")
     return _channel(f"/cameras/{group}", CompressedImage, "foxglove.CompressedImage")
 
 
 def service_channel(label: str, result: Mapping[str, Any]) -> Channel:
-    """Of the answers of any service, each as ``value`` of an object: ``/services/rosie.hand.state``."""
+    """The channel of a service's results, each as ``value`` of an object: ``/services/rosie.hand.state``."""
     wrapped = {"title": label, "type": "object", "properties": {"value": inlined(result)}, "required": ["value"]}
     return Channel(f"/services/{label}", label, msgspec.json.encode(wrapped))
 
 
 def picture(group: str, data: bytes, layout: str, width_px: int, height_px: int, at_ns: int) -> Message:
-    """A message with what a camera saw, without its time of arrival."""
+    """Builds the message of a camera's picture, without its time of arrival."""
     text = base64.b64encode(data).decode()
     bytes_a_pixel = {"rgb8": 3, "mono8": 1}.get(layout)
     if bytes_a_pixel is None:
@@ -230,5 +230,5 @@ def picture(group: str, data: bytes, layout: str, width_px: int, height_px: int,
 
 
 def encoded(value: Any) -> bytes:
-    """A message as JSON; what JSON has no word for, such as a handle, as text."""
+    """Encodes a message as JSON; values that JSON does not have, such as handles, become text."""
     return msgspec.json.encode(value, enc_hook=str)

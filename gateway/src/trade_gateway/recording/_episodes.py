@@ -1,4 +1,4 @@
-"""Episodes of a recording: what lies between two moments, as frames at even times."""
+"""Episodes of a recording: its parts between two times, as frames at a fixed rate."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,17 +27,17 @@ class Span(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """Where all joints were, at even times."""
+    """The positions of all joints at a fixed rate."""
 
     task: str
     states: Sequence[Sequence[float]]
-    """Of each frame: the angle of each joint in rad."""
+    """For each frame, the angle of each joint in rad."""
     actions: Sequence[Sequence[float]]
-    """Of each frame: the state one frame later, as recordings have no commands."""
+    """For each frame, the state one frame later, as recordings contain no commands."""
 
 
 def locked(entries: Iterable[Entry], joints: Sequence[str]) -> list[Span]:
-    """The times in which somebody had a lock over any of some joints, each with the purpose of that lock."""
+    """The times of locks over any of the joints, each with the lock's purpose."""
     open_: dict[tuple[str, str], Span] = {}
     """By owner and purpose: a lock over several containers is one."""
     found: list[Span] = []
@@ -60,7 +60,7 @@ def locked(entries: Iterable[Entry], joints: Sequence[str]) -> list[Span]:
 
 
 def _held(locks: Locks, joints: Sequence[str]) -> dict[tuple[str, str], float]:
-    """Since when, by owner and purpose, of those over any of the joints."""
+    """The start of each lock over any of the joints, by owner and purpose."""
     held: dict[tuple[str, str], float] = {}
     for lock in locks.locks:
         if _over(lock, joints):
@@ -79,14 +79,14 @@ def episodes(
     fps: int,
     tell: Callable[[Span, str], None],
 ) -> Iterator[Episode]:
-    """What was measured in each span, straight lines between the measurements.
+    """Returns the measurements of each span, linearly interpolated.
 
     Args:
-        states: what was measured, by group; the joints of all of them are in each frame, in this order.
-        spans: the parts to take.
-        fps: frames a second.
-        tell: told of a span that is cut where a joint moved unmeasured, or left out as joints were hardly measured in
-            it, and why.
+        states: measurements by group; each frame has all their joints, in this order.
+        spans: the parts to return.
+        fps: frames per second.
+        tell: called with a span that is cut where a joint moved unmeasured, or skipped for too few measurements,
+            and with the reason.
     """
     for span in spans:
         try:
@@ -114,7 +114,7 @@ def _within(states: Mapping[str, Sequence[JointStates]], span: Span) -> dict[str
 def _parts(
     states: Mapping[str, Sequence[JointStates]], span: Span, tell: Callable[[Span, str], None]
 ) -> Iterator[Span]:
-    """A span without the times in which a joint moved unmeasured."""
+    """Removes from a span the times at which a joint moved unmeasured."""
     began_s = min((min(one.stamp_s) for measured in states.values() for one in measured), default=0.0)
     from_s = span.from_s
     for gap in sorted(gap for group, measured in states.items() for gap in gaps(group, measured)):

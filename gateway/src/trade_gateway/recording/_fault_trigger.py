@@ -1,4 +1,4 @@
-"""The ring, saved to a folder when something goes wrong."""
+"""Saves the ring buffer to a folder when a fault occurs."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,15 +16,15 @@ from trade_gateway.recording._recorder import Ring
 __all__ = ["SavedAtFault"]
 
 HOLD_OFF_S: Final = 10.0
-"""What goes wrong so soon after what was saved belongs to the same event."""
+"""A fault within this time after a saved one belongs to the same event, in seconds."""
 _decode: Final = msgspec.json.Decoder(Fault).decode
 
-Told = Callable[[Path, str, int], None]
-"""Told of a file that was saved: where, why, how many messages it has."""
+Saved = Callable[[Path, str, int], None]
+"""Receives a saved file: its path, the reason and its number of messages."""
 
 
 class SavedAtFault:
-    """A sink that keeps the last seconds, and writes them once for each event. Used by one thread."""
+    """A sink that keeps the last seconds, and saves them once for each event. Used by one thread."""
 
     def __init__(
         self,
@@ -32,39 +32,39 @@ class SavedAtFault:
         ring: Ring,
         about: Mapping[str, str],
         attachments: Sequence[Attachment],
-        told: Told,
+        saved: Saved,
         failed: Callable[[str], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Keep, and write to the folder.
+        """Creates the sink.
 
         Args:
-            folder: made if need be.
-            ring: what keeps.
+            folder: created if necessary.
+            ring: the ring buffer.
             about: metadata of each file.
             attachments: of each file.
-            told: called after each file.
-            failed: told why one could not be written; what goes on is kept and saved at the next event.
-            clock: seconds that rise.
+            saved: called after each file.
+            failed: called with the reason if a file cannot be written; recording continues until the next event.
+            clock: a monotonic clock in seconds.
 
         Raises:
-            ConfigurationError: there can be no such folder.
+            ConfigurationError: the folder cannot be created.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as bad:
-            raise ConfigurationError(where=str(folder), problem=f"cannot be made: {bad.strerror}") from None
+            raise ConfigurationError(where=str(folder), problem=f"cannot be created: {bad.strerror}") from None
         self._folder = folder
         self._ring = ring
         self._about = about
         self._attachments = attachments
-        self._told = told
+        self._saved = saved
         self._failed = failed
         self._clock = clock
         self._held_until = 0.0
 
     def write(self, message: Message) -> None:
-        """Keep it; save everything if it says that something has gone wrong."""
+        """Adds a message; saves everything if it reports a fault."""
         self._ring.write(message)
         if message.channel is FAULTS:
             fault = _decode(message.data)
@@ -83,6 +83,6 @@ class SavedAtFault:
         try:
             count = self._ring.save(path, {**self._about, "fault": why}, self._attachments)
         except (OSError, ConfigurationError) as bad:
-            self._failed(f"{path} is not whole: {bad}")
+            self._failed(f"{path} is incomplete: {bad}")
         else:
-            self._told(path, why, count)
+            self._saved(path, why, count)

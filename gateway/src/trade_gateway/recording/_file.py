@@ -1,4 +1,4 @@
-"""An MCAP file that is written: readable up to the last second whatever ends it, and closed in order on a full disk."""
+"""A writer of MCAP files that stay readable up to the last second after a crash, and are closed on a full disk."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,11 +19,11 @@ _CHUNK_BYTES: Final = 1 << 20
 _SEQUENCE: Final = (1 << 32) - 1
 
 Attachment = tuple[str, bytes]
-"""Name and contents of a file that goes into the recording."""
+"""Name and content of a file that is stored in the recording."""
 
 
 class Raw(Protocol):
-    """An unbuffered file; ``write`` may take a part only."""
+    """An unbuffered file; ``write`` may accept only a part."""
 
     def write(self, data: Any, /) -> int | None: ...
     def tell(self) -> int: ...
@@ -37,9 +37,9 @@ def _unbuffered(path: Path) -> Raw:
 
 
 class RecordingFile:
-    """One file. Used by one thread; a context manager.
+    """One recording. Used by one thread; a context manager.
 
-    When a write fails, the file is ended after its last whole chunk, without an index, and the OSError passes.
+    When a write fails, the file is ended after its last complete chunk, without an index, and OSError is raised.
     """
 
     def __init__(
@@ -49,16 +49,16 @@ class RecordingFile:
         attachments: Sequence[Attachment] = (),
         opened: Callable[[Path], Raw] = _unbuffered,
     ) -> None:
-        """Begin it.
+        """Creates the file.
 
         Args:
-            path: where; what is there already is not overwritten.
-            about: goes into it as the metadata record ``trade``.
-            attachments: robot files and the like.
-            opened: makes the file.
+            path: an existing file is not overwritten.
+            about: content of the metadata record ``trade``.
+            attachments: robot files and others.
+            opened: opens the file.
 
         Raises:
-            ConfigurationError: it cannot be made.
+            ConfigurationError: it cannot be created.
         """
         try:
             self._raw: Final = opened(path)
@@ -67,7 +67,7 @@ class RecordingFile:
         self.path: Final = path
         self.messages = 0
         self.size_bytes = 0
-        """Up to here the file has whole chunks."""
+        """The size of the file up to its last complete chunk."""
         self._channels: dict[tuple[str, str], int] = {}
         self._closed = False
         stream = cast("IO[Any]", _Whole(self._raw))
@@ -82,7 +82,7 @@ class RecordingFile:
         self._writer.add_metadata("trade", dict(about))
 
     def write(self, message: Message) -> None:
-        """Add a message; it is in the file after the next ``flush``, or earlier."""
+        """Adds a message; it is in the file after the next ``flush``, or earlier."""
         self._do(lambda: self._add(message))
 
     def _add(self, message: Message) -> None:
@@ -100,11 +100,11 @@ class RecordingFile:
         return known
 
     def flush(self) -> None:
-        """Have all messages in the file: so far it is readable from now on, even if this process is killed."""
+        """Writes all messages to the file: they are readable from now on, even if this process is killed."""
         self._do(self._writer.flush)
 
     def close(self) -> None:
-        """End the file with its index. Idempotent."""
+        """Ends the file with its index. Idempotent."""
         if not self._closed:
             self._do(self._writer.finish)
             self._closed = True
@@ -119,7 +119,7 @@ class RecordingFile:
         self.size_bytes = self._raw.tell()
 
     def _cut_off(self) -> None:
-        """End it after its last whole chunk: what that frees is enough."""
+        """Ends the file after its last complete chunk; the freed space is enough for that."""
         self._closed = True
         end = RecordBuilder()
         DataEnd(0).write(end)
@@ -137,7 +137,7 @@ class RecordingFile:
 
 
 class _Whole:
-    """A file that takes all it is given, or raises."""
+    """A file that writes everything or raises."""
 
     def __init__(self, raw: Raw) -> None:
         self._raw = raw
@@ -150,4 +150,4 @@ class _Whole:
         return len(data)
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing, as nothing is buffered."""

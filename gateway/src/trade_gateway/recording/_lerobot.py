@@ -1,4 +1,4 @@
-"""Episodes as tables: the layout of LeRobot datasets v3.0, without pictures.
+"""Exports episodes as tables in the layout of LeRobot datasets v3.0, without pictures.
 
 Facts of the layout: huggingface.co/docs/lerobot, "LeRobotDataset v3.0".
 """
@@ -18,7 +18,7 @@ __all__ = ["write"]
 _FILE: Final = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _FIRST: Final = _FILE.format(chunk_index=0, file_index=0)
 _WHERE: Final = ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index")
-"""Of each episode: in which files it is. All are in the first one."""
+"""For each episode, its files. All are in the first one."""
 _VECTORS: Final = ("observation.state", "action")
 _NUMBERS: Final = {
     "timestamp": "float32",
@@ -40,23 +40,23 @@ Joint angles in rad of {robot}, exported by `trade export` from {source}.
 
 
 def write(folder: Path, robot: str, joints: Sequence[str], fps: int, episodes: Sequence[Episode], source: str) -> None:
-    """Make a dataset.
+    """Creates a dataset.
 
     Args:
-        folder: made; it may be there if it is empty.
-        robot: what the joints belong to.
+        folder: created; it may exist if it is empty.
+        robot: the joints' robot.
         joints: their names, in the order of the frames.
-        fps: frames a second.
+        fps: frames per second.
         episodes: at least one.
-        source: what they were taken from.
+        source: the recording.
 
     Raises:
-        ConfigurationError: the folder has something in it, or cannot be written.
+        ConfigurationError: the folder is not empty, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise ConfigurationError(where=str(folder), problem="is not empty; what is there is not overwritten")
+            raise ConfigurationError(where=str(folder), problem="is not empty; existing files are not overwritten")
         for part in ("data/chunk-000", "meta/episodes/chunk-000"):
             (folder / part).mkdir(parents=True)
         tasks = list(dict.fromkeys(episode.task for episode in episodes))
@@ -71,7 +71,7 @@ def write(folder: Path, robot: str, joints: Sequence[str], fps: int, episodes: S
 
 
 def _write_data(path: Path, width: int, fps: int, tasks: Sequence[str], episodes: Sequence[Episode]) -> None:
-    """One group of rows an episode."""
+    """Writes one group of rows per episode."""
     arrow, parquet = _libraries()
     vector = arrow.list_(arrow.float32(), width)
     columns = [(name, vector) for name in _VECTORS] + [
@@ -108,7 +108,7 @@ def _write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Readers take it for a frame of pandas whose index is the task."""
+    """Writes the tasks. Readers expect a pandas frame with the task as index."""
     arrow, parquet = _libraries()
     kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     described = [
@@ -141,7 +141,7 @@ def _info(robot: str, joints: Sequence[str], fps: int, tasks: int, episodes: Seq
 
 
 def _stats(episodes: Sequence[Episode]) -> dict[str, dict[str, list[float]]]:
-    """What is needed to normalise: of each joint, over all frames."""
+    """Statistics of each joint over all frames, for normalisation."""
     values = {
         "observation.state": [row for episode in episodes for row in episode.states],
         "action": [row for episode in episodes for row in episode.actions],

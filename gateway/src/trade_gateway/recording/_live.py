@@ -1,4 +1,4 @@
-"""A sink that shows messages live, to whoever connects over the Foxglove WebSocket protocol."""
+"""A sink that shows messages live to viewers over the Foxglove WebSocket protocol."""
 
 import logging
 import queue
@@ -17,7 +17,7 @@ from trade_gateway.recording._channels import FAULTS, LOCKS, Channel, Fault, Fau
 __all__ = ["Live"]
 
 _OUTBOX: Final = 256
-"""So many messages wait for a viewer that is slow; beyond that the oldest go."""
+"""Most messages that wait for a slow viewer; beyond that the oldest are dropped."""
 _KEEP_NOTICES: Final = 100
 _LOGGER: Final = "foxglove"
 _BEHIND: Final = "foxglove.websocket.connected_client.send_lossy"
@@ -25,22 +25,22 @@ _fault: Final = msgspec.json.Decoder(Fault).decode
 
 
 class Live:
-    """A WebSocket server that sends and takes nothing in: no parameters, no services, no messages of viewers.
+    """A WebSocket server that only sends: it has no parameters and no services, and accepts no messages of viewers.
 
-    ``write`` waits for nobody. Used by one thread; a context manager.
+    ``write`` never waits. Used by one thread; a context manager.
     """
 
     def __init__(self, host: str, port: int, name: str, outbox: int = _OUTBOX) -> None:
-        """Listen.
+        """Starts to listen.
 
         Args:
-            host: where; the protocol has no login.
-            port: 0 takes any that is free.
-            name: what viewers are told that this is.
-            outbox: messages that wait for a viewer at most.
+            host: the address; the protocol has no login.
+            port: 0 selects a free one.
+            name: the name that viewers show.
+            outbox: most messages that wait for a viewer.
 
         Raises:
-            ConfigurationError: it cannot be listened there.
+            ConfigurationError: the address cannot be used.
         """
         self._notices = _Notices()
         self._newcomers = _Newcomers()
@@ -59,12 +59,12 @@ class Live:
             )
         except RuntimeError as bad:
             self._notices.close()
-            raise ConfigurationError(where=f"{in_url(host)}:{port}", problem=f"cannot be listened at: {bad}") from None
+            raise ConfigurationError(where=f"{in_url(host)}:{port}", problem=f"cannot be used: {bad}") from None
         self.url: Final = f"ws://{in_url(host)}:{self._server.port}"
-        """Where viewers connect to."""
+        """The address for viewers."""
 
     def write(self, message: Message) -> None:
-        """Send it to all who subscribed to its channel."""
+        """Sends a message to all subscribers of its channel."""
         if message.channel is LOCKS:
             self._locks = message
         elif message.channel is FAULTS:
@@ -73,7 +73,7 @@ class Live:
         self.greet()
 
     def greet(self) -> None:
-        """Tell those who have just subscribed to locks or faults how it stands, as nothing else will until a change."""
+        """Sends the current locks and faults to new subscribers, as the next message only follows a change."""
         for viewer, topic in self._newcomers.take():
             for message in self._standing(topic):
                 channel = self._channel(message.channel)
@@ -92,7 +92,7 @@ class Live:
             self._faults.pop((fault.about, fault.kind), None)
 
     def _channel(self, channel: Channel) -> foxglove.Channel:
-        """One for each topic; who gives it another schema withdraws the one before."""
+        """Returns the channel of a topic; a message with another schema replaces the channel."""
         known = self._channels.get(channel.topic)
         if known is not None and known[0] == channel:
             return known[1]
@@ -105,15 +105,15 @@ class Live:
 
     @property
     def behind(self) -> int:
-        """How often the server said that a viewer was too slow and missed messages: twice a minute at most, for all."""
+        """How often the server reported a slow viewer that missed messages: at most twice a minute in all."""
         return self._notices.behind
 
     def notices(self) -> Iterator[str]:
-        """What there is to be said of viewers since the last time."""
+        """Yields the server's reports on viewers since the last time."""
         yield from self._notices.take()
 
     def close(self) -> None:
-        """Hang up on everybody. Idempotent."""
+        """Disconnects all viewers. Idempotent."""
         self._server.stop()
         for _, channel in self._channels.values():
             channel.close()
@@ -128,7 +128,7 @@ class Live:
 
 
 class _Newcomers(ServerListener):
-    """Who has subscribed to what; told by a thread of the server, taken by ours."""
+    """New subscriptions; a thread of the server adds them, ours takes them."""
 
     def __init__(self) -> None:
         self._seen: queue.SimpleQueue[tuple[int, str]] = queue.SimpleQueue()
@@ -143,7 +143,7 @@ class _Newcomers(ServerListener):
 
 
 class _Notices(logging.Handler):
-    """What the server logs, which is its only word on viewers that are slow or were turned away."""
+    """Collects the server's log, its only report on viewers that are slow or were rejected."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The motion of joints in a recording: as it was measured, as a trajectory, and how far another one was from it."""
+"""The motion of joints in a recording: as measured, as a trajectory, and its deviation from another one."""
 
 import math
 from bisect import bisect_left
@@ -30,33 +30,33 @@ __all__ = [
 
 _decode: Final = msgspec.json.Decoder(JointStates).decode
 _STEP_S: Final = 0.05
-"""Between points of a trajectory, in the time of the recording."""
+"""Time between points of a trajectory, in the recording's time, in seconds."""
 _REACH_S: Final = 0.08
-"""So far before and after a point measurements count for it."""
+"""Measurements up to this time before and after a point count for it, in seconds."""
 _STEPS: Final = 8
 _NEAR_RAD: Final = 0.005
 _INSIDE_RAD: Final = 0.002
-"""So far the points keep off a limit: between them the way swings out a little."""
+"""Margin of the points to a limit, as the curve between points overshoots slightly."""
 _NOISE: Final = 0.95
 _SLOWER: Final = 0.99
 _SLOWEST: Final = 0.05
 _SAME_S: Final = 0.002
-"""Stamps of one measurement that was read twice differ by less."""
+"""Two reads of one measurement have time stamps with a smaller difference, in seconds."""
 _GAP_S: Final = 0.5
 _STILL_RAD: Final = 0.02
-"""A joint that is as near after a gap has not moved meanwhile."""
+"""A joint with a smaller change over a gap has not moved meanwhile."""
 _REST_S: Final = 0.5
-"""So much of standing still is left before and after what moves."""
+"""Rest that is kept before and after the motion, in seconds."""
 
 
 class Track(NamedTuple):
-    """What was measured at one joint, at rising times in seconds since the recording's first measurement."""
+    """The measurements of one joint, at ascending times in seconds since the recording's first measurement."""
 
     times_s: Sequence[float]
     positions_rad: Sequence[float]
 
     def at(self, time_s: float) -> float:
-        """The angle at a time, on the straight line between two measurements."""
+        """The angle at a time, linearly interpolated."""
         times, positions = self
         after = bisect_left(times, time_s)
         if after == 0:
@@ -67,9 +67,9 @@ class Track(NamedTuple):
         return positions[after - 1] + share * (positions[after] - positions[after - 1])
 
     def around(self, time_s: float) -> tuple[float, float]:
-        """Angle and speed at a time, of the mean over what was measured about then: noise is no motion.
+        """Angle and speed at a time, of the mean of the measurements around it, which removes noise.
 
-        The speed is the derivative of that mean, so nothing is quicker, or gets quicker sooner, than it was.
+        The speed is the derivative of that mean, so it never exceeds the recorded speed, nor rises earlier.
         """
         steps = [self.at(time_s + _REACH_S * (2 * step / _STEPS - 1)) for step in range(_STEPS + 1)]
         mean = (sum(steps) - (steps[0] + steps[-1]) / 2) / _STEPS
@@ -77,27 +77,27 @@ class Track(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The joints of a group over time."""
+    """The motion of a group's joints over time."""
 
     group: str
     joints: Sequence[str]
     tracks: Sequence[Track]
     began_s: float = 0.0
-    """When its time is zero, in seconds since the epoch."""
+    """The time of its zero, in seconds since the epoch."""
 
     @property
     def duration_s(self) -> float:
-        """From the first measurement to the last."""
+        """Time from the first measurement to the last, in seconds."""
         return max(track.times_s[-1] for track in self.tracks)
 
     @property
     def start(self) -> list[float]:
-        """Where it begins."""
+        """The positions at its beginning."""
         return [track.around(0.0)[0] for track in self.tracks]
 
 
 class Gap(NamedTuple):
-    """When a joint moved and was not measured, in seconds since the epoch."""
+    """A time in which a joint moved unmeasured, in seconds since the epoch."""
 
     from_s: float
     until_s: float
@@ -105,19 +105,19 @@ class Gap(NamedTuple):
 
 
 class Deviation(NamedTuple):
-    """How far joints were from a recorded motion, in rad."""
+    """The deviation of joints from a recorded motion, in rad."""
 
     greatest_rad: Sequence[float]
-    """Of each joint."""
+    """For each joint, the maximum."""
     rms_rad: Sequence[float]
-    """Of each joint: root of the mean square."""
+    """For each joint, the root mean square."""
 
 
 def motions(path: Path) -> dict[str, list[JointStates]]:
-    """What a recording has of joints, by group.
+    """Reads the joint states of a recording, by group.
 
     Raises:
-        ConfigurationError: it cannot be read.
+        ConfigurationError: the recording cannot be read.
     """
     found: dict[str, list[JointStates]] = {}
     for entry in entries(path):
@@ -128,14 +128,14 @@ def motions(path: Path) -> dict[str, list[JointStates]]:
 
 
 def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
-    """The motion of a group; a value that was sent twice counts once.
+    """Returns the motion of a group; a repeated measurement counts once.
 
     Raises:
-        ConfigurationError: its joints are not the same all through, or are missing while they moved.
+        ConfigurationError: its joints change, or were not measured during a motion.
     """
     joints, measured = _measured(group, states)
     if not measured or any(len(track) < 3 for track in measured):
-        raise ConfigurationError(where="recording", problem=f"{group} was measured less than three times")
+        raise ConfigurationError(where="recording", problem=f"{group} has fewer than three measurements")
     began = max(track[0][0] for track in measured)
     tracks: list[Track] = []
     for joint, track in zip(joints, measured, strict=True):
@@ -148,16 +148,16 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
 
 
 def gaps(group: str, states: Iterable[JointStates]) -> list[Gap]:
-    """When joints of a group moved and were not measured.
+    """Returns the times in which joints of a group moved unmeasured.
 
     Raises:
-        ConfigurationError: its joints are not the same all through.
+        ConfigurationError: its joints change.
     """
     return [gap for joint, track in zip(*_measured(group, states), strict=True) for gap in _gaps(joint, track)]
 
 
 def _measured(group: str, states: Iterable[JointStates]) -> tuple[list[str], list[list[tuple[float, float]]]]:
-    """The joints, and when each of them was measured where."""
+    """The joints, and the times and angles of their measurements."""
     joints: list[str] = []
     measured: list[list[tuple[float, float]]] = []
     for each in states:
@@ -179,7 +179,7 @@ def _gaps(joint: str, track: Sequence[tuple[float, float]]) -> Iterator[Gap]:
 
 
 def moving(motion: Motion) -> Motion:
-    """A motion without what stands still at its ends, but for half a second; one that never moves as it is."""
+    """Removes rest at both ends except for half a second; a motion without movement is unchanged."""
     leaves = [_away(track.times_s, track.positions_rad) for track in motion.tracks]
     arrives = [_away(track.times_s[::-1], track.positions_rad[::-1]) for track in motion.tracks]
     if not any(at_s is not None for at_s in leaves):
@@ -191,7 +191,7 @@ def moving(motion: Motion) -> Motion:
 
 
 def _away(times_s: Sequence[float], positions_rad: Sequence[float]) -> float | None:
-    """When a joint was measured last before it was elsewhere than at the beginning; None: it never was."""
+    """The last time at which a joint was at its initial angle; None: it never left it."""
     for before_s, position in zip(times_s, positions_rad[1:], strict=False):
         if abs(position - positions_rad[0]) > _STILL_RAD:
             return before_s
@@ -205,12 +205,12 @@ def _cut(track: Track, from_s: float, until_s: float) -> Track:
 
 
 def fitted(motion: Motion, speed: float, limits: Sequence[JointLimits]) -> tuple[Trajectory, float]:
-    """The motion as a trajectory that keeps the limits, and its speed: what was asked for, or up to 5 % less.
+    """Returns the motion as a trajectory within the limits, and its speed: as requested, or up to 5 % less.
 
-    What was recorded at a limit is measured a little beyond it as often as not.
+    Measurements at a limit are as often beyond it as not.
 
     Raises:
-        LimitExceeded: it does not keep them, even so; says at which speed it would, if at any.
+        LimitExceeded: it exceeds the limits even so; the error names the speed at which it would not, if there is one.
     """
     refused: LimitExceeded | None = None
     slower = speed
@@ -235,12 +235,12 @@ def fitted(motion: Motion, speed: float, limits: Sequence[JointLimits]) -> tuple
 
 
 def trajectory(motion: Motion, speed: float, limits: Sequence[JointLimits] = ()) -> Trajectory:
-    """The motion as points over time, at rest at both ends, its noise smoothed.
+    """Returns the motion as points over time, at rest at both ends, with noise removed.
 
     Args:
-        motion: what was recorded.
-        speed: 1 is that of the recording; 0.5 takes twice as long.
-        limits: angles that are measured less than 5 mrad beyond them are taken for 2 mrad inside.
+        motion: the recorded motion.
+        speed: 1 is the recorded speed; 0.5 takes twice as long.
+        limits: angles less than 5 mrad beyond them are set to 2 mrad inside.
     """
     ranges = {limit.name: (limit.min_rad, limit.max_rad) for limit in limits}
     count = max(2, round(motion.duration_s / _STEP_S))
@@ -271,13 +271,13 @@ def _inside(position_rad: float, ends: tuple[float, float] | None) -> float:
 
 
 def deviation(motion: Motion, speed: float, measured: Motion, latest_s: float = 2.0) -> tuple[Deviation, float]:
-    """How far a motion that was measured is from a recorded one, at the delay at which they fit best.
+    """Compares a measured motion with a recorded one, at the delay with the best fit.
 
     Args:
-        motion: what was recorded.
-        speed: at which it was replayed.
-        measured: of the same joints, from before it began to after its end.
-        latest_s: the greatest delay that is tried.
+        motion: the recorded motion.
+        speed: the speed of its replay.
+        measured: the same joints, from before the beginning to after the end.
+        latest_s: the greatest possible delay in seconds.
 
     Returns:
         The deviation, and the delay in seconds from the first measurement to the beginning.
@@ -298,7 +298,7 @@ def _misfit(motion: Motion, speed: float, measured: Motion, delay_s: float) -> f
 
 
 def _errors(motion: Motion, speed: float, measured: Motion, delay_s: float, every: int) -> list[list[float]]:
-    """Of each joint, at each measurement of it or at some: measured minus recorded."""
+    """For each joint, at every measurement or every nth: measured minus recorded."""
     tracks = dict(zip(measured.joints, measured.tracks, strict=True))
     return [
         [

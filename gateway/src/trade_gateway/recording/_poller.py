@@ -1,4 +1,4 @@
-"""What has to be asked for again and again: calls noted, locks, health, e-stops; on a thread of its own."""
+"""Polls what cannot be subscribed to: traced calls, locks, health and e-stops, on its own thread."""
 
 import contextlib
 import queue
@@ -28,16 +28,16 @@ __all__ = ["Watch"]
 
 _EVERY_S: Final = 0.2
 _ASKED_S: Final = 1.0
-"""How long a container may take to answer before the others are asked without it."""
+"""How long to wait for a container's answer before continuing without it, in seconds."""
 _LOCKS_AGAIN_S: Final = 5.0
-"""So often all locks are told though none has changed, so that any part of a recording has them."""
+"""Period in which all locks are recorded even if unchanged, so that every part of a recording has them."""
 _TAKES_AND_GIVES: Final = ("trade.acquire", "trade.release")
 _HEALTHY: Final = "healthy"
 _END_S: Final = 15.0
 
 
 class Watch:
-    """Looks several times a second, and keeps what it saw until it is taken."""
+    """Polls several times a second, and keeps the results until they are taken."""
 
     def __init__(self, container: Container, groups: list[str], wake: threading.Event) -> None:
         self._container = container
@@ -57,7 +57,7 @@ class Watch:
         self._thread.start()
 
     def take(self) -> Iterator[Message]:
-        """What was seen since the last time, without its time of arrival."""
+        """Yields the results since the last time, without their time of arrival."""
         with contextlib.suppress(queue.Empty):
             while True:
                 yield self._seen.get_nowait()
@@ -74,7 +74,7 @@ class Watch:
                 look()
             except AccessDenied as denied:
                 self.refused = str(denied)
-            except TradeError:  # who is asked may leave meanwhile
+            except TradeError:  # a container may shut down meanwhile
                 continue
         self._wake.set()
 
@@ -104,41 +104,41 @@ class Watch:
             if handle.groups and within(handle.label, self._groups)
         }
         for group in self._health.keys() - now.keys():
-            self._told(group, "gone", "its services have gone")
+            self._changed(group, "gone", "its services have gone")
         for group, health in now.items():
             if health != self._health.get(group, _HEALTHY):
-                self._told(group, "health", "" if health == _HEALTHY else health)
+                self._changed(group, "health", "" if health == _HEALTHY else health)
         self._health = now
         estops = {estop.id: f"{estop.reason} (by {estop.giver})" for estop in self._container.estops()}
         for known in self._estops.keys() - estops.keys():
-            self._told(f"e-stop {known}", "e-stop", "")
+            self._changed(f"e-stop {known}", "e-stop", "")
         for known in estops.keys() - self._estops.keys():
-            self._told(f"e-stop {known}", "e-stop", estops[known])
+            self._changed(f"e-stop {known}", "e-stop", estops[known])
         self._estops, self._looked = estops, True
 
-    def _told(self, about: str, kind: FaultKind, text: str) -> None:
+    def _changed(self, about: str, kind: FaultKind, text: str) -> None:
         self._put(FAULTS, time.time(), Fault(about=about, kind=kind, text=text, new=self._looked))
 
     def close(self) -> None:
-        """Look once more, and have no more calls noted for it. Idempotent."""
+        """Polls once more, and turns off the tracing that it turned on. Idempotent."""
         self._end.set()
         self._thread.join(_END_S)
         self._calls.close()
 
 
 class _Calls:
-    """Has containers note their calls, and reads each note once."""
+    """Turns on tracing in containers, and reads each traced call once."""
 
     def __init__(self, container: Container, groups: list[str]) -> None:
         self._container = container
         self._groups = groups
         self._switched: list[Handle] = []
-        """Of those that did not note calls before."""
+        """Containers that did not trace before."""
         self._read: dict[Handle, int] = {}
-        """The last note that was read."""
+        """For each container, the number of the last call read."""
 
     def read(self) -> list[Span]:
-        """What was noted since the last time, of containers that come as well."""
+        """Returns the calls traced since the last time, also of new containers."""
         asked = [handle.with_(deadline_s=_ASKED_S) for handle in self._services("spans")]
         new = [handle for handle in asked if handle not in self._read]
         outcomes = self._container.call_all([handle.bind(None, self._read.get(handle, 0)) for handle in asked])
@@ -153,7 +153,7 @@ class _Calls:
         if new:
             self._have_noted({handle.key.address for handle in new if handle in self._read})
         reading = {handle.label for handle in self._container.services() if handle.effect == "read"}
-        return [span for span in spans if self._told_of(span, reading)]
+        return [span for span in spans if self._is_recorded(span, reading)]
 
     def _services(self, name: str) -> list[Handle]:
         return [one for one in self._container.services(where(name=name, group="trade")) if not one.local]
@@ -165,13 +165,13 @@ class _Calls:
             if outcome.ok and not outcome.result:
                 self._switched.append(outcome.handle)
 
-    def _told_of(self, span: Span, reading: Collection[str]) -> bool:
-        """Not what a container reads of its own accord: that is how samples for streams are taken."""
+    def _is_recorded(self, span: Span, reading: Collection[str]) -> bool:
+        """Whether a call is recorded: not a container's own reads, which sample its streams."""
         sampled = span.side == "served" and not (span.calls or span.remote) and span.service in reading
         return not sampled and (span.service in _TAKES_AND_GIVES or within(span.service, self._groups))
 
     def close(self) -> None:
-        """Leave every container as it was. Idempotent."""
+        """Restores the tracing of every container. Idempotent."""
         calls = [handle.with_(deadline_s=_ASKED_S).bind(False) for handle in self._switched if handle.alive]
         self._switched.clear()
         self._container.call_all(calls)

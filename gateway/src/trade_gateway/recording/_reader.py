@@ -1,4 +1,4 @@
-"""Reading a recording, also one whose writer was killed: as far as it goes."""
+"""Reads a recording, up to its end or to where its writer was killed."""
 
 import struct
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Entry", "entries"]
 
 _BROKEN: Final = (McapError, struct.error, ValueError, ZstdError)
-"""What the library raises where a file ends in the middle of something."""
+"""What the library raises at an incomplete end of a file."""
 
 
 class Entry(NamedTuple):
@@ -28,10 +28,10 @@ class Entry(NamedTuple):
 
 
 def entries(path: Path) -> Iterator[Entry]:
-    """The messages of a recording in the order they were written; they end where the file is not whole.
+    """Yields the messages of a recording in their written order, up to an incomplete end.
 
     Raises:
-        ConfigurationError: there is no such file, or it is no MCAP file at all.
+        ConfigurationError: the file does not exist, or is not an MCAP file.
     """
     topics: dict[int, str] = {}
     try:
@@ -56,4 +56,4 @@ def _whole(reader: StreamReader, path: Path) -> Iterator[object]:
         return
     except _BROKEN as bad:
         if not begun:
-            raise ConfigurationError(where=str(path), problem=f"is no recording: {bad}") from None
+            raise ConfigurationError(where=str(path), problem=f"is not a recording: {bad}") from None

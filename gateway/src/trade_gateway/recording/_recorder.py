@@ -1,4 +1,4 @@
-"""One recording under way: takes what sources and watch have, and gives it to a file or to the ring."""
+"""Records a system: moves messages from the sources and the poller to a file or a ring buffer."""
 
 import platform
 import threading
@@ -21,19 +21,19 @@ __all__ = ["Recorder", "Ring", "Sink", "about"]
 
 
 class Ring:
-    """Messages of the last seconds. Used by one thread."""
+    """A ring buffer of the last seconds' messages. Used by one thread."""
 
     def __init__(self, keep_s: float, most_bytes: int) -> None:
         self._keep_ns = int(keep_s * 1e9)
         self._most_bytes = most_bytes
         self._kept: deque[Message] = deque()
         self.size_bytes = 0
-        """Of what is kept."""
+        """Size of the kept messages in bytes."""
         self.cut_short = 0
-        """So many messages had to go before their time, for want of room."""
+        """Number of messages that were dropped early for lack of space."""
 
     def write(self, message: Message) -> None:
-        """Keep it, and let go of what is too old or too much."""
+        """Adds a message, and drops what is too old or too much."""
         self._kept.append(message)
         self.size_bytes += len(message.data)
         while self._kept[0].arrived_ns < message.arrived_ns - self._keep_ns:
@@ -46,7 +46,7 @@ class Ring:
         self.size_bytes -= len(self._kept.popleft().data)
 
     def save(self, path: Path, about: Mapping[str, str], attachments: Sequence[Attachment] = ()) -> int:
-        """Write what is kept to a file, and keep it; returns how many messages there are. Raises like the file."""
+        """Writes the kept messages to a file, and keeps them; returns their number. Raises like the file."""
         with RecordingFile(path, about, attachments) as file:
             for message in self._kept:
                 file.write(message)
@@ -54,26 +54,26 @@ class Ring:
 
 
 _LOOK_S: Final = 0.5
-"""So often it looks for services that have come or gone."""
+"""Period of the search for new and lost services, in seconds."""
 _BEAT_S: Final = 1.0
 
 
 class Sink(Protocol):
-    """Where messages go."""
+    """A destination of messages."""
 
     def write(self, message: Message) -> None: ...
 
 
 class Recorder:
-    """Reads a system until it is told to end. Used by one thread; a context manager."""
+    """Records a system until its end is requested. Used by one thread; a context manager."""
 
     def __init__(self, container: Container, wanted: Wanted, ending: threading.Event | SignalEvent) -> None:
-        """Begin to watch.
+        """Starts the subscriptions.
 
         Args:
-            container: of its own.
-            wanted: what of the system.
-            ending: ends ``run`` within half a second of being set.
+            container: the recorder's own container.
+            wanted: the parts of the system to record.
+            ending: ends ``run`` within half a second after it is set.
         """
         self._wake = threading.Event()
         self._ending = ending
@@ -81,11 +81,11 @@ class Recorder:
         self._watch = Watch(container, list(wanted.groups), self._wake)
         self.messages = 0
         self._ahead_ns = 0
-        """The clock on the wall ahead of the one that always runs, at most so far."""
+        """The greatest difference so far of the wall clock to the monotonic clock."""
 
     @property
     def dropped(self) -> int:
-        """Samples that were lost on the way, or while the disk was too slow."""
+        """Number of samples lost on the way, or because of a slow disk."""
         return self._sources.dropped
 
     @property
@@ -94,20 +94,20 @@ class Recorder:
         return self._watch.refused
 
     def listening_to(self) -> list[str]:
-        """The services that are sampled."""
+        """Labels of the sampled services."""
         return self._sources.labels()
 
     def look(self) -> list[str]:
-        """Listen to what there is now; the services."""
+        """Subscribes to the services present now; returns their labels."""
         self._sources.look()
         return self.listening_to()
 
     def run(self, sink: Sink, seconds: float | None, beat: Callable[[], None]) -> None:
-        """Record until it is asked to end.
+        """Records until the end is requested.
 
         Args:
-            sink: where to; what it raises passes.
-            seconds: or so long.
+            sink: the destination; its exceptions are raised.
+            seconds: or for this time.
             beat: called every second, and once at the end.
         """
         began = looked = beaten = time.monotonic()
@@ -139,13 +139,13 @@ class Recorder:
             yield message._replace(arrived_ns=self._now_ns())
 
     def _now_ns(self) -> int:
-        """Since the epoch; it follows the clock on the wall forwards, and goes on evenly where that is put back."""
+        """Nanoseconds since the epoch: follows the wall clock forwards, and is steady when that is set back."""
         running_ns = time.monotonic_ns()
         self._ahead_ns = max(self._ahead_ns, time.time_ns() - running_ns)
         return running_ns + self._ahead_ns
 
     def close(self) -> None:
-        """Listen to nothing more. Idempotent."""
+        """Ends all subscriptions. Idempotent."""
         self._watch.close()
         self._sources.close()
 
@@ -157,7 +157,7 @@ class Recorder:
 
 
 def about(container: Container, wanted: Wanted) -> dict[str, str]:
-    """What a recording says of itself."""
+    """The metadata of a recording."""
     return {
         "system": container.settings.system,
         "groups": ",".join(wanted.groups),

@@ -1,4 +1,4 @@
-"""What is listened to: joints, arms, cameras and other services, as they come and go."""
+"""The subscriptions of a recording: joints, arms, cameras and other services, as they come and go."""
 
 import threading
 import time
@@ -23,19 +23,19 @@ from trade_gateway.recording._channels import (
 __all__ = ["Sources", "Wanted", "joint_states", "within"]
 
 _KEEP: Final = 500
-"""So many samples of a stream wait for a disk that is slow."""
+"""Most samples of a stream that wait for a slow disk."""
 _LIMITS_S: Final = 2.0
 
 Read = Callable[[Handle, Sample], Message]
 
 
 class Wanted(NamedTuple):
-    """What of a system is to be recorded."""
+    """The parts of a system to record."""
 
     groups: Sequence[str] = ()
-    """These and what is beneath them; none: all."""
+    """These groups and those beneath them; none: all."""
     services: Sequence[str] = ()
-    """Others that only read, by group and name; ``*`` and ``?`` stand for anything."""
+    """Other services that only read, by group and name; ``*`` and ``?`` are wildcards."""
     joints_hz: float = 50.0
     cameras_hz: float = 5.0
     services_hz: float = 10.0
@@ -47,7 +47,7 @@ class _Source(NamedTuple):
 
 
 class Sources:
-    """The streams that are open. Used by one thread, which is woken when there is something to take."""
+    """The open streams. Used by one thread, which is woken when there are samples."""
 
     def __init__(self, container: Container, wanted: Wanted, wake: threading.Event) -> None:
         self._container = container
@@ -55,15 +55,15 @@ class Sources:
         self._wake = wake
         self._open: dict[Handle, _Source] = {}
         self._arms: dict[Handle, list[str]] = {}
-        """The names of their joints."""
+        """The names of arms' joints."""
         self._wrong: dict[tuple[str, FaultKind], str] = {}
-        """What was told last of each service and joint; empty: it is well."""
+        """The last fault of each service and joint; empty: it is healthy."""
         self._refused: list[Message] = []
         self.dropped = 0
-        """Samples that were lost on the way, or while the disk was too slow."""
+        """Number of samples lost on the way, or because of a slow disk."""
 
     def look(self) -> None:
-        """Listen to what has come, and no more to what has gone."""
+        """Subscribes to new services, and ends the streams of lost ones."""
         present: set[Handle] = set()
         for handle, hz, read in self._meant():
             present.add(handle)
@@ -75,7 +75,7 @@ class Sources:
     def _listen(self, handle: Handle, hz: float, read: Read) -> None:
         try:
             stream = self._container.stream(handle, hz=hz, keep=_KEEP)
-        except TradeError as bad:  # it has left already, or may not be read; looked at again
+        except TradeError as bad:  # it has shut down, or may not be read; retried at the next look
             text = f"{type(bad).__name__}: {bad}"
             self._refused.extend(self._noted(handle.label, "unreadable", text, type(bad).__name__))
             return
@@ -100,7 +100,7 @@ class Sources:
                 yield handle, wanted.services_hz, _answer
 
     def take(self) -> Iterator[Message]:
-        """What has come since the last time, without its time of arrival."""
+        """Yields the messages since the last time, without their time of arrival."""
         refused, self._refused = self._refused, []
         yield from refused
         for source in list(self._open.values()):
@@ -111,9 +111,9 @@ class Sources:
         while True:
             try:
                 sample = source.stream.take()
-            except ServiceGone:  # told by the registry, too
+            except ServiceGone:  # the registry reports that too
                 return
-            except Exception as bad:  # noqa: BLE001 - whatever the service itself raises
+            except Exception as bad:  # noqa: BLE001 - any exception of the service itself
                 yield from self._noted(handle.label, "unreadable", f"{type(bad).__name__}: {bad}", type(bad).__name__)
                 if bad is source.stream.why_ended:
                     return
@@ -128,7 +128,7 @@ class Sources:
             yield source.read(handle, sample)
 
     def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
-        """A change of what is wrong, by ``what`` rather than by the whole text, which may have times in it."""
+        """Yields a change of a fault, compared by ``what``, as the whole text may contain times."""
         now, before = what or text, self._wrong.get((about, kind))
         self._wrong[about, kind] = now
         if now != (before or ""):
@@ -144,24 +144,24 @@ class Sources:
         return _joints(handle, sample, names)
 
     def labels(self) -> list[str]:
-        """What is listened to."""
+        """Labels of the subscribed services."""
         return sorted(source.stream.source.label for source in self._open.values())
 
     def close(self) -> None:
-        """Listen to nothing. Idempotent."""
+        """Ends all streams. Idempotent."""
         for source in self._open.values():
             source.stream.close()
         self._open.clear()
 
 
 def within(label: str, groups: Iterable[str]) -> bool:
-    """Whether a service, by its group and name, is of one of these groups; of none given: always."""
+    """Whether a service, by its group and name, belongs to one of these groups; without groups always."""
     asked = list(groups)
     return not asked or any(label == group or label.startswith(f"{group}.") for group in asked)
 
 
 def _moves(handle: Handle, grouped: set[str]) -> bool:
-    """Whether a state is that of joints which no other one tells of."""
+    """Whether a state is of joints that no other state includes."""
     kinds = handle.kinds
     return "JointGroup" in kinds or "Arm" in kinds or ("Motor" in kinds and handle.groups[0] not in grouped)
 
@@ -171,18 +171,18 @@ def _ns(at_s: float) -> int:
 
 
 def _faults(value: Any) -> list[tuple[str, str]]:
-    """Joints, or arms, and what is wrong with each."""
+    """Joints, or arms, and the faults of each."""
     states: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
     return [(state.name, state.fault) for state in states]
 
 
 def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -> JointStates:
-    """The state of a motor, of a group of joints or of an arm, as it is recorded.
+    """Converts the state of a motor, of a group of joints or of an arm.
 
     Args:
-        value: what its ``state`` answered.
-        at_s: when, in seconds since the epoch.
-        arm_joints: names of the joints of an arm; None: it is none.
+        value: the result of its ``state``.
+        at_s: its time, in seconds since the epoch.
+        arm_joints: the names of an arm's joints; None: it is not an arm.
     """
     if arm_joints is not None:
         return _arm_states(value, at_s, arm_joints)

@@ -181,14 +181,14 @@ class Nodes:
         container: the bridge's.
         graph: the ROS system.
         grace_s: how long ROS may be lost before all nodes count as gone, in seconds.
-        told: receives ROS's problem, or an empty text, at each change.
+        changed: receives ROS's problem, or an empty text, at each change.
     """
 
-    def __init__(self, container: Container, graph: Graph, grace_s: float, told: Callable[[str], object]) -> None:
+    def __init__(self, container: Container, graph: Graph, grace_s: float, changed: Callable[[str], object]) -> None:
         self._container = container
         self._graph = graph
         self._grace_s = grace_s
-        self._tell = told
+        self._tell = changed
         self._guests: dict[str, Guest] = {}
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}
