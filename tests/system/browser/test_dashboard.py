@@ -162,10 +162,10 @@ def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))  # where no robot has its stop line
     doorway.start()
     chief = browsers.view("chief")
-    expect(chief.page.locator("#apart")).to_contain_text(f"The door reaches nobody at {nowhere}")
+    expect(chief.page.locator("#apart")).to_contain_text(f"The HTTP gateway reaches no container at {nowhere}")
     expect(chief.page.locator("#apart")).to_contain_text("nothing accepts connections there")
-    expect(chief.page.locator("#apart")).to_contain_text("no robot hears an e-stop")
-    expect(chief.page.locator("#robot-list")).to_contain_text("No robot is there")
+    expect(chief.page.locator("#apart")).to_contain_text("no robot receives an e-stop")
+    expect(chief.page.locator("#robot-list")).to_contain_text("There is no robot")
     chief.page.keyboard.press("Escape")
     loudest = chief.stopped.locator("strong")
     expect(loudest).to_contain_text("CONFIRMED")  # at once, and as long as it is tried
@@ -203,7 +203,7 @@ def test_who_may_only_look_cannot_act_but_for_the_e_stop(bench: Bench, browsers:
     expect(vera.page.locator("#lock-problem")).to_contain_text("AccessDenied")
     vera.estop.click()
     expect(vera.stopped).to_contain_text("Confirmed by")
-    expect(vera.stopped).to_contain_text("Who administers the system may clear it.")
+    expect(vera.stopped).to_contain_text("Clearing it needs the right to administer the system.")
     assert not events(bench.sim.entries(), "motion_started")
 
 

@@ -41,7 +41,7 @@ def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_r
 
 def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
-    expect(part(vera, "call-list")).to_contain_text("for who may read the system")
+    expect(part(vera, "call-list")).to_contain_text("the right to read the system")
     expect(part(anna, "note-calls")).to_be_disabled()  # she does not instrument the system
     expect(part(chief, "call-list")).to_have_text("No call has been noted yet.")
     part(chief, "note-calls").click()
@@ -62,11 +62,11 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) 
 
 def test_the_policy_is_for_who_reads_the_system_and_the_audit_for_who_administers_it(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
-    expect(part(vera, "policy-list")).to_contain_text("for who may read the system")
+    expect(part(vera, "policy-list")).to_contain_text("the right to read the system")
     bert = part(anna, "policy-list").get_by_role("row", name="bert")
     expect(bert).to_contain_text("operator")
-    expect(part(anna, "audit-list")).to_have_text("It is for who administers the system.")
-    expect(part(anna, "rule-list")).to_have_text("No rules stand.")
+    expect(part(anna, "audit-list")).to_have_text("This needs the right to administer the system.")
+    expect(part(anna, "rule-list")).to_have_text("There are no rules.")
     part(chief, "note-calls").click()
     expect(part(chief, "audit-list").get_by_role("row", name="set_tracing").first).to_contain_text("configure")
 

@@ -1,4 +1,4 @@
-// The dashboard: a client of the door like any other. It comes, asks, goes and comes back.
+// The dashboard: a client of the HTTP API like any other. It connects, polls, disconnects and reconnects.
 
 import { readCalls, showCalls } from "./calls.js";
 import { STATE_HZ } from "./devices.js";
@@ -14,7 +14,7 @@ import { lookAtAudit, lookAtContainers, lookAtPolicy, lookAtSight, lookAtWatcher
 const ASK_AGAIN_MS = 1000;
 const LONGEST_PAUSE_MS = 4000;
 
-/** Ask again and again while connected and visible. Whoever answers nothing is gone. */
+/** Poll while connected and visible. A robot without an answer is gone. */
 async function keepAsking(look, every_ms) {
   for (;;) {
     if (door.connected && document.visibilityState === "visible") {
@@ -83,7 +83,7 @@ async function main() {
       if (door.me.reads) {
         readLog();
         readCalls();
-      } else write($("log-problem"), "It is for who may read the system (group trade).");
+      } else write($("log-problem"), "This needs the right to read the system (group trade).");
       lookAround().catch((error) => tell(error.message));
       await closed;
     } catch (error) {

@@ -1,15 +1,15 @@
-// Calls of the whole system as they end, while its containers note them.
+// Calls of the whole system as they end, while its containers trace them.
 
 import { door } from "./door.js";
 import { $, clock, table, tell, write } from "./page.js";
 
 const MOST_CALLS = 100;
 const COLUMNS = ["Ended", "Service", "In", "For", "Took", "Outcome"];
-const ended = new Map(); // by call; what served it tells more than who asked
+const ended = new Map(); // by call; its callee's record has more data than its caller's
 
 let reading = null;
 
-/** Read on from what is kept; of a connection that ended nothing comes any more. */
+/** Read recorded calls; an ended connection delivers none. */
 export function readCalls() {
   if (reading) door.cancel(reading.id);
   ended.clear();
@@ -36,7 +36,7 @@ export function showCalls() {
 }
 
 function rowOf(call) {
-  const client = call.session.split("/")[3]; // of a door, whose call it was
+  const client = call.session.split("/")[3]; // of an HTTP gateway: the client behind it
   const who = client ? `${call.caller} for ${client.slice(0, client.lastIndexOf("."))}` : call.caller;
   return [clock(call.began + call.took_s), call.service, call.container, who, `${(call.took_s * 1000).toFixed(1)} ms`, call.outcome];
 }

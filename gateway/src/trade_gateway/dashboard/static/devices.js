@@ -1,4 +1,4 @@
-// A joint, a gripper, an arm: what was last measured of it, and what one can do to it.
+// A joint, a gripper or an arm: its last measurement, and its controls.
 
 import { door } from "./door.js";
 import { JOG_VALID_S, Jog } from "./jog.js";
@@ -9,9 +9,9 @@ export const STATE_HZ = 5;
 const STALE_MS = 1500;
 const ASK_AGAIN_MS = 1000;
 const DEED_S = 60;
-const MOST_LEAD_S = 1; // so far a goal may run ahead of what was measured
+const MOST_LEAD_S = 1; // longest lead of a goal over the measurement
 
-/** What the services of a group are of, and what was last measured of it. */
+/** The device behind the services of a group, and its last measurement. */
 class Device {
   present = true; // on this page
   state = null;
@@ -38,7 +38,7 @@ class Device {
     return this.services.get(name)?.allowed ?? false;
   }
 
-  /** Follow its state until it is no device of this page any more; resolves once something was heard. */
+  /** Follow its state while it is on this page; resolves after the first message. */
   follow() {
     return new Promise((first) => this.#follow(first));
   }
@@ -90,7 +90,7 @@ class Device {
     this.resume.hidden = true;
   }
 
-  /** Call a service that needs no arguments. What it moves ends with this page, like everything of it. */
+  /** Call a service without arguments. Its motion ends with this page, like all of its motion. */
   async act(name) {
     this.say("");
     try {
@@ -108,7 +108,7 @@ class Device {
     this.resume.hidden = error.title !== "Stopped";
   }
 
-  /** Under a lock, as that is for whoever has it, or administers the joint. */
+  /** Resume under a lock, as this needs the lock, or the right to administer the joint. */
   async let_move_again() {
     let lock = "";
     try {
@@ -166,7 +166,7 @@ class Device {
     const words = state ? this.words(state) : [];
     show(this.badges, JSON.stringify(words), () => words.map((text) => make("span", { class: "badge" }, text)));
     const lock = lockOn(this.resources);
-    write(this.locked, lock ? `${lock.owner}, ${lock.purpose}` : "nobody");
+    write(this.locked, lock ? `${lock.owner}, ${lock.purpose}` : "—");
     this.element.classList.toggle("stale", !state || this.stale || !door.connected);
     if (!state) return;
     const figures = this.measured(state);
@@ -295,7 +295,7 @@ export class Arm extends Device {
     return this.limits.joints;
   }
 
-  /** Angles for all joints, of which one goes on from where the arm is, as far as time goes on, and never far ahead. */
+  /** Angles for all joints; one advances with time from the arm's position, and never far ahead of it. */
   setpoints(jog) {
     const { sign, place } = jog;
     const { min_rad, max_rad } = this.joint_limits[place];
@@ -315,7 +315,7 @@ export class Arm extends Device {
   paint() {
     if (this.limits && !this.jogs.length && this.services.has("servo")) this.show_jogs();
     super.paint();
-    if (!this.state || this.stale) for (const jog of this.jogs) jog.let(false); // where would it go from
+    if (!this.state || this.stale) for (const jog of this.jogs) jog.let(false); // its position is unknown
   }
 
   words(state) {

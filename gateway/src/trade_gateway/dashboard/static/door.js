@@ -1,12 +1,12 @@
-// The way to the door: requests, and the WebSocket with what is under way on it. All that is known of the other side is in docs/http.md.
+// The connection to the HTTP gateway: requests, and the WebSocket with its operations. docs/http.md specifies the other side.
 
 import { sleep, tell } from "./page.js";
 
 const ESTOP_WITHIN_MS = 1000;
-const SILENT_MS = 3000; // a door that answers nothing for so long is as good as gone
-export const LONG_MS = 15000; // for what waits for others
+const SILENT_MS = 3000; // a gateway that is silent for so long counts as gone
+export const LONG_MS = 15000; // for requests that wait for other containers
 
-/** What the door or the system would not do, with the problem as it was told. */
+/** A refusal by the gateway or the system, with its problem. */
 export class Refused extends Error {
   constructor(problem) {
     super(problem.detail || problem.title);
@@ -16,11 +16,11 @@ export class Refused extends Error {
   }
 }
 
-const lost = () => new Refused({ title: "NotConnected", status: 0, detail: "There is no connection to the door." });
+const lost = () => new Refused({ title: "NotConnected", status: 0, detail: "There is no connection to the HTTP gateway." });
 
 class Door {
   token = sessionStorage.getItem("token") || "";
-  me = null; // who is signed in, and what that identity may do to the system
+  me = null; // the identity that is signed in, and its rights over the system
   locks = new Map(); // those of this page: name -> resources
   on_loss = () => {}; // called when a lock or the connection is lost
   #socket = null;
@@ -98,7 +98,7 @@ class Door {
     else waiting.resolve(told.result);
   }
 
-  /** Begin something; `heard` gets what is said on the way, `ended` is how it ends. */
+  /** Begin an operation; `heard` gets its messages, `ended` its result. */
   begin(message, heard = () => {}) {
     const id = ++this.#number;
     const ended = new Promise((resolve, reject) => {
@@ -140,7 +140,7 @@ class Door {
     return resources.length > 0 && resources.every((one) => mine.has(one));
   }
 
-  /** Stop everything: over the socket, and if that says nothing in time, over a request of its own. */
+  /** Stop everything: over the socket, and without an answer in time, by a separate request. */
   async estop(reason) {
     const stopped = this.connected ? this.ask({ do: "estop", reason }).catch(() => null) : null;
     return (await Promise.race([stopped, sleep(stopped ? ESTOP_WITHIN_MS : 0)])) ?? this.post("/estop", { reason });

@@ -1,4 +1,4 @@
-// The e-stop: always there, and Esc presses it. What it says of robots is never more than what they have confirmed.
+// The e-stop: always visible, and Esc presses it. It reports only what robots have confirmed.
 
 import { door } from "./door.js";
 import { releaseAll } from "./jog.js";
@@ -7,7 +7,7 @@ import { $, button, clock, make, show, tell } from "./page.js";
 const CUT = "use the switch that cuts the power.";
 
 let open_estops = [];
-let pressed = null; // what came of the last press here: the id that all have confirmed, or what is wrong; and the rest
+let pressed = null; // result of the last press here: the id that all have confirmed, or the problem; and the rest
 
 async function pressEstop() {
   releaseAll();
@@ -17,7 +17,7 @@ async function pressEstop() {
   } catch (error) {
     say({ wrong: `✕ NO ROBOT CONFIRMED: ${CUT}`, rest: error.message });
   }
-  await lookForEstops().catch(() => {}); // what came of it stays
+  await lookForEstops().catch(() => {}); // the result stays
 }
 
 function say(outcome) {
@@ -43,7 +43,7 @@ export async function lookForEstops() {
   showEstops();
 }
 
-/** Only the page that has pressed it knows who has confirmed it. */
+/** Only the page that pressed it knows its confirmations. */
 function headline() {
   if (pressed?.wrong) return pressed.wrong;
   if (open_estops.some((one) => one.id === pressed?.id)) return "E-STOP: nothing moves until it is cleared.";
@@ -55,9 +55,9 @@ function showEstops() {
   show($("stopped"), JSON.stringify([open, pressed, door.me?.administers]), () => [
     headline() ? make("strong", {}, headline()) : "",
     pressed?.rest ? make("p", {}, pressed.rest) : "",
-    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}${one.told_by ? ` (told by ${one.told_by})` : ""}: ${one.reason}`)),
+    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}${one.told_by ? ` (reported by ${one.told_by})` : ""}: ${one.reason}`)),
     open.length && door.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
-    open.length && !door.me?.administers ? make("p", {}, "Who administers the system may clear it.") : "",
+    open.length && !door.me?.administers ? make("p", {}, "Clearing it needs the right to administer the system.") : "",
     !open.length && pressed ? button("Understood", () => say(null)) : "",
   ].filter(Boolean));
 }
@@ -66,11 +66,11 @@ async function clearEstop(open) {
   try {
     const told = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
     pressed = null;
-    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself, and what it stopped not before it is let." : `Not cleared by ${told.missing.join(", ") || "anybody that is in sight"}.`);
+    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself; what it stopped must be resumed first." : `Not cleared by ${told.missing.join(", ") || "any visible container"}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);
   }
-  await lookForEstops().catch(() => {}); // it is looked for again anyway
+  await lookForEstops().catch(() => {}); // the next poll looks again anyway
 }
 
 $("estop").onclick = pressEstop;

@@ -1,4 +1,4 @@
-// What is or was wrong with devices, from the robots' logs of faults, and that somebody has seen it.
+// Present and past faults of devices, from the robots' fault logs, and their acknowledgement.
 
 import { door } from "./door.js";
 import { $, moment, table, tell } from "./page.js";
@@ -23,11 +23,11 @@ async function faultsOf(log, open_only) {
 
 function rowOf(one) {
   const see = { label: "I have seen it", act: () => acknowledge(one), name: `I have seen: ${one.text}` };
-  const seen = one.acknowledged_by || (one.may ? see : "nobody");
+  const seen = one.acknowledged_by || (one.may ? see : "—");
   return [one.device, said(one), one.open ? "✕ there" : "gone", seen, one.remedy || "—", `${one.count}`, moment(one.last_at)];
 }
 
-// What was wrong the latest time, with its numbers: a kind has none.
+// The text of the latest occurrence, with its numbers: a kind has none.
 function said(one) {
   const begin = `${one.device}: `;
   return one.text.startsWith(begin) ? one.text.slice(begin.length) : one.kind;

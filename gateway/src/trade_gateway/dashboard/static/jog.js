@@ -4,7 +4,7 @@ import { door } from "./door.js";
 import { $, make, sleep, write } from "./page.js";
 
 const JOG_EVERY_MS = 80;
-export const JOG_VALID_S = 0.2; // so long a set-point holds: whatever happens to this page, motion ends then
+export const JOG_VALID_S = 0.2; // validity of a set-point: motion ends then, whatever happens to this page
 
 const held = new Set();
 
@@ -62,7 +62,7 @@ export class Jog {
     write(this.button.lastChild, `${this.speed_rad_s.toFixed(3)} rad/s`);
   }
 
-  /** Whether it may be held; who holds it while it may not any more lets go. */
+  /** Whether it may be held; when it may not any more, it is released. */
   let(allowed) {
     this.button.disabled = !allowed;
     if (!allowed) this.release();

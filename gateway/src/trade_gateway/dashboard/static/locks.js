@@ -1,4 +1,4 @@
-// Locks: who has what, and what can be done about it.
+// Locks: their owners, and how to request, break and release them.
 
 import { door } from "./door.js";
 import { $, button, clock, make, show, write } from "./page.js";
@@ -43,7 +43,7 @@ function lockCard(one, mine) {
     ["Owner", mine ? `${one.owner} (this page)` : one.owner],
     ["Purpose", one.purpose || "—"],
     ["Since", clock(one.since)],
-    ["Waiting", one.waiting.join(", ") || "nobody"],
+    ["Waiting", one.waiting.join(", ") || "—"],
   ];
   const figures = make("dl", { class: "figures" }, ...lines.map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text))));
   return make("li", { class: "card" }, make("h3", {}, one.resources.join(", ")), figures, make("div", { class: "line" }, ...hands), breaking, said);

@@ -25,12 +25,12 @@ export function draw(tag, attributes = {}, ...children) {
 
 export const button = (text, onclick, properties = {}) => make("button", { type: "button", onclick, ...properties }, text);
 
-/** Set a text if it is another one: what has not changed is not read out again. */
+/** Set a text if it differs: screen readers do not read an unchanged one again. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Show children if they are others, told by a key. */
+/** Replace children if their key differs. */
 export function show(element, key, children) {
   if (element.dataset.shown === key) return;
   element.dataset.shown = key;
@@ -44,7 +44,7 @@ export const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString();
 
 let told_for = 0;
 
-/** Say something in passing. */
+/** Show a message for a short time. */
 export function tell(text) {
   write($("told"), text);
   clearTimeout(told_for);

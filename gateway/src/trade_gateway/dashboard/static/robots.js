@@ -41,7 +41,7 @@ function kindOf(state) {
 
 let looking = Promise.resolve();
 
-/** Look what is there, one look after the other. */
+/** Refresh the list of robots, one refresh at a time. */
 export function lookAround() {
   looking = looking.catch(() => {}).then(lookOnce);
   return looking;
@@ -79,11 +79,11 @@ async function arrange(groups) {
   }
   chains = [];
   const shown = [...robots].sort().map(([name, inside]) => robotCard(name, inside, members));
-  $("robot-list").replaceChildren(...(shown.length ? shown : [make("p", { class: "note" }, "No robot is there, or none that you may see.")]));
+  $("robot-list").replaceChildren(...(shown.length ? shown : [make("p", { class: "note" }, "There is no robot, or none that you may see.")]));
   followAll([...devices.values()]);
 }
 
-/** One after the other: a client may ask for 16 things at once. */
+/** In turn: a client may have 16 operations at once. */
 async function followAll(all) {
   for (const device of all) await device.follow();
 }
@@ -112,7 +112,7 @@ function part(group, inside, sketched) {
   return make("section", { class: "part" }, alone ? null : title, sketches, make("ul", { class: "devices" }, ...inside.map((one) => one.element)));
 }
 
-/** After a new connection: all is looked at anew. */
+/** Refresh everything after a new connection. */
 export function forget() {
   shape = "";
 }

@@ -1,11 +1,11 @@
-// What services there are, and of what kind their arguments and results are.
+// The services, and the types of their arguments and results.
 
 import { door } from "./door.js";
 
 export let services = [];
 let described = { paths: {}, components: { schemas: {} } };
 
-/** Ask for all of it again. */
+/** Fetch all of it again. */
 export async function lookForServices() {
   [services, described] = await Promise.all([door.get("/services"), door.get("/openapi.json")]);
 }

@@ -74,7 +74,7 @@ function formOf(one) {
   return [make("p", { class: "doc" }, one.doc), make("p", { class: "note" }, make("code", {}, one.signature)), where_, form];
 }
 
-/** One argument: a plain input where there is one for it, JSON otherwise. An empty one that may be left out is left out. */
+/** One argument: a plain input if there is one for its type, JSON otherwise. An empty optional one is omitted. */
 function field(one, name, schema, required) {
   const kinds = (resolve(schema).anyOf ?? [resolve(schema)]).map(resolve).filter((kind) => kind.type !== "null");
   const kind = kinds.length === 1 ? kinds[0] : {};

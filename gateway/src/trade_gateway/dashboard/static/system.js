@@ -6,12 +6,12 @@ import { services } from "./schemas.js";
 
 const VERBS = ["call", "read", "register", "lock", "instrument", "administer"];
 
-/** Whom the door itself does not reach: what is behind it is not on this page, and hears no e-stop. */
+/** Endpoints that the HTTP gateway does not reach: robots behind them are not on this page, and receive no e-stop. */
 export async function lookAtSight() {
   const { others, apart } = await door.get("/sight", LONG_MS);
-  const said = Object.entries(apart).map(([where, why]) => `✕ The door reaches nobody at ${where} (its TRADE_CONNECT): ${why}`);
-  if (!others.length) said.push("✕ The door finds nobody else in its system: no robot hears an e-stop from here.");
-  else if (said.length) said.push("The robots there are not on this page, and hear no e-stop from here.");
+  const said = Object.entries(apart).map(([where, why]) => `✕ The HTTP gateway reaches no container at ${where} (its TRADE_CONNECT): ${why}`);
+  if (!others.length) said.push("✕ The HTTP gateway finds no other container in its system: no robot receives an e-stop from here.");
+  else if (said.length) said.push("The robots there are not on this page, and receive no e-stop from here.");
   show($("apart"), JSON.stringify(said), () => said.map((one) => make("p", {}, one)));
 }
 
@@ -26,7 +26,7 @@ export async function lookAtContainers() {
       memory ? `${(memory / 1e6).toFixed(0)} MB` : "—", measure(load?.calls_per_s, 1, "/s"), measure(load?.in_flight, 0, ""),
     ];
   });
-  table($("container-list"), "Containers, over the last second", ["Container", "Identity", "Host", "CPU", "Host’s CPU", "Memory", "Calls", "Running"], rows, "No container is there.");
+  table($("container-list"), "Containers, over the last second", ["Container", "Identity", "Host", "CPU", "Host’s CPU", "Memory", "Calls", "Running"], rows, "There is no container.");
 }
 
 export async function lookAtWatchers() {
@@ -39,13 +39,13 @@ export async function lookAtWatchers() {
     ...standing.map((one) => [one.occasion, one.call, one.condition || "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || one.state]),
     ...hooks.map((one) => [`${one.side} ${one.target}`, one.call, "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || (one.suspended ? "suspended" : "attached")]),
   ];
-  table($("watcher-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "No notification and no hook stands.");
+  table($("watcher-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "There are no notifications and no hooks.");
 }
 
 export async function lookAtPolicy() {
   await lookAtRules();
   if (!door.me.reads) {
-    table($("policy-list"), "", [], [], "It is for who may read the system (group trade).");
+    table($("policy-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
   const { governed, identities, revoked } = await door.get("/policy");
@@ -53,7 +53,7 @@ export async function lookAtPolicy() {
     ...identities.map((one) => [one.name, one.roles.join(", ") || "—", ...VERBS.map((verb) => one.rights[verb].join(", ") || "—")]),
     ...revoked.map((name) => [name, "revoked", ...VERBS.map(() => "—")]),
   ];
-  const none = governed ? "The policy names nobody." : "There is no policy: whoever is let in may do everything.";
+  const none = governed ? "The policy names no identity." : "There is no policy: every client may do everything.";
   table($("policy-list"), "Who may do what in which groups", ["Identity", "Roles", ...VERBS], rows, none);
 }
 
@@ -61,12 +61,12 @@ async function lookAtRules() {
   const told = services.filter((one) => one.name === "rules" && one.group === "rules" && one.allowed);
   const found = await Promise.all(told.map((one) => door.call("rules", "rules", {}, { container: one.container })));
   const rows = found.flat().map((one) => [one.name, one.occasion, one.condition || "—", one.container, `${one.fired}`, `${one.failed}`, one.why || one.last_error || one.state]);
-  table($("rule-list"), "Rules by which the system configures itself", ["Rule", "Occasion", "Condition", "Runs in", "Fired", "Failed", "State"], rows, "No rules stand.");
+  table($("rule-list"), "Rules by which the system configures itself", ["Rule", "Occasion", "Condition", "Runs in", "Fired", "Failed", "State"], rows, "There are no rules.");
 }
 
 export async function lookAtAudit() {
   const columns = ["At", "Kind", "Who", "What", "About", "In", "Outcome"];
-  let [rows, none] = [[], "It is for who administers the system."];
+  let [rows, none] = [[], "This needs the right to administer the system."];
   if (door.me.administers) {
     try {
       const found = await door.get("/audit");
