@@ -76,7 +76,7 @@ def test_a_started_call_raises_its_error_when_asked(offer: Any) -> None:
 def test_waiting_for_a_started_call_may_be_given_up_without_ending_it(offer: Any, gate: Any) -> None:
     run = offer(gate)("pass_through").start()
     gate.entered.wait(20)
-    with pytest.raises(TimeoutError, match="has not ended after 0 s; it goes on"):
+    with pytest.raises(TimeoutError, match="has not ended after 0 s; it continues"):
         run.result(0)
     gate.open.set()
     assert run.result(20) == "through"
