@@ -1,4 +1,4 @@
-"""The error tree: one root, with branches by who must act::
+"""The error tree: one root, with branches by who must act.
 
     TradeError
     |-- CallerError            the caller must act
