@@ -1,4 +1,4 @@
-"""What an arm of six joints with a controller of its own can do, in SI units, whoever built it."""
+"""The vendor-neutral interface of a six-joint arm with its own controller, in SI units."""
 
 from abc import abstractmethod
 from typing import Annotated, Literal
@@ -16,7 +16,7 @@ Safety = Literal["normal", "reduced", "protective stop", "recovery", "safeguard 
 
 
 class ArmState(Struct, frozen=True, kw_only=True):
-    """What was last measured at one arm."""
+    """The newest measurement of one arm."""
 
     name: str
     """The arm, such as ``rosie.right``."""
@@ -24,56 +24,56 @@ class ArmState(Struct, frozen=True, kw_only=True):
     """From the base to the tool."""
     velocities_rad_s: list[float]
     pose: list[float]
-    """Of the tool in the frame of the base: x, y, z in m, then a rotation vector in rad."""
+    """The tool's pose in the base frame: x, y, z in m, then a rotation vector in rad."""
     powered: bool
     enabled: bool
-    """Its brakes are released: it holds or moves."""
+    """True if the brakes are released: the arm holds or moves."""
     moving: bool
     freedrive: bool
-    """It can be moved by hand."""
+    """True if the arm can be moved by hand."""
     safety: Safety
     speed_scaling: float
-    """The fraction of their speed at which motions are carried out."""
+    """The fraction of the commanded speed at which motions run."""
     fault: str = ""
-    """Why it refuses to move; empty if it does not."""
+    """Why the arm refuses to move; empty if it does not."""
     remedy: str = ""
-    """What to do about that."""
+    """What to do about the fault."""
     measured_at: float
-    """When all this was read: ``time.monotonic()`` of the driver's process."""
+    """When the driver measured this: ``time.monotonic()`` of its process."""
     age_s: float
-    """How long ago that was."""
+    """Age of the measurement."""
 
 
 class ArmLimits(Struct, frozen=True, kw_only=True):
-    """What an arm may be told, from the robot file."""
+    """The limits for commands to an arm, from the robot file."""
 
     name: str
     joints: list[JointLimits]
     """From the base to the tool."""
     max_speed_m_s: float
-    """Of the tool, on a line."""
+    """Of the tool, on a straight line."""
     max_accel_m_s2: float
     poses: dict[str, list[float]]
-    """Joint angles in rad by the name of the pose."""
+    """Joint angles in rad, by name of the pose."""
 
 
 Angles = Annotated[list[float], Meta(description="six joint angles in rad, from the base to the tool, within limits()")]
 Pose = Annotated[list[float], Meta(description="x, y, z in m and a rotation vector in rad, in the frame of the base")]
-ToolSpeed = Annotated[float, Meta(gt=0, description="of the tool in m/s; by default the greatest of limits()")]
-Fraction = Annotated[float, Meta(gt=0, le=1, description="of the speed motions are told")]
+ToolSpeed = Annotated[float, Meta(gt=0, description="speed of the tool in m/s; by default the maximum of limits()")]
+Fraction = Annotated[float, Meta(gt=0, le=1, description="fraction of the commanded speed")]
 
 
 class Arm(Lockable):
-    """One arm. It is one thing to lock and to stop: its joints are not commanded one by one.
+    """One arm. It is locked and stopped as a whole; its joints cannot be commanded separately.
 
-    Everything raises ``DeviceSilent`` when the controller has not sent anything new for too long: an old value is no
-    value. Power and brakes are switched by the services of that name, and by nothing else.
+    Every service raises ``DeviceSilent`` instead of using outdated values if the controller has sent nothing new for
+    too long. Only the services named after them switch power and brakes.
     """
 
     @service(effect="read")
     @abstractmethod
     def state(self) -> ArmState:
-        """Angles, speeds, pose, safety and the time of their measurement.
+        """Returns angles, speeds, pose and safety state, with the time of measurement.
 
         Raises:
             DeviceSilent: the newest measurement is older than the bus allows.
@@ -82,102 +82,102 @@ class Arm(Lockable):
     @service(effect="read")
     @abstractmethod
     def limits(self) -> ArmLimits:
-        """The ranges, speeds and accelerations this arm may be commanded, and the poses it knows by name."""
+        """Returns the limits for commands to this arm (ranges, speeds, accelerations) and its named poses."""
 
     @service(effect="read")
     def safety_state(self) -> Safety:
-        """What the safety system of the controller says."""
+        """Returns the state of the controller's safety system."""
         return self.state().safety
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_joints(self, positions_rad: Angles, speed_rad_s: Speed | None = None) -> list[float]:
-        """Move in joint space, all joints arriving together; the angles measured at rest there.
+        """Moves in joint space, all joints arriving together, and returns the angles measured at rest.
 
         Raises:
-            LimitExceeded: outside of limits(); nothing was sent. Moving back inside is allowed from outside.
-            InvalidArgument: not six finite numbers.
-            MotionStopped: stop(), another move, or the call's deadline came first; the arm was stopped.
-            DeviceFault: its power is off, its brakes are on, or its safety system stopped it.
+            LimitExceeded: outside limits(); nothing was sent. A joint outside its range may move back inside.
+            InvalidArgument: the values are not six finite numbers.
+            MotionStopped: stop(), another move, or the call's deadline ended the move; the arm was stopped.
+            DeviceFault: the power is off, the brakes are on, or the safety system stopped the arm.
             DeviceSilent: the controller does not answer.
-            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+            DeadlineExceeded: the deadline passed before anything was sent; the command will not run.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_line(self, pose: Pose, speed_m_s: ToolSpeed | None = None) -> list[float]:
-        """Move the tool in a straight line; the pose measured at rest.
+        """Moves the tool in a straight line and returns the pose measured at rest.
 
-        Before it begins, the joint angles along the line are worked out, every 5 cm and 0.2 rad: a joint that would
-        leave its range is LimitExceeded, a line that leads out of reach InvalidArgument, and nothing moves (what was
-        under way has been stopped by then). A joint that is measured outside all the same ends the move. Nobody looks
-        for singularities, how fast joints turn near them, the arm itself or anything else that is in the way.
+        Before the move starts, the controller computes the joint angles along the line, every 5 cm and 0.2 rad. A joint
+        that would leave its range raises LimitExceeded, a line out of reach InvalidArgument. Then nothing moves, and
+        any previous motion has been stopped. A joint measured outside its range ends the move. Singularities, joint
+        speeds near them, and collisions with the arm or with obstacles are not checked.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_to_pose(self, name: str, speed_rad_s: Speed | None = None) -> list[float]:
-        """``move_joints`` to a pose of limits(); InvalidArgument names those there are."""
+        """Moves to a named pose of limits(), as ``move_joints`` does; InvalidArgument lists the names."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def servo(self, positions_rad: Angles, valid_s: Valid = 0.2) -> None:
-        """Follow angles that are given again and again: each holds for ``valid_s`` seconds, then the arm stops.
+        """Follows a stream of angles: each set-point is valid for ``valid_s`` seconds, then the arm stops.
 
-        Every joint goes for its own within limits() of speed and acceleration; returns once the controller was told.
+        Each joint moves to its own goal within the speed and acceleration of limits(). Returns once it is sent.
         """
 
     @service(effect="actuate", cancel="stop")
     def follow(self, trajectory: Trajectory, tolerances: Tolerances | None = None) -> list[float]:
-        """Go through angles at given times, as ``JointGroup.follow`` does; its joints are named as in limits()."""
+        """Follows a trajectory of angles, as ``JointGroup.follow`` does; joints are named as in limits()."""
         return self.stream(planned(trajectory, tolerances or Tolerances(), self.limits().joints))
 
     @abstractmethod
     def stream(self, plan: Plan) -> list[float]:
-        """Carry out what follow() has checked; no service. As ``JointGroup.stream``."""
+        """Executes a plan that follow() has checked; not a service. See ``JointGroup.stream``."""
 
     @service(effect="stop")
     @abstractmethod
     def stop(self) -> None:
-        """End any motion, program and freedrive, and hold; returns once at rest. Earlier commands are dropped.
+        """Ends any motion, program and freedrive, holds, and returns once at rest. Earlier commands are dropped.
 
         Raises:
-            DeviceSilent: told to stop, but nobody heard whether it did.
-            DeviceFault: told to stop, but it is still moving.
+            DeviceSilent: the stop was sent, but the arm did not report whether it is at rest.
+            DeviceFault: the stop was sent, but the arm is still moving.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def freedrive(self, on: bool) -> None:
-        """Let it be moved by hand, until this is called with False, it is stopped, or the caller's session ends."""
+        """Lets people move the arm by hand until a call with False, a stop, or the end of the caller's session."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def set_speed_scaling(self, fraction: Fraction) -> None:
-        """Have motions carried out slower, also the one under way.
+        """Scales the speed of motions down, including the current one.
 
-        A trajectory does not wait for the arm: it ends with ``ToleranceExceeded`` if the arm falls behind too far.
+        A trajectory does not wait for the arm: it ends with ``ToleranceExceeded`` if the arm falls too far behind.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def unlock_protective_stop(self) -> None:
-        """End a protective stop, once somebody has looked at its cause; nothing moves.
+        """Ends a protective stop after a person has examined its cause; nothing moves.
 
         Raises:
-            DeviceFault: there is none, or it is too early: its controller wants some seconds to pass.
+            DeviceFault: there is no protective stop, or it is too recent: the controller requires a few seconds.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def power_on(self) -> None:
-        """Switch the arm's power on and wait for it; its brakes stay on. No other service does it."""
+        """Switches the arm's power on and waits for it; the brakes stay on. No other service does this."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def release_brakes(self) -> None:
-        """Release the brakes of a powered arm and wait until it holds itself; its joints move a little.
+        """Releases the brakes of a powered arm and waits until it holds itself; its joints move slightly.
 
         Raises:
-            DeviceFault: its power is off, or it is stopped by its safety system.
+            DeviceFault: the power is off, or the safety system has stopped the arm.
         """

@@ -1,4 +1,4 @@
-"""What a motor, a group of joints and a gripper can do, in SI units, whoever built them."""
+"""The vendor-neutral interfaces of motors, joint groups and grippers, in SI units."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -16,57 +16,57 @@ __all__ = ["Gripper", "GripperLimits", "GripperState", "JointGroup", "JointLimit
 
 
 class MotorState(Struct, frozen=True, kw_only=True):
-    """What was last measured at one joint."""
+    """The newest measurement of one joint."""
 
     name: str
     """The joint, such as ``rosie.neck.pan``."""
     position_rad: float
     velocity_rad_s: float
     load: float
-    """Effort as a fraction of the most the motor can give, -1 to 1; negative in the negative direction of the joint."""
+    """Effort as a fraction of the motor's maximum, -1 to 1; negative in the negative direction of the joint."""
     temperature_c: float | None
-    """None: the device does not tell."""
+    """None if the device does not report it."""
     voltage_v: float | None
-    """None: the device does not tell."""
+    """None if the device does not report it."""
     enabled: bool
-    """Torque is on: the joint holds or moves; False: it can be turned by hand."""
+    """True if torque is on: the joint holds or moves. False: it can be turned by hand."""
     moving: bool
     fault: str = ""
-    """Why it refuses to move until it is enabled again; empty if it does not."""
+    """Why the joint refuses to move until it is enabled again; empty if it does not."""
     measured_at: float
-    """When position, velocity and load were read: ``time.monotonic()`` of the driver's process."""
+    """When the driver measured position, velocity and load: ``time.monotonic()`` of its process."""
     age_s: float
-    """How long ago that was."""
+    """Age of the measurement."""
 
 
 class GripperState(Struct, frozen=True, kw_only=True):
-    """What was last measured at one gripper."""
+    """The newest measurement of one gripper."""
 
     name: str
     """The gripper, such as ``rosie.left.hand``."""
     width_m: float
-    """Between the fingers."""
+    """Distance between the fingers."""
     speed_m_s: float
-    """How fast the width changes; negative when it closes."""
+    """Rate of change of the width; negative while closing."""
     force_n: float
-    """The force it was last told to grip with; no gripper known here measures it."""
+    """The last commanded grip force; no supported gripper measures the force."""
     current_a: float
-    """Of its motor."""
+    """Current of the motor."""
     holding: Literal["", "outside", "inside"]
-    """An object was met: between the fingers, which close on it, or around them. Empty: none, or it was lost."""
+    """Where an object is held: between the fingers, or around them. Empty: none was found, or it was lost."""
     activated: bool
-    """Its fingers have found their stops; without that it cannot be moved."""
+    """True if the fingers have found their end stops; before that, the gripper cannot move."""
     moving: bool
     fault: str = ""
-    """Why it refuses to move; empty if it does not."""
+    """Why the gripper refuses to move; empty if it does not."""
     measured_at: float
-    """When all this was read: ``time.monotonic()`` of the driver's process."""
+    """When the driver measured this: ``time.monotonic()`` of its process."""
     age_s: float
-    """How long ago that was."""
+    """Age of the measurement."""
 
 
 class GripperLimits(Struct, frozen=True, kw_only=True):
-    """What a gripper may be told, from the robot file and the device."""
+    """The limits for commands to a gripper, from the robot file and the device."""
 
     name: str
     min_width_m: float
@@ -79,33 +79,33 @@ class GripperLimits(Struct, frozen=True, kw_only=True):
 
 Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
 Members = Mapping[str, Sequence[str]]
-Velocity = Annotated[float, Meta(description="speed in rad/s with the joint's sign, within limits(); 0 stands still")]
-Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds after which it ends unless it is renewed")]
-Speed = Annotated[float, Meta(gt=0, description="greatest speed in rad/s; by default the joint's limit")]
+Velocity = Annotated[float, Meta(description="speed in rad/s with the joint's sign, within limits(); 0 holds still")]
+Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds until it expires unless it is renewed")]
+Speed = Annotated[float, Meta(gt=0, description="maximum speed in rad/s; by default the joint's limit")]
 
 
 class Lockable(ABC):
-    """A device that locks, fences and stops attach to."""
+    """A device that locks, fences and stops apply to."""
 
     members: Members = MappingProxyType({})
-    """Who belongs to the groups of its robot, from the robot file; a lock over a group is one over all of them."""
+    """The joints of each group of the robot, from the robot file; a lock of a group is a lock of all its joints."""
 
     @property
     @abstractmethod
     def resources(self) -> tuple[Resource, ...]:
-        """One, with the name of the device; a group has those of its joints, each the same object as its motor's."""
+        """The device's resource, named after it; a group returns the resource objects of its joints' motors."""
 
 
 class Motor(Lockable):
     """One joint with a position drive.
 
-    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
+    Every service raises ``DeviceSilent`` instead of using outdated values if the device has not answered for too long.
     """
 
     @service(effect="read")
     @abstractmethod
     def state(self) -> MotorState:
-        """Position, velocity, load, health and the time of their measurement.
+        """Returns position, velocity, load and health, with the time of measurement.
 
         Raises:
             DeviceSilent: the newest measurement is older than the bus allows.
@@ -114,54 +114,55 @@ class Motor(Lockable):
     @service(effect="read")
     @abstractmethod
     def limits(self) -> JointLimits:
-        """The range, speed and acceleration this joint may be commanded."""
+        """Returns the limits for commands to this joint: range, speed and acceleration."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_to(self, position_rad: Position, speed_rad_s: Speed | None = None) -> float:
-        """Move to an angle and return, once at rest there, the angle measured; a relaxed joint is enabled first.
+        """Moves to an angle and returns the measured angle once at rest; enables a relaxed joint first.
 
         Raises:
-            LimitExceeded: outside of limits(); nothing was sent. Moving back inside is allowed from outside.
-            InvalidArgument: not a finite number.
-            MotionStopped: stop(), another move, or the call's deadline came first; the joint was stopped. For its
-                deadline a move ends up to 0.1 s early, so that this answer is still in time.
-            DeviceFault: the device reports a fault, or it does not move; it was told to hold.
+            LimitExceeded: outside limits(); nothing was sent. A joint outside its range may move back inside.
+            InvalidArgument: the value is not a finite number.
+            MotionStopped: stop(), another move, or the call's deadline ended the move; the joint was stopped. A move
+                ends up to 0.1 s before its deadline, so that this answer still arrives in time.
+            DeviceFault: the device reports a fault, or the joint does not move; the driver commanded it to hold.
             DeviceSilent: the device does not answer.
-            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+            DeadlineExceeded: the deadline passed before anything was sent; the command will not run.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def set_velocity(self, velocity_rad_s: Velocity, valid_s: Valid = 0.2) -> None:
-        """Turn at a speed for ``valid_s`` seconds, then ramp to a stop, unless it is called again before.
+        """Turns at a speed for ``valid_s`` seconds, then ramps to a stop unless it is called again before.
 
-        Returns once the device was told; a relaxed joint is enabled first. The joint brakes before it comes to the end
-        of its range and stands there. A call that is refused renews nothing.
+        Enables a relaxed joint first, and returns once the command is sent. The joint brakes before the end of its
+        range and stops there. A refused call renews nothing.
 
         Raises:
-            LimitExceeded: faster or slower than limits() and the device allow, or outwards from outside the range.
-            InvalidArgument: not a finite number, or a time that is none.
+            LimitExceeded: the speed is outside limits() or the device's range, or moves a joint that is outside its
+                range further out.
+            InvalidArgument: the speed is not a finite number, or ``valid_s`` is out of range.
             MotionStopped, DeviceFault, DeviceSilent, DeadlineExceeded: as with move_to().
         """
 
     @service(effect="stop")
     @abstractmethod
     def stop(self) -> None:
-        """End any motion and hold; returns once the joint is at rest. Commands admitted earlier are dropped.
+        """Ends any motion, holds, and returns once the joint is at rest. Earlier commands are dropped.
 
         Raises:
-            DeviceSilent: told to stop, but nobody heard whether it did.
-            DeviceFault: told to stop, but it is still moving.
+            DeviceSilent: the stop was sent, but the joint did not report whether it is at rest.
+            DeviceFault: the stop was sent, but the joint is still moving.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def enable(self) -> None:
-        """Switch torque on, holding where the joint is; clears an expired watchdog and the latched fault.
+        """Switches torque on at the measured position; clears a latched fault and an expired watchdog.
 
         Raises:
-            DeviceFault: the device has a hardware error or refuses.
+            DeviceFault: the device has a hardware error or refuses the command.
             DeviceSilent: the device does not answer.
             DeadlineExceeded: the deadline passed before torque was on.
         """
@@ -169,7 +170,7 @@ class Motor(Lockable):
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def relax(self) -> None:
-        """Switch torque off: the joint can be turned by hand, and falls if something pulls it.
+        """Switches torque off: the joint can be turned by hand, and falls under load.
 
         Raises:
             DeviceSilent: the device does not answer.
@@ -178,113 +179,113 @@ class Motor(Lockable):
 
 
 class JointGroup(Lockable):
-    """Joints that are commanded together; values are in the order of ``joints()``. Errors are those of ``Motor``."""
+    """Joints that are commanded together, with values in the order of ``joints()``. Errors are those of ``Motor``."""
 
     @service(effect="read")
     @abstractmethod
     def joints(self) -> list[str]:
-        """The names of the joints, in the order of all values."""
+        """Returns the names of the joints, in the order of all values."""
 
     @service(effect="read")
     @abstractmethod
     def state(self) -> list[MotorState]:
-        """The state of every joint; one silent joint makes it an error."""
+        """Returns the state of each joint; raises an error if one of them is offline."""
 
     @service(effect="read")
     @abstractmethod
     def limits(self) -> list[JointLimits]:
-        """The limits of every joint."""
+        """Returns the limits of each joint."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_to(self, positions_rad: list[Position], speed_rad_s: Speed | None = None) -> list[float]:
-        """Move all joints so that they start together and arrive together; the angles measured at rest.
+        """Moves all joints so that they start and arrive together, and returns the angles measured at rest.
 
-        ``speed_rad_s`` bounds every joint. If one is refused, stopped, faulty or silent, all are stopped.
+        ``speed_rad_s`` limits each joint. If one is refused, stopped, faulty or offline, all are stopped.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def servo(self, positions_rad: list[Position], valid_s: Valid = 0.2) -> None:
-        """Follow positions that are given again and again: each holds for ``valid_s`` seconds, then all joints stop.
+        """Follows a stream of positions: each set-point is valid for ``valid_s`` seconds, then all joints stop.
 
-        Every joint goes for its own at its limits of speed and acceleration; returns once the devices were told.
+        Each joint moves to its own goal at its limits of speed and acceleration. Returns once it is sent.
         """
 
     @service(effect="actuate", cancel="stop")
     def follow(self, trajectory: Trajectory, tolerances: Tolerances | None = None) -> list[float]:
-        """Go through angles at given times and return, once at rest at the last, the angles measured.
+        """Follows a trajectory and returns the measured angles once at rest at its end.
 
-        All of it is checked before anything is sent; relaxed joints are enabled first. The driver's own thread sends
-        what is due in each of its cycles: nothing is asked of the caller meanwhile, but it must live. Cancelled, it
-        stops. Another move of a joint takes over at once: this call ends with ``MotionStopped``, and the joints that
-        are left hold. A trajectory that is to take over from another one smoothly begins with the angles and
-        velocities of that moment. Its progress is a ``FollowProgress``.
+        The driver checks the whole trajectory before it sends anything, and enables relaxed joints first. In each
+        cycle, the bus thread sends the set-points that are due. The motion ends if the caller dies or cancels it.
+        Another move of a joint takes over immediately: this call ends with ``MotionStopped``, and the other joints
+        hold. To take over in motion, start the new trajectory with the current angles and velocities. The call's
+        progress is a ``FollowProgress``.
 
         Args:
             trajectory: angles in rad and, if given, speeds in rad/s over time in seconds.
-            tolerances: how far from it the joints may be; by default those of ``Tolerances``.
+            tolerances: how far the joints may be off; by default those of ``Tolerances``.
 
         Raises:
-            LimitExceeded: an angle, speed or acceleration is beyond limits(), also between the points; nothing was
-                sent. It may begin outside of the range of a joint that stands there, and come back in.
-            InvalidArgument: other joints, times that do not rise, no end at rest, numbers that are not finite, or more
-                time than its call has; nothing was sent.
-            ToleranceExceeded: a joint is not where the trajectory begins; or it left it on the way, or did not come to
-                rest at its end: then all hold.
-            ConfigurationError: its bus is too slow for that kind of device; nothing was sent.
+            LimitExceeded: an angle, speed or acceleration is outside limits(), also between the points; nothing was
+                sent. A joint that is outside its range may begin there and move back inside.
+            InvalidArgument: other joints, times that do not increase, no rest at the end, non-finite numbers, or more
+                time than the call's deadline leaves; nothing was sent.
+            ToleranceExceeded: a joint is not where the trajectory begins, left it, or did not come to rest at its end;
+                all joints hold.
+            ConfigurationError: the bus is too slow for trajectories of its devices; nothing was sent.
             MotionStopped, DeviceFault, DeviceSilent, DeadlineExceeded: as with a motor's move_to().
         """
         return self.stream(planned(trajectory, tolerances or Tolerances(), self.limits()))
 
     @abstractmethod
     def stream(self, plan: Plan) -> list[float]:
-        """Carry out what follow() has checked; no service. For drivers:
+        """Executes a plan that follow() has checked; not a service. A driver does this:
 
-        - enable what is relaxed, see that each joint is within ``start_rad`` of ``curve.at(0)``, and take over from
-          whatever moves them, holding there; then call ``plan.course.ready(now_ns)``;
-        - in every cycle, after the permit's gate, send what is due at ``plan.course.elapsed_s(now_ns)``, which stays
+        - enable relaxed joints, check that each joint is within ``start_rad`` of ``curve.at(0)``, end any other motion
+          of them, and hold; then call ``plan.course.ready(now_ns)``;
+        - in each cycle, after the permit's gate, send the set-points for ``plan.course.elapsed_s(now_ns)``, which stays
           below zero until all buses are ready;
-        - in every cycle, look whether ``plan.course.failed`` is set, a joint is farther off than ``path_rad``, or more
-          than 0.2 s have passed since the cycle before: then hold, and raise;
-        - tell ``plan.course.note(joint, error_rad)``, and call ``plan.course.report(now_ns)`` several times a second on
+        - in each cycle, hold and raise if ``plan.course.failed`` is set, a joint is farther off than ``path_rad``, or
+          the previous cycle was more than 0.2 s ago;
+        - call ``plan.course.note(joint, error_rad)``, and call ``plan.course.report(now_ns)`` several times a second on
           the thread of the service;
-        - return the angles at rest, or raise as follow() says.
+        - return the angles at rest, or raise the errors of follow().
         """
 
     @service(effect="stop")
     @abstractmethod
     def stop(self) -> None:
-        """End the motion of every joint and hold; returns once all are at rest."""
+        """Ends the motion of all joints, holds, and returns once all are at rest."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def enable(self) -> None:
-        """Switch the torque of every joint on, holding where they are."""
+        """Switches the torque of all joints on at their measured positions."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def relax(self) -> None:
-        """Switch the torque of every joint off."""
+        """Switches the torque of all joints off."""
 
 
-Width = Annotated[float, Meta(description="between the fingers in m, within limits()")]
+Width = Annotated[float, Meta(description="distance between the fingers in m, within limits()")]
 FingerSpeed = Annotated[
-    float, Meta(gt=0, description="of the fingers in m/s, within limits(); by default the greatest")
+    float, Meta(gt=0, description="speed of the fingers in m/s, within limits(); by default the maximum")
 ]
-Force = Annotated[float, Meta(gt=0, description="to grip with in N, within limits(); by default the greatest")]
+Force = Annotated[float, Meta(gt=0, description="grip force in N, within limits(); by default the maximum")]
 
 
 class Gripper(Lockable):
     """One gripper with two fingers that move together.
 
-    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
+    Every service raises ``DeviceSilent`` instead of using outdated values if the device has not answered for too long.
     """
 
     @service(effect="read")
     @abstractmethod
     def state(self) -> GripperState:
-        """Width, what is held, health and the time of their measurement.
+        """Returns width, held object and health, with the time of measurement.
 
         Raises:
             DeviceSilent: the newest measurement is older than the bus allows.
@@ -293,20 +294,21 @@ class Gripper(Lockable):
     @service(effect="read")
     @abstractmethod
     def limits(self) -> GripperLimits:
-        """The range, speeds and forces this gripper may be commanded."""
+        """Returns the limits for commands to this gripper: range, speeds and forces."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def activate(self) -> GripperState:
-        """Have the fingers find their stops, by moving all the way: what they hold falls. Never done by itself.
+        """Moves the fingers through their whole range to find their end stops: a held object falls.
 
-        Clears the fault of the device. A gripper that is activated and has no fault is left as it is.
+        Clears the device's fault. No driver activates a gripper by itself. Does nothing to one that is activated and
+        has no fault.
 
         Raises:
-            MotionStopped: stop(), or the call's deadline came first; it is not activated.
-            DeviceFault: it did not succeed; the fault says why.
+            MotionStopped: stop() or the call's deadline ended the activation; the gripper is not activated.
+            DeviceFault: the activation failed; the fault says why.
             DeviceSilent: the device does not answer.
-            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+            DeadlineExceeded: the deadline passed before anything was sent; the command will not run.
         """
 
     @service(effect="actuate", cancel="stop")
@@ -314,49 +316,49 @@ class Gripper(Lockable):
     def move_to(
         self, width_m: Width, speed_m_s: FingerSpeed | None = None, force_n: Force | None = None
     ) -> GripperState:
-        """Move the fingers until they are at rest there, or hold something; whether they do is in the answer.
+        """Moves the fingers until they are at rest at this width or hold an object; the result says which.
 
-        The gripper goes on pressing on what it holds, and follows it, until it is moved or stopped.
+        The gripper keeps pressing on a held object, and follows it, until it is moved or stopped.
 
         Raises:
-            LimitExceeded: outside of limits(); nothing was sent.
-            InvalidArgument: not a finite number.
-            MotionStopped: stop(), another move, or the call's deadline came first; the fingers were stopped. For its
-                deadline a move ends up to 0.1 s early, so that this answer is still in time.
-            DeviceFault: not activated, a fault, or the fingers do not move; they were told to stop.
+            LimitExceeded: outside limits(); nothing was sent.
+            InvalidArgument: a value is not a finite number.
+            MotionStopped: stop(), another move, or the call's deadline ended the move; the fingers were stopped. A
+                move ends up to 0.1 s before its deadline, so that this answer still arrives in time.
+            DeviceFault: the gripper is not activated or has a fault, or its fingers do not move; they were stopped.
             DeviceSilent: the device does not answer.
-            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+            DeadlineExceeded: the deadline passed before anything was sent; the command will not run.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def open(self, speed_m_s: FingerSpeed | None = None) -> GripperState:
-        """``move_to`` the greatest width; what is held is let go of."""
+        """Opens to the maximum width, as ``move_to`` does; releases a held object."""
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def close(self, speed_m_s: FingerSpeed | None = None, force_n: Force | None = None) -> GripperState:
-        """``move_to`` the least width: grip what is between the fingers."""
+        """Closes to the minimum width, as ``move_to`` does: grips an object between the fingers."""
 
     @service(effect="stop")
     @abstractmethod
     def stop(self) -> None:
-        """End any motion, activation too; returns once the fingers are at rest. Commands admitted earlier are dropped.
+        """Ends any motion or activation and returns once the fingers are at rest. Earlier commands are dropped.
 
-        From here on the fingers stand: they do not follow what they hold any more.
+        The fingers then keep their position: they no longer follow a held object.
 
         Raises:
-            DeviceSilent: told to stop, but nobody heard whether it did.
-            DeviceFault: told to stop, but it is still moving.
+            DeviceSilent: the stop was sent, but the gripper did not report whether it is at rest.
+            DeviceFault: the stop was sent, but the gripper is still moving.
         """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def clear_fault(self) -> None:
-        """Reset the device: its faults are cleared, nothing moves, and it has to be activated again.
+        """Resets the device: clears its faults without motion; it must be activated again afterwards.
 
         Raises:
-            DeviceFault: the fault is still there.
+            DeviceFault: the fault persists.
             DeviceSilent: the device does not answer.
             DeadlineExceeded: the deadline passed before it was sent.
         """

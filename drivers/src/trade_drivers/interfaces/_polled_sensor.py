@@ -1,4 +1,4 @@
-"""A sensor that is asked again and again by a thread of its own; a driver says how it is asked."""
+"""A base class for sensors that a thread of their own polls; a driver implements the request."""
 
 import logging
 import threading
@@ -19,7 +19,7 @@ _END_S: Final = 5.0
 
 
 class Measured(NamedTuple):
-    """What a driver has just measured."""
+    """A measurement by the driver."""
 
     value: float | list[float]
     quality: Literal["good", "doubtful"] = "good"
@@ -29,14 +29,14 @@ _Polled = TypeVar("_Polled", bound="PolledSensor")
 
 
 class PolledSensor(Sensor):
-    """A sensor whose thread owns its wire: services have the newest reading and never touch the wire.
+    """A sensor whose thread owns the port: services return the newest reading and never access the port.
 
-    Whatever ``open`` or ``measure`` raises, the wire is let go of, and taken again 0.1 to 1 s later.
+    If ``open`` or ``measure`` raises any exception, the port is closed and reopened 0.1 to 1 s later.
 
     Args:
-        info: what it measures, and how often.
-        port: where it is, for messages.
-        stale_after_s: a measurement older than this is an error, not a number.
+        info: the sensor's unit, range and rate.
+        port: the port, for messages.
+        stale_after_s: the age from which a measurement is an error.
     """
 
     def __init__(self, info: SensorInfo, port: str, *, stale_after_s: float = 1.0) -> None:
@@ -45,27 +45,27 @@ class PolledSensor(Sensor):
         self._stale_after_s = stale_after_s
         self._newest: tuple[Measured, int] | None = None
         self._gone = ""
-        """Why the wire is not open; empty if it is."""
+        """Why the port is not open; empty if it is."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"sensor {info.name}", daemon=True)
 
     @abstractmethod
     def open(self) -> None:
-        """Take the wire, for this process alone; OSError or ValueError if it cannot be had."""
+        """Opens the port for exclusive use; raises OSError or ValueError if it cannot be opened."""
 
     @abstractmethod
     def measure(self) -> Measured:
-        """Ask once and wait for less than a second; OSError or ValueError if no answer comes, or a wrong one."""
+        """Measures once within a second; raises OSError or ValueError for no answer or a wrong one."""
 
     @abstractmethod
     def hang_up(self) -> None:
-        """Let go of the wire; more than once is fine, and also when it was never taken."""
+        """Closes the port; may be called repeatedly, and before it was ever opened."""
 
     def start(self: _Polled, where: str) -> _Polled:
-        """Measure once, then go on in the thread.
+        """Measures once, then starts the polling thread.
 
         Raises:
-            ConfigurationError: it cannot be measured, with ``where`` as the place.
+            ConfigurationError: the first measurement failed; the message names ``where``.
         """
         try:
             self.open()
@@ -119,7 +119,7 @@ class PolledSensor(Sensor):
                     due, wait_s, is_well = max(due + 1 / self._info.rate_hz, time.monotonic()), _REOPEN_FIRST_S, True
                 except Exception as bad:  # noqa: BLE001 - whatever a library raises: it is silent until it is back
                     if is_well:
-                        _log.warning("%s on %s: %s; it is asked again", self._info.name, self.port, _text(bad))
+                        _log.warning("%s on %s: %s; retrying", self._info.name, self.port, _text(bad))
                     self._gone = "" if is_open else _text(bad)
                     is_open = is_well = False
                     self.hang_up()

@@ -1,4 +1,4 @@
-"""What a camera and a sensor can do, whoever built them. They look and measure; nothing of them moves."""
+"""The vendor-neutral interfaces of cameras and sensors. They only observe; they move nothing."""
 
 from abc import ABC, abstractmethod
 from typing import Final, Literal
@@ -10,7 +10,7 @@ from trade import service
 __all__ = ["UNITS", "Camera", "CameraInfo", "Image", "ImageFormat", "Reading", "Sensor", "SensorInfo"]
 
 ImageFormat = Literal["jpeg", "png", "rgb8", "mono8"]
-"""A whole file, or raw pixels row by row from the upper left, three bytes each (red, green, blue) or one."""
+"""A complete file, or raw pixels row by row from the upper left, of three bytes (red, green, blue) or one."""
 
 UNITS: Final = frozenset(
     {
@@ -19,11 +19,11 @@ UNITS: Final = frozenset(
         *("A", "V", "W", "J", "C", "T", "lx", "kg/m3"),
     }
 )
-"""What readings are in: SI, with angles in rad, degC for the degree Celsius and 1 for fractions and counts."""
+"""Units of readings: SI, with angles in rad, degC for degrees Celsius and 1 for fractions and counts."""
 
 
 class Image(Struct, frozen=True, kw_only=True):
-    """What a camera has seen."""
+    """One picture of a camera."""
 
     name: str
     """The camera, such as ``rosie.eye``."""
@@ -33,99 +33,99 @@ class Image(Struct, frozen=True, kw_only=True):
     width_px: int
     height_px: int
     stamp_ns: int
-    """When it was captured: ``time.monotonic_ns()`` of the driver's process. If the camera does not tell, when it was
-    asked."""
+    """Time of capture: ``time.monotonic_ns()`` of the driver's process. If the camera does not report it, the time of
+    the request."""
     age_s: float
-    """How long ago that was."""
+    """Age of the value."""
 
 
 class CameraInfo(Struct, frozen=True, kw_only=True):
-    """What a camera delivers."""
+    """The properties of a camera's images."""
 
     name: str
     model: str
-    """As the device says it; empty if it does not."""
+    """As the device reports it; empty if it does not."""
     format: ImageFormat
     width_px: int
     height_px: int
 
 
 class Reading(Struct, frozen=True, kw_only=True):
-    """What a sensor has measured."""
+    """One measurement of a sensor."""
 
     name: str
     """The sensor, such as ``rosie.oven.temperature``."""
     value: float | list[float]
-    """One number, or a vector with as many as info() says."""
+    """One number, or a vector of the size in info()."""
     unit: str
-    """Of each number; one of ``UNITS``."""
+    """Unit of each number; one of ``UNITS``."""
     stamp_ns: int
-    """When it was measured: ``time.monotonic_ns()`` of the driver's process. If the sensor does not tell, when it was
-    asked."""
+    """Time of measurement: ``time.monotonic_ns()`` of the driver's process. If the sensor does not report it, the time
+    of the request."""
     age_s: float
-    """How long ago that was."""
+    """Age of the value."""
     quality: Literal["good", "doubtful"] = "good"
-    """``doubtful``: the device itself does not vouch for it: it is warming up, or outside of what it can measure."""
+    """``doubtful``: the device itself does not trust the value, as it is warming up or outside its range."""
 
 
 class SensorInfo(Struct, frozen=True, kw_only=True):
-    """What a sensor measures."""
+    """The properties of a sensor's readings."""
 
     name: str
     model: str
-    """As the device says it; empty if it does not."""
+    """As the device reports it; empty if it does not."""
     unit: str
     """One of ``UNITS``."""
     size: int
-    """0: a value is one number; else a vector of so many."""
+    """0: a value is one number; otherwise the length of the vector."""
     low: float
-    """The least it can measure, in its unit."""
+    """Lower end of the range, in the sensor's unit."""
     high: float
-    """The most."""
+    """Upper end of the range."""
     rate_hz: float
-    """So often it is measured."""
+    """Measurements per second."""
 
 
 class Camera(ABC):
-    """A camera. Asking for images moves nothing and sets nothing; any number of callers may at the same time."""
+    """A camera. Requesting an image moves and sets nothing; any number of clients may do so at the same time."""
 
     @service(effect="read")
     @abstractmethod
     def image(self) -> Image:
-        """What it sees: captured for this call, or so recently that its driver vouches for it.
+        """Returns an image, captured for this call or recent enough for the driver to trust.
 
         Raises:
-            DeviceSilent: it does not answer, or its newest image is too old.
-            DeviceFault: it answers with an error, or with what is no image.
+            DeviceSilent: the camera does not answer, or its newest image is too old.
+            DeviceFault: the camera answers with an error, or with something other than an image.
         """
 
     @service(effect="read")
     @abstractmethod
     def info(self) -> CameraInfo:
-        """What its images are like."""
+        """Returns the format and size of all images."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the device; no service. More than once is fine."""
+        """Closes the device; not a service. May be called repeatedly."""
 
 
 class Sensor(ABC):
-    """A sensor. Reading it moves nothing and sets nothing; any number of callers may at the same time."""
+    """A sensor. Reading it moves and sets nothing; any number of clients may do so at the same time."""
 
     @service(effect="read")
     @abstractmethod
     def read(self) -> Reading:
-        """What was measured last.
+        """Returns the newest measurement.
 
         Raises:
-            DeviceSilent: that was too long ago: an old value is no value.
+            DeviceSilent: the newest measurement is too old.
         """
 
     @service(effect="read")
     @abstractmethod
     def info(self) -> SensorInfo:
-        """What it measures."""
+        """Returns the unit, vector length, range and rate."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the device; no service. More than once is fine."""
+        """Closes the device; not a service. May be called repeatedly."""

@@ -1,4 +1,4 @@
-"""Trajectories: what a caller gives, and what of it is refused before anything is sent."""
+"""Trajectories, and their validation before anything is sent."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -18,35 +18,35 @@ _ROUNDING = 1e-6
 
 
 class TrajectoryPoint(Struct, frozen=True, kw_only=True):
-    """Where all joints are at one moment."""
+    """The positions of all joints at one time."""
 
     time_from_start_s: float
-    """0 at the first point, and greater at each one that follows."""
+    """0 at the first point; increases from point to point."""
     positions_rad: list[float]
-    """In the order of the trajectory's joints."""
+    """In the order of the trajectory's ``joints``."""
     velocities_rad_s: list[float] | None = None
-    """In the same order; at every point or at none."""
+    """In the same order; given at all points or at none."""
 
 
 class Trajectory(Struct, frozen=True, kw_only=True):
     """Angles over time.
 
-    Between two points each joint goes along the cubic curve that has the angles and speeds of both. Without velocities
-    the trajectory begins and ends at rest, and the speeds in between are chosen such that no point is overshot.
+    Between two points, each joint follows the cubic curve with the angles and speeds of both. Without velocities, the
+    trajectory begins and ends at rest, and the driver chooses intermediate speeds so that no point is overshot.
     """
 
     joints: list[str]
-    """Their full names (``rosie.neck.pan``): all of the group's, in any order."""
+    """Full names (``rosie.neck.pan``) of all joints of the group, in any order."""
     points: list[TrajectoryPoint]
-    """At least two. The first is where the joints are, the last is at rest."""
+    """At least two points. The first is the current position of the joints; the last is at rest."""
 
 
 def planned(trajectory: Trajectory, tolerances: Tolerances, limits: Sequence[JointLimits]) -> Plan:
-    """The plan of a trajectory, its joints in the order of the limits.
+    """Returns the plan of a trajectory, with its joints in the order of the limits.
 
     Raises:
-        InvalidArgument: it is no trajectory of these joints, or it lasts beyond the deadline of the call.
-        LimitExceeded: an angle, speed or acceleration on the way is beyond its joint's limits.
+        InvalidArgument: the trajectory is not valid for these joints, or lasts beyond the deadline of the call.
+        LimitExceeded: an angle, speed or acceleration is outside its joint's limits.
     """
     call = current_call()
     service = "follow" if call is None else call.service
@@ -67,12 +67,12 @@ def planned(trajectory: Trajectory, tolerances: Tolerances, limits: Sequence[Joi
 
 
 def checked(tracks: Sequence[Track], tolerances: Tolerances) -> Plan:
-    """A plan whose tracks keep the limits of their joints.
+    """Returns a plan after checking that its tracks keep the limits of their joints.
 
-    A track may begin outside of its joint's range, if it comes back in and never goes farther out.
+    A track may begin outside its joint's range if it moves back inside and never further out.
 
     Raises:
-        LimitExceeded: one does not.
+        LimitExceeded: a track exceeds a limit.
     """
     for limits, curve in tracks:
         ends = (limits.min_rad, limits.max_rad)
@@ -99,7 +99,7 @@ def _keep(joint: str, what: str, unit: str, values: Sequence[tuple[float, float]
 
 def _order(trajectory: Trajectory, joints: Sequence[str], service: str) -> list[int]:
     if sorted(trajectory.joints) != sorted(joints):
-        problem = f"is for {', '.join(trajectory.joints) or 'no joints'}; it takes one for {', '.join(joints)}"
+        problem = f"is for {', '.join(trajectory.joints) or 'no joints'}; it must be for {', '.join(joints)}"
         raise InvalidArgument(service=service, argument="trajectory.joints", problem=problem)
     return [trajectory.joints.index(joint) for joint in joints]
 
@@ -111,10 +111,10 @@ def _times(trajectory: Trajectory, service: str) -> list[float]:
     if len(times) < 2:
         problem = f"there are {len(times)} points; a trajectory has at least two"
     elif times[0] != 0:
-        problem = f"the first is {times[0]:g}; it must be 0, with the joints where they are"
+        problem = f"the first is {times[0]:g}; it must be 0, at the current position of the joints"
     else:
         late = [(before, after) for before, after in pairwise(times) if not after > before]
-        problem = f"{late[0][1]:g} comes after {late[0][0]:g}; times must rise" if late else ""
+        problem = f"{late[0][1]:g} comes after {late[0][0]:g}; times must increase" if late else ""
     if problem:
         raise InvalidArgument(service=service, argument=argument, problem=problem)
     return times
@@ -128,9 +128,9 @@ def _velocities(trajectory: Trajectory, service: str) -> list[list[float]] | Non
         return None
     problem = ""
     if len(rows) < len(given):
-        problem = f"{len(rows)} of {len(given)} points have them; give them at every point or at none"
+        problem = f"{len(rows)} of {len(given)} points have velocities; give them at all points or at none"
     elif any(rows[-1]):
-        problem = f"the last are {rows[-1]}; a trajectory ends at rest"
+        problem = f"the last velocities are {rows[-1]}; a trajectory must end at rest"
     if problem:
         raise InvalidArgument(service=service, argument=argument, problem=problem)
     return rows
