@@ -1,4 +1,4 @@
-"""What has been wrong with the devices of a robot: noticed by bus threads, kept by one log, told as services."""
+"""Faults of a robot's devices: detected by bus threads, kept in one log, exposed as services."""
 
 from trade_drivers.faults._fault_poller import FaultPoller
 from trade_drivers.faults._log import FaultLog

@@ -1,4 +1,4 @@
-"""Takes what bus threads notice, remembers what devices measured lately, and tells the log of both."""
+"""Collects faults from bus threads and recent measurements of devices, and passes both to the log."""
 
 import queue
 import threading
@@ -19,41 +19,41 @@ __all__ = ["FaultPoller"]
 
 _EVERY_S: Final = 0.04
 _KEPT: Final = 50
-"""Measurements of each device: those of two seconds."""
+"""Number of measurements kept for each device: two seconds of them."""
 _END_S: Final = 5.0
 _END: Final = Trouble("", "fault", 0.0, 0.0)
-"""Nothing is told after it."""
+"""The last item of the queue."""
 _MEASURING: Final = (Motor, Gripper, Arm, Sensor)
 
 
 class FaultPoller:
-    """A thread for the devices of one robot; it has the time to wait that bus threads have not.
+    """A thread for the devices of one robot; unlike bus threads, it may wait.
 
     Args:
-        log: is told of every fault that begins or ends.
+        log: receives each fault that begins or ends.
         name: of the thread.
     """
 
     def __init__(self, log: FaultLog, name: str) -> None:
         self._log = log
-        self._told: queue.SimpleQueue[Trouble] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Trouble] = queue.SimpleQueue()
         self._devices: dict[str, Any] = {}
         self._asked: frozenset[str] = frozenset()
         self._lately: dict[str, deque[Moment]] = {}
         self._known: dict[tuple[str, str], dict[str, Found]] = {}
-        """By device and respect, what is wrong with it."""
+        """Current faults by device and respect."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def tell(self, trouble: Trouble) -> None:
-        """Take what somebody noticed; never waits."""
-        self._told.put(trouble)
+        """Queues a detected change; never waits."""
+        self._queue.put(trouble)
 
     def start(self, devices: Mapping[str, object], asked: Collection[str]) -> None:
-        """Begin.
+        """Starts the thread.
 
         Args:
-            devices: by name; what measures nothing is left out.
-            asked: the names of those of which nobody else notices what is wrong: they are asked 25 times a second.
+            devices: devices by name; those without measurements are left out.
+            asked: the names of devices whose bus reports no faults; the thread polls them 25 times a second.
         """
         self._devices = {name: device for name, device in devices.items() if isinstance(device, _MEASURING)}
         self._asked = frozenset(asked) & frozenset(self._devices)
@@ -61,8 +61,8 @@ class FaultPoller:
         self._thread.start()
 
     def close(self) -> None:
-        """End, once all that was told is noted. More than once is fine."""
-        self._told.put(_END)
+        """Ends the thread after it has logged all queued changes. Idempotent."""
+        self._queue.put(_END)
         if self._thread.ident is not None:
             self._thread.join(_END_S)
 
@@ -80,7 +80,7 @@ class FaultPoller:
 
     def _next(self, due_s: float) -> Trouble | None:
         try:
-            return self._told.get(timeout=max(0.0, due_s - time.monotonic()))
+            return self._queue.get(timeout=max(0.0, due_s - time.monotonic()))
         except queue.Empty:
             return None
 
@@ -91,12 +91,12 @@ class FaultPoller:
                 self._take(Trouble(name, "fault", time.time(), time.monotonic(), found))
 
     def _measure(self, name: str) -> tuple[Found, ...]:
-        """Keep what a device has measured, if that is new; what is wrong with it, by what it says itself."""
+        """Keeps a device's measurement if it is new, and returns the faults that the device itself reports."""
         device, lately = self._devices[name], self._lately[name]
         try:
             state = device.read() if isinstance(device, Sensor) else device.state()
             at_s, fault = when(state), str(getattr(state, "fault", ""))
-        except Exception as error:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
+        except Exception as error:  # noqa: BLE001 - a bug in the driver becomes a fault, and ends nothing
             return found_in(name, error)
         if not lately or lately[-1][0] < at_s:
             lately.append((at_s, state))

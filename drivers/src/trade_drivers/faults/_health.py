@@ -1,4 +1,4 @@
-"""How the providers of a robot are, as the registry says it, whoever knows of it."""
+"""Publishes the health of a robot's providers in the registry."""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -15,11 +15,11 @@ _END_S: Final = 5.0
 
 
 class HealthTeller:
-    """A thread that says in the registry how providers are: never a bus's own, which has no time.
+    """A thread that publishes the health of providers, since bus threads may not wait for that.
 
     Args:
-        watched: each provider with those who know: what they say first counts, unless it is that it is healthy.
-        tell: says of a provider how it is.
+        watched: each provider with the functions that judge its health; the first result that is not healthy counts.
+        tell: publishes the health of a provider.
         name: of the thread.
     """
 
@@ -31,13 +31,13 @@ class HealthTeller:
     ) -> None:
         self._watched = watched
         self._tell = tell
-        self._told: dict[object, str] = {}
+        self._published: dict[object, str] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End it; more than once is fine."""
+        """Ends the thread. Idempotent."""
         self._closing.set()
         self._thread.join(_END_S)
 
@@ -48,7 +48,7 @@ class HealthTeller:
     def _look(self) -> None:
         for provider, knowing in self._watched.items():
             health = next((text for know in knowing if (text := know()) != HEALTHY), HEALTHY)
-            if health != self._told.get(provider, HEALTHY):
-                self._told[provider] = health
-                with suppress(TradeError):  # its container has ended, or it was withdrawn
+            if health != self._published.get(provider, HEALTHY):
+                self._published[provider] = health
+                with suppress(TradeError):  # the container has ended, or the provider was withdrawn
                     self._tell(provider, health)

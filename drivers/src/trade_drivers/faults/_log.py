@@ -1,4 +1,4 @@
-"""The one owner of what is known of a robot's faults; what anybody may ask of it are services."""
+"""The fault log of a robot, with its services."""
 
 import secrets
 import threading
@@ -18,35 +18,35 @@ from trade_drivers.faults._trouble import Found
 __all__ = ["FaultLog"]
 
 _MOST: Final = 200
-"""So many kinds are kept; then those go first that are gone and acknowledged, the oldest of them first."""
+"""How many kinds of fault are kept; ended and acknowledged ones are dropped first, oldest first."""
 _SAVE_EVERY_S: Final = 1.0
 _AGAIN_S: Final = 5.0
-"""What was open when the process before ended, and is found within so long, is the same and not another time."""
+"""A fault that was open when the previous process ended, and is found again within this time, is not counted again."""
 _DISK_S: Final = 10.0
 _MOST_EVIDENCE: Final = 16
 
-Id = Annotated[str, Meta(description="of a fault, as faults() tells it: rosie-3f2a")]
-Note = Annotated[str, Meta(min_length=1, max_length=500, description="what was found out, and where it can be seen")]
+Id = Annotated[str, Meta(description="id of a fault, as faults() returns it: rosie-3f2a")]
+Note = Annotated[str, Meta(min_length=1, max_length=500, description="a finding, and where its evidence is")]
 
 
 class _Entry(Struct):
-    """What is known of one fault while the process runs."""
+    """The record of one fault in this process."""
 
     fault: Fault
     number: int
-    """Which began later has the greater one, whatever the clock on the wall says."""
+    """Numbers faults in the order of their beginning, independent of the wall clock."""
     began_s: float = 0.0
-    """When it began the latest time, by the monotonic clock of this process."""
+    """When the fault last began, by the monotonic clock of this process."""
     moments: tuple[Moment, ...] = ()
-    """What was measured then, as long as nobody asked for the numbers."""
+    """The measurements of that time, until a client requests them as samples."""
 
 
 class FaultLog:
-    """Faults of the devices of one robot. To acknowledge one clears nothing in a device and moves nothing.
+    """Faults of the devices of one robot. Acknowledging a fault clears nothing in a device and moves nothing.
 
     Args:
-        robot: its name.
-        store: where they outlive the process; None: nowhere.
+        robot: the name of the robot.
+        store: the storage where faults outlive the process; None if there is none.
         clock: ``time.monotonic``.
         wall: ``time.time``.
         most: how many kinds are kept.
@@ -65,11 +65,11 @@ class FaultLog:
         self._lock = threading.Lock()
         self._entries: dict[Key, _Entry] = {}
         self._before: set[Key] = set()
-        """Those that were open when the process before ended, and were not found since."""
+        """Faults that were open when the previous process ended, and have not been found since."""
         self._number = 0
         self._unsaved: set[Key] = set()
         self._sent: set[Key] = set()
-        """Those that the disk has been given, and may have refused."""
+        """Faults of the last write to disk, which may have failed."""
         self._saving: Future[bool] | None = None
         self._saved_s = -_SAVE_EVERY_S
         self._started_s = clock()
@@ -89,58 +89,58 @@ class FaultLog:
 
     @service(effect="read")
     def faults(self, open_only: bool = False) -> list[FaultInfo]:
-        """All kinds of faults that were noticed, those that began last first; with ``open_only`` what is wrong now."""
+        """Returns all recorded kinds of faults, newest first; with ``open_only``, only current ones."""
         with self._lock:
             entries = sorted(self._entries.values(), key=lambda entry: -entry.number)
-            return [info_of(self._told(entry)) for entry in entries if entry.fault.open or not open_only]
+            return [info_of(self._current(entry)) for entry in entries if entry.fault.open or not open_only]
 
     @service(effect="read")
     def fault(self, id: Id) -> Fault:  # noqa: A002 - as it is called everywhere
-        """One fault, with what its device measured before it began, the first time and the latest.
+        """Returns one fault with its device's measurements before the first and the latest beginning.
 
         Raises:
-            InvalidArgument: there is none of that id.
+            InvalidArgument: there is no fault with this id.
         """
         with self._lock:
-            return self._told(self._found(id, "fault"))
+            return self._current(self._found(id, "fault"))
 
     @service(effect="note")
     def acknowledge(self, id: Id) -> FaultInfo:  # noqa: A002
-        """Say that its caller has seen it. It stays until its cause is gone; if it begins again, it is unseen again.
+        """Marks a fault as seen by the caller. It stays until its cause is gone; a new occurrence is unseen again.
 
         Raises:
-            InvalidArgument: there is none of that id.
+            InvalidArgument: there is no fault with this id.
         """
         call = current_call()
         by = "its own process" if call is None else call.asker
         with self._lock:
             entry = self._found(id, "acknowledge")
             self._change(entry, acknowledged_by=by, acknowledged_at=self._wall())
-            return info_of(self._told(entry))
+            return info_of(self._current(entry))
 
     @service(effect="note")
     def add_evidence(self, id: Id, note: Note) -> FaultInfo:  # noqa: A002
-        """Add what somebody found out about it, such as where a picture of it is; the newest 16 are kept.
+        """Attaches a finding to a fault, such as the place of a picture; the newest 16 are kept.
 
         Raises:
-            InvalidArgument: there is none of that id.
+            InvalidArgument: there is no fault with this id.
         """
         with self._lock:
             entry = self._found(id, "add_evidence")
             self._change(entry, evidence=[*entry.fault.evidence, note][-_MOST_EVIDENCE:])
-            return info_of(self._told(entry))
+            return info_of(self._current(entry))
 
-    # --- for whoever notices
+    # --- for fault detectors
 
     def begin(self, device: str, found: Found, at: float, at_s: float, moments: Sequence[Moment] = ()) -> None:
-        """Something is wrong from now on that was not before.
+        """Records the beginning of a fault.
 
         Args:
-            device: its name.
-            found: what is wrong with it.
+            device: the name of the device.
+            found: the fault.
             at: seconds since the epoch.
-            at_s: the same moment by the monotonic clock.
-            moments: what the device measured before, oldest first.
+            at_s: the same time by the monotonic clock.
+            moments: the device's measurements before, oldest first.
         """
         key = (device, found.kind)
         with self._lock:
@@ -156,7 +156,7 @@ class FaultLog:
                 self._begin_again(entry, found, at, at_s, moments)
 
     def end(self, device: str, kind: str, at: float, at_s: float) -> None:
-        """It is gone; of what was not there, nothing is noted."""
+        """Records the end of a fault, if it was open."""
         with self._lock:
             entry = self._entries.get((device, kind))
             if entry is not None and entry.fault.open:
@@ -164,20 +164,20 @@ class FaultLog:
                 self._change(entry, open=False, gone_at=at, lasted_s=lasted_s)
 
     def health(self, device: str) -> str:
-        """What is wrong with a device, in few words; empty if nothing is."""
+        """Returns a short text with the device's faults; empty if there are none."""
         with self._lock:
             found = [entry for entry in self._entries.values() if entry.fault.open and entry.fault.device == device]
             return max(found, key=lambda entry: entry.number).fault.said if found else ""
 
     def save(self) -> None:
-        """Have the disk take what has changed, at most once a second; waits for nothing."""
+        """Starts to write changes to disk, at most once a second; does not wait."""
         if self._clock() - self._saved_s >= _SAVE_EVERY_S:
             self._hand_over()
 
     def close(self) -> None:
-        """Have the disk take all there is, and let go of it; more than once is fine."""
+        """Writes all changes to disk and closes the file. Idempotent."""
         if self._store is not None:
-            for _ in range(2):  # the first may only have waited for what was under way
+            for _ in range(2):  # the first pass may only have waited for an earlier write
                 self._hand_over()
                 wait([] if self._saving is None else [self._saving], _DISK_S)
             self._store.close()
@@ -233,8 +233,8 @@ class FaultLog:
         entry.fault = structs.replace(entry.fault, **changed)
         self._unsaved.add((entry.fault.device, entry.fault.kind))
 
-    def _told(self, entry: _Entry) -> Fault:
-        """As it is now."""
+    def _current(self, entry: _Entry) -> Fault:
+        """Returns the fault with its current duration and samples."""
         if entry.moments:
             entry.fault = structs.replace(entry.fault, latest=samples_of(entry.moments, entry.began_s))
             entry.moments = ()
@@ -246,11 +246,11 @@ class FaultLog:
         for entry in self._entries.values():
             if entry.fault.id == id:
                 return entry
-        problem = f"there is no fault {id!r}; `trade faults` lists those there are"
+        problem = f"there is no fault {id!r}; `trade faults` lists all faults"
         raise InvalidArgument(service=f"{self._robot}.faults.{called}", argument="id", problem=problem)
 
     def _new_id(self) -> str:
-        """By chance: if the disk could not be read, those it holds are not given out again."""
+        """Returns a random id, so that ids on an unreadable disk are not used again."""
         known = {entry.fault.id for entry in self._entries.values()}
         while (made := f"{self._robot}-{secrets.token_hex(2)}") in known:
             pass
@@ -266,7 +266,7 @@ class FaultLog:
                 self._unsaved |= self._sent
             self._saving, self._sent, self._unsaved = None, self._unsaved, set()
             kept: list[Kept] = [
-                (self._entries[key].number, self._told(self._entries[key]))
+                (self._entries[key].number, self._current(self._entries[key]))
                 for key in self._sent
                 if key in self._entries
             ]

@@ -1,4 +1,4 @@
-"""What is known of a fault. Pure records, no I/O."""
+"""Records of faults and their samples. No I/O."""
 
 import re
 from collections.abc import Sequence
@@ -10,96 +10,96 @@ __all__ = ["Fault", "FaultInfo", "FaultSample", "Moment", "info_of", "kind_of", 
 
 _NUMBER: Final = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 _SEVERAL: Final = re.compile(r"((?:hardware error|error|status): )(.+)")
-"""How drivers say what a device reports, one word a bit."""
+"""How drivers list the error bits that a device reports, one word for each."""
 _TIMES: Final = frozenset({"measured_at", "stamp_ns", "age_s"})
 
 Moment = tuple[float, Any]
-"""When something was measured, by ``time.monotonic()``, and the state that was."""
+"""A time by ``time.monotonic()`` and the state measured then."""
 
 
 class FaultSample(Struct, frozen=True, kw_only=True):
-    """What a device measured once."""
+    """One measurement of a device, as numbers."""
 
     s: float
-    """How long after the fault began; negative before."""
+    """Time since the fault began; negative before it."""
     values: dict[str, float]
-    """By the names that its ``state()`` or ``read()`` has: ``position_rad``, ``load``; ``positions_rad.1`` of several.
-    What is true is 1."""
+    """Values by their names in ``state()`` or ``read()``: ``position_rad``, ``load``; ``positions_rad.1`` in a list.
+    True is 1."""
 
 
 class FaultInfo(Struct, frozen=True, kw_only=True):
-    """One kind of fault of one device, however often it was there."""
+    """One kind of fault of one device, with all its occurrences."""
 
     id: str
     """Such as ``rosie-3f2a``."""
     device: str
     """Such as ``rosie.neck.pan``."""
     kind: str
-    """Its text without what differs from time to time; ``silent`` and ``bus gone`` if the device cannot be heard."""
+    """The text without its numbers; ``silent`` or ``bus gone`` if the device is offline."""
     text: str
-    """What was wrong the latest time, with the device's name."""
+    """The text of the latest occurrence, with the device's name."""
     remedy: str = ""
-    """What to do; empty if the text says it."""
+    """What to do; empty if the text says so."""
     open: bool
-    """It is there now. False: it is gone."""
+    """True while the fault is present."""
     first_at: float
-    """When it began the first time, in seconds since the epoch."""
+    """When the fault first began, in seconds since the epoch."""
     last_at: float
-    """When it began the latest time."""
+    """When the fault last began."""
     gone_at: float | None = None
-    """When it ended, if it has; found open by a new process that does not see it, when that process began."""
+    """When the fault ended, if it has. If it ended between two processes, the start of the later one."""
     lasted_s: float = 0.0
-    """How long it was there in all, by a clock that nobody sets."""
+    """Total duration of all occurrences, by the monotonic clock."""
     count: int = 1
-    """How often it began."""
+    """Number of occurrences."""
     acknowledged_by: str = ""
-    """Who has seen it since it began the latest time: an identity, ``page for anna`` by a door; empty: nobody."""
+    """The identity that acknowledged the latest occurrence, such as ``page for anna``; empty if none has."""
     acknowledged_at: float | None = None
     evidence: list[str] = []
-    """What others have found out about it, oldest first."""
+    """Findings that clients have attached, oldest first."""
 
     @property
     def said(self) -> str:
-        """What was wrong the latest time, in few words: its kind, with the numbers that it had then."""
+        """Returns the kind with the numbers of the latest occurrence."""
         text = self.text.removeprefix(f"{self.device}: ")
         return text if kind_of(text) == self.kind else self.kind
 
 
 class Fault(FaultInfo, frozen=True, kw_only=True):
-    """The same, with what was measured before it began."""
+    """A fault with the measurements from before it began."""
 
     first: list[FaultSample] = []
-    """The first time, oldest sample first."""
+    """Samples of the first occurrence, oldest first."""
     latest: list[FaultSample] = []
-    """The latest time."""
+    """Samples of the latest occurrence."""
 
 
 def info_of(fault: Fault) -> FaultInfo:
-    """A fault without its samples."""
+    """Returns a fault without its samples."""
     return FaultInfo(**{name: getattr(fault, name) for name in FaultInfo.__struct_fields__})
 
 
 def kind_of(text: str) -> str:
-    """A fault's text without its numbers: how far a joint was short of its goal does not make it another fault."""
+    """Returns a fault's text without its numbers, so that different distances to a goal are one kind of fault."""
     return _NUMBER.sub("N", text)
 
 
 def parts_of(text: str) -> list[str]:
-    """The faults that a device reports in one text: several may be there at once, and end one by one."""
+    """Splits the text of a device into its faults; several may be present at once, and end separately."""
     several = _SEVERAL.fullmatch(text)
     return [several[1] + part for part in several[2].split(", ")] if several else [text]
 
 
 def when(state: Any) -> float:
-    """When a state or reading was measured, by ``time.monotonic()``; TypeError if it is neither."""
+    """Returns when a state or reading was measured, by ``time.monotonic()``; raises TypeError for anything else."""
     if not isinstance(state, Struct):
-        raise TypeError(f"{type(state).__name__} is no record of what was measured")
+        raise TypeError(f"{type(state).__name__} is not a state or a reading")
     stamp_ns = getattr(state, "stamp_ns", None)
     return float(state.measured_at if stamp_ns is None else stamp_ns / 1e9)  # type: ignore[attr-defined]
 
 
 def samples_of(moments: Sequence[Moment], began_s: float) -> list[FaultSample]:
-    """What was measured, as numbers; ``began_s`` is when the fault began, by ``time.monotonic()``."""
+    """Converts measurements to numbers; ``began_s`` is the begin of the fault by ``time.monotonic()``."""
     return [FaultSample(s=round(at_s - began_s, 4), values=_values(state)) for at_s, state in moments]
 
 

@@ -1,4 +1,4 @@
-"""The faults of a robot on disk, so that they outlive the process."""
+"""The faults of a robot on disk (SQLite), so that they outlive the process."""
 
 import sqlite3
 from collections.abc import Callable, Iterable, Sequence
@@ -16,7 +16,7 @@ __all__ = ["FaultStore", "Kept", "Key"]
 Key = tuple[str, str]
 """Device and kind."""
 Kept = tuple[int, Fault]
-"""Which began later has the greater number."""
+"""A number in the order of the faults' beginning, and the fault."""
 
 _TABLE: Final = """
 create table if not exists fault (
@@ -29,18 +29,18 @@ _LOAD: Final = "select number, blob from fault order by number"
 
 
 class FaultStore(Database):
-    """One file with the faults of one robot.
+    """The database with the faults of one robot.
 
     Args:
-        path: of the file; its folder is made.
-        tell: is told what is wrong with it, and when it is not any more.
+        path: of the file; its folder is created.
+        tell: called when the file cannot be used, and when it can again.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
         super().__init__(path, _TABLE, "fault", tell)
 
     def load(self) -> list[Kept]:
-        """What was saved, the oldest first; nothing if there is none to be had. Takes 10 s at most."""
+        """Returns the saved faults, oldest first; none if the file cannot be read. Takes 10 s at most."""
 
         def load(database: sqlite3.Connection) -> list[Kept]:
             found = database.execute(_LOAD).fetchall()
@@ -49,7 +49,7 @@ class FaultStore(Database):
         return self._ask(load, default=[])
 
     def save(self, kept: Sequence[Kept], dropped: Iterable[Key]) -> "Future[bool]":
-        """Write these anew, and forget those, all or nothing, without waiting; whether that could be done."""
+        """Writes and deletes faults in one transaction without waiting; the future says whether it succeeded."""
         gone = list(dropped)
 
         def save(database: sqlite3.Connection) -> bool:

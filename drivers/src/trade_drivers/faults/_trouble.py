@@ -1,4 +1,4 @@
-"""What is wrong with a device, and how that is told."""
+"""Changes of a device's faults, as fault detectors report them."""
 
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
@@ -14,21 +14,21 @@ Respect = Literal["fault", "link"]
 
 
 class Trouble(NamedTuple):
-    """What is wrong with a device in one respect from now on, instead of what was before."""
+    """The faults of a device in one respect from now on; replaces the previous ones."""
 
     device: str
     respect: "Respect"
-    """What it says of itself, or whether it can be heard: both can be wrong at once."""
+    """The device's own report, or its connection; both can fail at once."""
     at: float
     """Seconds since the epoch."""
     at_s: float
     """``time.monotonic()``."""
     found: "tuple[Found, ...]" = ()
-    """All that is wrong in this respect; nothing if it is empty."""
+    """All current faults in this respect; empty if there are none."""
 
 
 class Found(NamedTuple):
-    """One thing that is wrong."""
+    """One fault."""
 
     kind: str
     text: str
@@ -36,11 +36,11 @@ class Found(NamedTuple):
 
 
 Tell = Callable[[Trouble], object]
-"""Takes what was noticed; never waits."""
+"""Accepts a change; never waits."""
 
 
 def found_in(device: str, error: Exception) -> tuple[Found, ...]:
-    """What an error says of a device."""
+    """Returns the faults of a device that an error describes."""
     match error:
         case DeviceFault():
             parts = parts_of(error.fault)
@@ -49,5 +49,5 @@ def found_in(device: str, error: Exception) -> tuple[Found, ...]:
             return (Found(BUS_GONE, str(error)),)
         case DeviceError():
             return (Found(SILENT, str(error)),)
-        case _:  # a mistake of the driver's
+        case _:  # a bug in the driver
             return (Found(type(error).__name__, f"{device}: its state cannot be read: {error!r}"),)
