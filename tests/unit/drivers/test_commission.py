@@ -154,7 +154,7 @@ def test_an_id_is_not_changed_while_torque_is_on(line: Line) -> None:
 
 
 @pytest.mark.parametrize(
-    ("device_id", "to", "complaint"), [(1, 2, "id 2 is taken"), (3, 4, "nobody answers"), (1, 999, "999 is no id")]
+    ("device_id", "to", "complaint"), [(1, 2, "id 2 is taken"), (3, 4, "no device answers"), (1, 999, "999 is not")]
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(
     line: Line, device_id: int, to: int, complaint: str

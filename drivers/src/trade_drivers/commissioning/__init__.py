@@ -1,1 +1,1 @@
-"""Finding devices on a bus, and giving them ids and rates."""
+"""Scanning a bus for devices, and setting their ids and baud rates."""

@@ -1,4 +1,4 @@
-"""An open CAN bus, looked at before a robot file names its devices: who is there. Reads; commands nothing."""
+"""Scanning an open CAN bus for devices before they are in a robot file. Reads only; commands nothing."""
 
 from abc import abstractmethod
 from collections.abc import Collection
@@ -12,31 +12,31 @@ from trade_drivers.commissioning._commissioner import Bench, Found
 __all__ = ["CanBench"]
 
 _LISTEN_S: Final = 1.0
-"""Who commands devices, and who tells of itself, is heard within it."""
+"""How long to listen for other drivers, and for devices that report by themselves."""
 
 _Self = TypeVar("_Self", bound="CanBench")
 
 
 class CanBench(Bench):
-    """One CAN bus that nobody commands."""
+    """An open CAN bus that no driver commands."""
 
     driver: ClassVar[str]
     remedy: ClassVar[str]
-    """Where its devices are given their numbers and rates."""
+    """The tool that sets the ids and rates of its devices."""
     zero: ClassVar[str]
-    """How the zero of its devices is found."""
+    """How to set the zero of its devices."""
 
     def __init__(self, port: CanPort, bitrate: int) -> None:
         self._port, self._bitrate, self._talk = port, bitrate, port.talk
 
     @classmethod
     def open(cls: type[_Self], port: str, bitrate: int) -> _Self:
-        """Begin to use a bus, after listening who talks there.
+        """Opens a bus after listening for other drivers.
 
         Raises:
-            ConfigurationError: somebody commands its devices, there is no such interface, or a question would be a
-                command there.
-            PortLost: it is not there, or down.
+            ConfigurationError: another driver commands its devices, there is no such interface, or a device would take
+                a request for a command.
+            PortLost: the interface does not exist or is down.
         """
         wire = CanPort(port, bitrate, "", _LISTEN_S, cls.orders)
         wire.open()
@@ -51,13 +51,13 @@ class CanBench(Bench):
     @staticmethod
     @abstractmethod
     def orders(talk: Talk) -> Collection[int]:
-        """What of it comes from somebody who commands or asks such devices."""
+        """Returns the identifiers among the frames that only a driver of such devices sends."""
 
     def refuse(self) -> None:
-        """ODrives would take questions that are not theirs for commands. Raises ``ConfigurationError``."""
+        """Raises ``ConfigurationError`` if there are ODrives, which would take requests to others for commands."""
         if nodes := self._talk.odrives:
             numbers = ", ".join(map(str, sorted(nodes)))
-            problem = f"ODrives talk on this bus (node {numbers}) and would take its questions for commands"
+            problem = f"ODrives talk on this bus (node {numbers}) and would take its requests for commands"
             raise ConfigurationError(where=f"driver {self.driver}", problem=problem)
 
     def found(
@@ -70,7 +70,7 @@ class CanBench(Bench):
         torque: bool | None = None,
         problem: str = "",
     ) -> Found:
-        """A device of this bus."""
+        """Returns a record of a device on this bus."""
         return Found(
             driver=self.driver,
             wire="can",
@@ -93,7 +93,7 @@ class CanBench(Bench):
         self._cannot(device_id, f"its bit rate is set by {self.remedy}")
 
     def seal(self, device_id: int) -> None:
-        """Nothing was opened."""
+        """Does nothing, as this bench unlocks no registers."""
 
     def _cannot(self, device_id: int, problem: str) -> NoReturn:
         raise ConfigurationError(where=f"{self._port.path}, node {device_id}", problem=problem)

@@ -1,6 +1,6 @@
-"""Setting devices up before a robot file names them: who is on a line, under which id, at which rate.
+"""Setting up devices before they are in a robot file: scanning a line, and setting ids and baud rates.
 
-Nothing here moves anything. Only ``set_id`` and ``set_baud`` write, to one device, and only while its torque is off.
+Nothing here moves a device. Only ``set_id`` and ``set_baud`` write, to one device whose torque is off.
 """
 
 from abc import ABC, abstractmethod
@@ -19,127 +19,127 @@ _ATTEMPTS: Final = 3
 
 
 class Found(Struct, frozen=True, kw_only=True):
-    """A device that answers."""
+    """A device that answers a scan."""
 
     driver: str
     kind: Literal["joint", "gripper", "arm"] = "joint"
-    """What it is in a robot file."""
+    """The kind of device in a robot file."""
     wire: Literal["serial", "can"] = "serial"
-    """What it was found on."""
+    """The port it was found on."""
     baud: int = 0
-    """Bits per second; 0 where there is no such thing: the controller of an arm."""
+    """Bits per second; 0 for devices without a rate, such as the controller of an arm."""
     id: int = 0
     model: str = ""
-    """As printed on it, or what number it tells if that is not known; empty if it cannot be asked."""
+    """Model as printed on the device, or the number that it reports; empty if it reports none."""
     firmware: str = ""
     serial_number: int | None = None
-    """None if it tells none."""
+    """None if the device reports none."""
     torque: bool | None = None
-    """None if it cannot be asked, or has none."""
+    """None if the device has no torque, or cannot report it."""
     problem: str = ""
-    """Why it cannot be used like this, and what helps."""
+    """Why the device cannot be used as it is, and what to do."""
 
 
 class Bench(ABC):
-    """An open line, and one device after the other on it. Whoever made it closes it."""
+    """An open line, for access to one device after the other. Its creator closes it."""
 
     @abstractmethod
     def anybody(self) -> bool:
-        """Whether it is worth asking every id; True where nothing but that can tell."""
+        """Returns False if no device can be on the line, so that no id needs to be tried."""
 
     @abstractmethod
     def look(self, device_id: int) -> Found | None:
-        """Who answers to an id; None if nobody does."""
+        """Returns the device that answers to an id, or None."""
 
     def alone(self, device_id: int, where: str) -> Found:
-        """The device behind an id, if somebody may write to it or turn it by hand.
+        """Returns the device with an id if it is safe to write to it or to turn it by hand.
 
         Raises:
-            ConfigurationError: it is absent, not alone, or has torque on; ``where`` is for the message.
+            ConfigurationError: the device is absent, shares its id, or has torque on; ``where`` is for the message.
         """
         found = self.answering(device_id)
         if found is None:
-            problem = "nobody answers; `trade scan` shows who does, and at which rate"
+            problem = "no device answers; `trade scan` shows the ids and rates of those that do"
             raise ConfigurationError(where=where, problem=problem)
         if found.problem:
             raise ConfigurationError(where=where, problem=found.problem)
         if found.torque:
-            problem = f"its torque is on ({found.model}); end what drives it, or switch off its power for a moment"
+            problem = f"its torque is on ({found.model}); end the program that drives it, or switch off its power"
             raise ConfigurationError(where=where, problem=problem)
         return found
 
     def answering(self, device_id: int) -> Found | None:
-        """Who answers to an id, asked three times; None if nobody does."""
+        """Returns the device that answers to an id within three attempts, or None."""
         return next((found for _ in range(_ATTEMPTS) if (found := self.look(device_id)) is not None), None)
 
     @abstractmethod
     def angle_rad(self, device_id: int) -> float:
-        """Where a device stands, from its own centre and in its own sense.
+        """Returns a device's position relative to its own centre, in its own direction.
 
         Raises:
-            WireError: it does not answer.
+            WireError: the device does not answer.
         """
 
     def homing_counts(self, device_id: int) -> int:  # noqa: ARG002 - most devices have none
-        """By how much a device shifts its zero itself; 0 where that is not known.
+        """Returns the homing offset that a device applies itself; 0 if it is not known.
 
         Raises:
-            WireError: it does not answer.
+            WireError: the device does not answer.
         """
         return 0
 
     @abstractmethod
     def write_id(self, device_id: int, to: int) -> None:
-        """Have it answer to another id from now on. Whether it does is for the caller to look.
+        """Sets a device's id. The caller must check that the device answers to it.
 
         Raises:
-            WireError: it refuses.
+            WireError: the device refuses.
         """
 
     @abstractmethod
     def write_baud(self, device_id: int, to: int) -> None:
-        """Have it speak at another rate from now on. Whether it does is for the caller to look.
+        """Sets a device's baud rate. The caller must check that the device answers at it.
 
         Raises:
-            WireError: it refuses.
+            WireError: the device refuses.
         """
 
     @abstractmethod
     def seal(self, device_id: int) -> None:
-        """Shut against writes what was opened for one, where there is such a thing."""
+        """Locks again the registers that a write unlocked, on devices with such a lock."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the port; more than once is fine."""
+        """Closes the port. Idempotent."""
 
 
 class Commissioner(ABC):
-    """What a driver knows of setting up its devices. Made without arguments, and harmless to make."""
+    """How a driver sets up its devices; constructed without arguments and without side effects."""
 
     driver: ClassVar[str]
     wire: ClassVar[Literal["serial", "can"]] = "serial"
-    """What its ports are: serial devices, or ``INTERFACE:CHANNEL``."""
-    ports: ClassVar[str] = "`ls -l /dev/serial/by-id` shows those there are"
-    """Where to look when a port is not there."""
+    """The form of its ports: a serial device, or ``INTERFACE:CHANNEL``."""
+    ports: ClassVar[str] = "`ls -l /dev/serial/by-id` lists the ports"
+    """What to check if a port does not exist."""
     bauds: ClassVar[Sequence[int]]
-    """Rates its devices can be set to, those they leave the factory with first."""
+    """Rates that its devices support, factory defaults first."""
     ids: ClassVar[range]
 
     @abstractmethod
     def open(self, port: str, baud: int) -> Bench:
-        """Take a port for this process alone.
+        """Opens a port for exclusive use.
 
         Raises:
-            ConfigurationError: the vendor library is missing, the port cannot be had, or the rate cannot be set.
+            ConfigurationError: the vendor library is missing, the port cannot be opened, or the rate cannot be set.
             PortLost: there is no such port.
         """
 
     @contextmanager
     def at(self, port: str, baud: int) -> Generator[Bench, None, None]:
-        """A bench, closed in the end.
+        """Opens a bench and closes it at the end of the block.
 
         Raises:
-            ConfigurationError: the port cannot be had, or was unplugged meanwhile.
+            ConfigurationError: the port cannot be opened, or was unplugged meanwhile.
         """
         try:
             bench = self.open(port, baud)
@@ -151,24 +151,25 @@ class Commissioner(ABC):
             raise ConfigurationError(where=port, problem=f"{lost}; {self.ports}") from None
 
     def set_id(self, port: str, baud: int, device_id: int, to: int) -> Found:
-        """Give the one device behind an id another one, which it keeps without power.
+        """Changes the id of a device permanently.
 
         Returns:
             The device, as it answers to its new id.
 
         Raises:
-            ConfigurationError: it is absent, not alone, or has torque on; the new id is taken; or it did not change.
+            ConfigurationError: the device is absent, shares its id, has torque on, or did not change; or the new id is
+                taken.
         """
         where = f"{port}, id {device_id}"
         if to not in self.ids:
-            problem = f"{to} is no id; {self.ids.start} to {self.ids.stop - 1} are"
+            problem = f"{to} is not a valid id; use {self.ids.start} to {self.ids.stop - 1}"
             raise ConfigurationError(where=where, problem=problem)
         with self._changing(port, baud, where) as bench:
             before = bench.alone(device_id, where)
             if to == device_id:
                 return before
             if bench.answering(to) is not None:
-                problem = f"id {to} is taken on this line; choose another, `trade scan` shows those that are"
+                problem = f"id {to} is taken on this line; choose another, `trade scan` shows the ids in use"
                 raise ConfigurationError(where=where, problem=problem)
             bench.write_id(device_id, to)
             now, stayed = bench.answering(to), bench.answering(device_id)
@@ -178,18 +179,18 @@ class Commissioner(ABC):
         return _changed(before, now, stayed, where, f"id {to}")
 
     def set_baud(self, port: str, baud: int, device_id: int, to: int) -> Found:
-        """Have the one device behind an id speak at another rate, which it keeps without power.
+        """Changes the baud rate of a device permanently.
 
         Returns:
             The device, as it answers at its new rate.
 
         Raises:
-            ConfigurationError: it is absent, not alone, or has torque on; its id is taken at that rate; or it did not
-                change.
+            ConfigurationError: the device is absent, shares its id, has torque on, or did not change; or its id is
+                taken at that rate.
         """
         where = f"{port}, id {device_id}"
         if to not in self.bauds:
-            problem = f"{to} is no rate of these devices; {', '.join(map(str, self.bauds))} are"
+            problem = f"{to} is not a rate of these devices; use one of {', '.join(map(str, self.bauds))}"
             raise ConfigurationError(where=where, problem=problem)
         if to != baud:
             with self._changing(port, to, where) as bench:
@@ -224,17 +225,16 @@ def scan(
     ids: Collection[int] = (),
     told: Callable[[int, int], None] = lambda _baud, _found: None,
 ) -> list[Found]:
-    """Who answers on a line. Nothing is written.
+    """Finds the devices on a line. Writes nothing. Calls back after each rate, with it and the number of devices found.
 
     Args:
-        commissioner: of the driver whose devices are looked for.
-        port: where; it must not be in use.
-        bauds: rates to try; by default all that the devices know.
-        ids: whom to ask; by default everybody, at the rates where anybody answers.
-        told: called after each rate, with it and how many devices were found at it.
+        commissioner: of the driver whose devices are wanted.
+        port: the port, which must not be in use.
+        bauds: rates to try; by default all that the devices support.
+        ids: ids to try; by default all, at the rates where a device answers.
 
     Raises:
-        ConfigurationError: the port cannot be had, or a device was met whose torque is on: its stop would have to wait.
+        ConfigurationError: the port cannot be opened, or a device has torque on: a scan would delay its stop.
     """
     found: list[Found] = []
     for baud in bauds or commissioner.bauds:
@@ -253,22 +253,22 @@ def _looking(bench: Bench, ids: Collection[int], port: str) -> Iterator[Found]:
             raise ConfigurationError(
                 where=port,
                 problem=f"id {device_id} ({found.model}, {found.baud} baud) has its torque on, so the scan has ended; "
-                "end what drives it, or switch off its power for a moment",
+                "end the program that drives it, or switch off its power",
             )
         yield found
 
 
 def _changed(before: Found, now: Found | None, stayed: Found | None, where: str, what: str) -> Found:
-    """What a device has become, if it alone has."""
+    """Returns the changed device, if it alone has changed."""
     if stayed is not None and now is None:
-        raise ConfigurationError(where=where, problem=f"it does not take {what}, and answers as before")
+        raise ConfigurationError(where=where, problem=f"it did not accept {what}, and answers as before")
     if stayed is not None:
-        problem = f"one device answers with {what} now, and one as before: two had this id. Unplug one, and scan again"
+        problem = f"one device answers with {what} now, another as before: two had this id. Unplug one, then scan again"
         raise ConfigurationError(where=where, problem=problem)
     if now is None:
-        problem = f"it was told {what} and answers neither so nor as before; switch it off and on, and scan again"
+        problem = f"after the change to {what} it does not answer at all; switch it off and on, and scan again"
         raise ConfigurationError(where=where, problem=problem)
     if now.problem or now.model != before.model:
-        problem = f"what answers with {what} now is not what was there before: {now.problem or now.model}"
+        problem = f"the device that answers with {what} now is not the one from before: {now.problem or now.model}"
         raise ConfigurationError(where=where, problem=problem)
     return now
