@@ -1,4 +1,4 @@
-"""From a robot file to services: every bus attached first, every provider announced after, all undone by close."""
+"""Attaches a robot file: opens all buses first, then announces their services; close() undoes both."""
 
 import atexit
 import logging
@@ -38,7 +38,7 @@ SetHealth = Callable[[object, str], object]
 
 
 class AttachedRobot:
-    """A robot whose devices are attached and whose services are announced, until it is closed."""
+    """A robot with attached devices and announced services, until it is closed."""
 
     def __init__(
         self,
@@ -50,53 +50,53 @@ class AttachedRobot:
     ) -> None:
         self.robot = robot
         self.faults = faults
-        """What is and was wrong with its devices; the provider in group ``rosie.faults``."""
+        """Current and past faults of the robot's devices; the provider in group ``rosie.faults``."""
         self._buses = buses
         self.providers = dict(providers)
-        """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
-        ``rosie.right`` -> an Arm, ``rosie.eye`` -> a Camera, ``rosie.wrist`` -> a Sensor, ``rosie.bus.legs`` -> a
-        CanMonitor."""
+        """Providers by group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a
+        Gripper, ``rosie.right`` -> an Arm, ``rosie.eye`` -> a Camera, ``rosie.wrist`` -> a Sensor, ``rosie.bus.legs``
+        -> a CanMonitor."""
         self._undo = undo
         self._lock = threading.Lock()
         atexit.register(self.close)
 
     def motor(self, joint: str) -> Motor:
-        """The provider of a joint, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a joint by its name in the robot file; raises KeyError if there is none."""
         return self._provider(joint, Motor)
 
     def group(self, name: str) -> JointGroup:
-        """The provider of a group, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a group by its name in the robot file; raises KeyError if there is none."""
         return self._provider(name, JointGroup)
 
     def gripper(self, name: str) -> Gripper:
-        """The provider of a gripper, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a gripper by its name in the robot file; raises KeyError if there is none."""
         return self._provider(name, Gripper)
 
     def arm(self, name: str) -> Arm:
-        """The provider of an arm, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of an arm by its name in the robot file; raises KeyError if there is none."""
         return self._provider(name, Arm)
 
     def camera(self, name: str) -> Camera:
-        """The provider of a camera, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a camera by its name in the robot file; raises KeyError if there is none."""
         return self._provider(name, Camera)
 
     def sensor(self, name: str) -> Sensor:
-        """The provider of a sensor, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a sensor by its name in the robot file; raises KeyError if there is none."""
         return self._provider(name, Sensor)
 
     def monitor(self, bus: str) -> CanMonitor:
-        """The provider of a CAN bus, named as in the robot file; KeyError if there is none."""
+        """Returns the provider of a CAN bus by its name in the robot file; raises KeyError if there is none."""
         provider = self.providers[_bus_group(self.robot, bus)]
         if not isinstance(provider, CanMonitor):
             raise KeyError(bus)
         return provider
 
     def measures(self) -> Iterator[Measure]:
-        """What is known of buses and joints, for `trade.Container.measured_by`; nothing is asked of a device."""
+        """Yields metrics of buses and joints for `trade.Container.measured_by`, without a request to any device."""
         return measures_of(self.robot, self._buses, self.providers)
 
     def unseen(self) -> list[str]:
-        """Once it is closed: the devices that were not seen at rest when they were left. Look at them."""
+        """After close(): returns the devices that were not seen at rest when the driver left them. Check them."""
         return [name for bus in self._buses.values() for name in bus.unseen()]
 
     def _provider(self, name: str, kind: type[_Provider]) -> _Provider:
@@ -106,10 +106,10 @@ class AttachedRobot:
         return provider
 
     def close(self) -> None:
-        """Withdraw the services, stop what moves, leave every device as the robot file asks. More than once is fine.
+        """Withdraws the services, stops all motion, and leaves each device as the robot file says. Idempotent.
 
         Raises:
-            TradeError: a device could not be left as asked; everything is closed all the same.
+            TradeError: a device could not be left as the file says; everything is closed nevertheless.
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -136,37 +136,36 @@ def attach(
     healthy: Callable[[], bool] = _always,
     state_dir: Path | None = None,
 ) -> AttachedRobot:
-    """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
+    """Attaches all devices of a robot, then announces their services. Moves and enables nothing; stops what moves.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
     ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, arm
     ``right`` an Arm in ``rosie.right``, camera ``eye`` a Camera in ``rosie.eye``, sensor ``wrist`` a Sensor in
-    ``rosie.wrist``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``, and what is wrong with any of them is told in
-    ``rosie.faults``. If anything is wrong, nothing is announced and
-    no port is kept.
+    ``rosie.wrist``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``. ``rosie.faults`` reports the faults of all of
+    them. If anything is wrong, nothing is announced and every port is freed.
 
     Args:
-        robot: what ``load`` read.
-        register: what announces a provider in its groups; ``trade.register`` by default.
-        deregister: its opposite; ``trade.deregister`` by default.
-        set_health: what says how a provider is; ``trade.set_health`` by default, nothing if ``register`` is given.
-        ports: bus name -> serial device, or ``INTERFACE:CHANNEL`` of a CAN bus, instead of the file's, and name of a
-            camera or sensor -> what its driver calls its port: for simulated devices.
-        healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
-            falls silent, so that their own watchdogs stop them.
-        state_dir: where faults are kept for the next process; by default nowhere, or, if ``register`` is not given,
-            where the default container keeps what outlives it.
+        robot: the result of ``load``.
+        register: announces a provider in its groups; ``trade.register`` by default.
+        deregister: withdraws a provider; ``trade.deregister`` by default.
+        set_health: reports a provider's health; ``trade.set_health`` by default, nothing if ``register`` is given.
+        ports: replacements for the ports in the file, for simulated devices. Bus name -> serial device, or
+            ``INTERFACE:CHANNEL`` of a CAN bus; camera or sensor name -> its driver's kind of port.
+        healthy: called by each bus thread in each cycle; while it returns False, devices are commanded to hold once and
+            the bus is silent, so that their own watchdogs stop them.
+        state_dir: the folder where faults outlive the process; by default the default container's state folder, or
+            none if ``register`` is given.
 
     Raises:
-        ConfigurationError: a driver is missing, a port cannot be had, a device is absent, another, or set wrongly.
+        ConfigurationError: a driver is missing, a port cannot be opened, or a device is absent, another or set wrongly.
     """
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
         check(robot)
         faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
         poller = FaultPoller(faults, f"faults of {robot.name}")
-        undo.callback(poller.close)  # after the devices: what befalls them while they are left is noted, too
-        senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, what moves is not even touched
+        undo.callback(poller.close)  # closes after the devices, to record faults during their shutdown, too
+        senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, no moving device is accessed
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses, senses)
         poller.start(providers, _unwatched(robot, buses, poller))
@@ -191,7 +190,7 @@ def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLo
 
 
 def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], poller: FaultPoller) -> set[str]:
-    """Have buses tell what is wrong with their devices; the names of the devices of which nobody does."""
+    """Subscribes to the faults that buses report; returns the names of the devices whose bus reports none."""
     deaf = {name for name, bus in buses.items() if not bus.watched(poller.tell)}
     moving = (*robot.joints, *robot.grippers, *robot.arms)
     names = [*(device.name for device in moving if device.bus in deaf), *(sensor.name for sensor in robot.sensors)]
@@ -201,7 +200,7 @@ def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], poller: FaultPoll
 def _check_ports(robot: Robot, ports: Mapping[str, str]) -> None:
     names = [device.name for device in (*robot.buses, *robot.cameras, *robot.sensors)]
     if unknown := sorted(set(ports) - set(names)):
-        problem = f"there is no bus {unknown[0]!r} to give a port to; there is {', '.join(names)}"
+        problem = f"there is no bus {unknown[0]!r} to give a port to; known: {', '.join(names)}"
         raise ConfigurationError(where=robot.where, problem=problem)
 
 
@@ -271,7 +270,7 @@ def _monitors(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, CanMo
 def _tell_health(
     robot: Robot, providers: Mapping[str, Provider], faults: FaultLog, tell: SetHealth, undo: ExitStack
 ) -> None:
-    """Have every device and group tell when it is not well, because of its CAN bus or a fault."""
+    """Reports the health of each device and group, which depends on its CAN bus and its faults."""
     groups = {group.name: group.joints for group in robot.groups}
     bus_of = {device.name: device.bus for device in (*robot.joints, *robot.grippers, *robot.arms)}
     watched: dict[object, list[Callable[[], str]]] = {}
@@ -289,7 +288,7 @@ def _tell_health(
 
 
 def _health_by(faults: FaultLog, device: str, *, whole: bool) -> Callable[[], str]:
-    """What its faults say of a device, or of a group that it belongs to."""
+    """Returns a function that derives the health of a device, or of a group with it, from the fault log."""
 
     def health() -> str:
         wrong = faults.health(device)
@@ -310,5 +309,5 @@ def _group(robot: Robot, group: Group, buses: Mapping[str, AttachedBus]) -> Join
 def _withdraw(deregister: Deregister, provider: object) -> None:
     try:
         deregister(provider)
-    except TradeError as gone:  # its container has ended before it: then it is withdrawn already
+    except TradeError as gone:  # its container has already ended, so the provider is withdrawn
         _log.debug("withdrawing %r: %s", provider, gone)

@@ -1,4 +1,4 @@
-"""Buses and devices in numbers, for metrics: what is known of them already, so that looking costs them nothing."""
+"""Metrics of buses and devices, from known values only, so that collection causes no bus traffic."""
 
 from collections.abc import Iterator, Mapping
 
@@ -13,7 +13,7 @@ __all__ = ["measures_of"]
 
 
 def measures_of(robot: Robot, buses: Mapping[str, AttachedBus], providers: Mapping[str, object]) -> Iterator[Measure]:
-    """All there is to tell of a robot."""
+    """Yields all metrics of a robot."""
     for name, bus in buses.items():
         yield from bus.measures(f"{robot.name}.{name}")
     for name, provider in providers.items():
@@ -26,10 +26,10 @@ def measures_of(robot: Robot, buses: Mapping[str, AttachedBus], providers: Mappi
 def _of_motor(name: str, motor: Motor) -> Iterator[Measure]:
     try:
         state: MotorState | None = motor.state()
-    except DeviceError:  # too old to be believed
+    except DeviceError:  # the measurement is too old
         state = None
     of = {"device": name}
-    yield Measure("device_up", "1: its measurements are fresh; 0: it is silent.", float(state is not None), of)
+    yield Measure("device_up", "1: its measurements are fresh; 0: it is offline.", float(state is not None), of)
     if state is None:
         return
     yield Measure("device_fault", "1: it refuses to move until it is enabled again.", float(bool(state.fault)), of)

@@ -226,7 +226,7 @@ def test_two_drivers_of_one_name_are_both_named(head: Rig, monkeypatch: pytest.M
 
 
 def test_a_driver_that_cannot_be_imported_or_is_none_is_refused(head: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    for value, complaint in (("no_such_module:Driver", "cannot be imported"), ("json:dumps", "no subclass")):
+    for value, complaint in (("no_such_module:Driver", "cannot be imported"), ("json:dumps", "not a subclass")):
         points = [EntryPoint("dynamixel", value, "trade.drivers")]
         monkeypatch.setattr(driver_module, "entry_points", lambda group, points=points: points)
         assert complaint in refused(head)

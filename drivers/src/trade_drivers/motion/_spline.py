@@ -1,4 +1,4 @@
-"""An angle as a function of time: cubic pieces between points, smooth in angle and speed. Arithmetic only, no clock."""
+"""Cubic splines of angles over time, smooth in angle and speed. Arithmetic only, no clock."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ __all__ = ["Curve", "Piece", "Way", "there_together"]
 
 
 class Piece(NamedTuple):
-    """What lies between two points: a jerk that does not change."""
+    """The cubic piece between two points, with a constant jerk."""
 
     begins_s: float
     duration_s: float
@@ -20,38 +20,38 @@ class Piece(NamedTuple):
     jerk_rad_s3: float
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Angle in rad and speed in rad/s, so long after the piece began."""
+        """Returns the angle in rad and the speed in rad/s at a time after the piece began."""
         t, a, j = time_s, self.accel_rad_s2, self.jerk_rad_s3
         position = self.position_rad + t * (self.velocity_rad_s + t * (a / 2 + t * j / 6))
         return position, self.velocity_rad_s + t * (a + t * j / 2)
 
     def accels(self) -> tuple[float, float]:
-        """The acceleration in rad/s^2 at both of its ends: it is never greater in between."""
+        """Returns the acceleration in rad/s^2 at both ends, which is the greatest of the piece."""
         return self.accel_rad_s2, self.accel_rad_s2 + self.jerk_rad_s3 * self.duration_s
 
     def speeds(self) -> list[float]:
-        """The speed in rad/s at its ends, and where it is greatest or least in between."""
+        """Returns the speed in rad/s at both ends and at its extreme in between."""
         times = [0.0, self.duration_s]
         if self.jerk_rad_s3 and 0 < (turn := -self.accel_rad_s2 / self.jerk_rad_s3) < self.duration_s:
             times.append(turn)
         return [self.at(time)[1] for time in times]
 
     def angles(self) -> list[float]:
-        """The angle in rad at its ends, and where it turns round in between."""
+        """Returns the angle in rad at both ends and at its turning points."""
         return [self.at(time)[0] for time in (0.0, self.duration_s, *self._still())]
 
     def _still(self) -> Iterator[float]:
-        """When its speed is zero."""
+        """Yields the times when the speed is zero."""
         v, a, j = self.velocity_rad_s, self.accel_rad_s2, self.jerk_rad_s3
         if (inside := a * a - 2 * j * v) < 0:
             return
-        q = -(a + copysign(sqrt(inside), a))  # never a difference of two numbers that are nearly the same
+        q = -(a + copysign(sqrt(inside), a))  # avoids the difference of two nearly equal numbers
         roots = ([q / j] if j else []) + ([2 * v / q] if q else [])
         yield from (root for root in roots if 0 < root < self.duration_s)
 
 
 class Curve:
-    """One joint's way through its points: what it begins with holds before, and the last is where it stands after."""
+    """One joint's path through its points; it holds the first angle before and the last angle after."""
 
     __slots__ = ("_begins", "pieces")
 
@@ -63,10 +63,10 @@ class Curve:
     def through(
         cls, times_s: Sequence[float], positions_rad: Sequence[float], velocities_rad_s: Sequence[float] | None = None
     ) -> "Curve":
-        """Through at least two points, at strictly rising times.
+        """Returns a curve through at least two points at strictly increasing times.
 
-        Without velocities it is at rest at both ends, and the speeds in between are chosen such that it overshoots no
-        point: zero where it turns round, else the weighted harmonic mean of the slopes on both sides.
+        Without velocities, it is at rest at both ends and overshoots no point: the speed at a point is zero where the
+        direction changes, otherwise the weighted harmonic mean of the slopes on both sides.
         """
         points = list(zip(times_s, positions_rad, strict=True))
         speeds = _chosen(points) if velocities_rad_s is None else velocities_rad_s
@@ -75,12 +75,12 @@ class Curve:
 
     @property
     def duration_s(self) -> float:
-        """When it is over."""
+        """Returns the duration in seconds."""
         last = self.pieces[-1]
         return last.begins_s + last.duration_s
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Angle in rad and speed in rad/s."""
+        """Returns the angle in rad and the speed in rad/s."""
         time_s = max(0.0, time_s)
         if time_s >= self.duration_s:
             return self.pieces[-1].at(self.pieces[-1].duration_s)[0], 0.0
@@ -97,7 +97,7 @@ def _piece(begins_s: float, start: float, ends_s: float, end: float, before: flo
 
 
 def _chosen(points: Sequence[tuple[float, float]]) -> list[float]:
-    """The speed at every point, after Fritsch and Butland (1984)."""
+    """Returns the speed at each point, after Fritsch and Butland (1984)."""
     steps = [(b[0] - a[0], (b[1] - a[1]) / (b[0] - a[0])) for a, b in pairwise(points)]
     inner = [
         0.0 if before * after <= 0 else 3 * (short + long) / ((2 * long + short) / before + (long + 2 * short) / after)
@@ -107,7 +107,7 @@ def _chosen(points: Sequence[tuple[float, float]]) -> list[float]:
 
 
 class Way(NamedTuple):
-    """What one joint has to do: from where, at which speed it is going already, to where, and how fast at most."""
+    """One joint's task: its start, current speed, goal and limits."""
 
     start_rad: float
     velocity_rad_s: float
@@ -117,28 +117,28 @@ class Way(NamedTuple):
 
     @property
     def braking_s(self) -> float:
-        """How long it takes to come to rest; what takes less than a millisecond does not count."""
+        """Returns the time to come to rest; less than a millisecond counts as zero."""
         braking_s = abs(self.velocity_rad_s) / self.accel_rad_s2
         return braking_s if braking_s > _SHORT_S else 0.0
 
     @property
     def rest_rad(self) -> float:
-        """Where it comes to rest then."""
+        """Returns the angle where the joint comes to rest."""
         return self.start_rad + self.velocity_rad_s * self.braking_s / 2
 
 
 _NEAR_RAD: Final = 1e-6
-"""Nearer than this is there."""
+"""A goal nearer than this is reached."""
 _SHORT_S: Final = 1e-3
-"""Shorter pieces are not worth one of their own: numbers become coarse in them."""
+"""Shorter pieces are left out, as they are numerically imprecise."""
 _LEAST_S: Final = 0.01
-"""A way of no length has a duration, too."""
+"""The duration of a path without length."""
 
 
 def there_together(ways: Sequence[Way]) -> list[Curve]:
-    """Curves that begin together and arrive together, in a straight line once what moves already has braked.
+    """Returns curves that start and arrive together, in a straight line after moving joints have braked.
 
-    All share one trapezoid of speed: that of the joint for which it takes longest.
+    All share one trapezoidal speed profile: that of the slowest joint.
     """
     braking_s = max(way.braking_s for way in ways)
     distances = [abs(way.goal_rad - way.rest_rad) for way in ways]

@@ -1,4 +1,4 @@
-"""What a driver is, and finding one by its name: the entry points of the group ``trade.drivers``."""
+"""The base classes of drivers, and their entry points in the group ``trade.drivers``."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -27,58 +27,58 @@ _GROUP = "trade.drivers"
 
 
 class AttachedBus(ABC):
-    """A bus whose devices were found to be those of the robot file. Nothing on it was moved or reset."""
+    """A bus with verified devices of the robot file. Attaching moved and reset nothing."""
 
     @abstractmethod
     def motor(self, joint: str) -> Motor:
-        """The provider of one joint of this bus, named as in the robot file."""
+        """Returns the provider of a joint of this bus by its name in the robot file."""
 
     @abstractmethod
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
-        """A provider of several joints of this bus; ``name`` is the group with the robot's name before it."""
+        """Returns a provider of several joints of this bus; ``name`` is the group with the robot's name as prefix."""
 
     def gripper(self, name: str) -> Gripper:
-        """The provider of one gripper of this bus, named as in the robot file.
+        """Returns the provider of a gripper of this bus by its name in the robot file.
 
         Raises:
             ConfigurationError: the driver of this bus has no grippers.
         """
-        problem = "the driver of its bus has no grippers; one that has is robotiq"
+        problem = "the driver of its bus has no grippers; use one that has, such as robotiq"
         raise ConfigurationError(where=f'gripper."{name}"', problem=problem)
 
     def arm(self, name: str) -> Arm:
-        """The provider of the arm on this bus, named as in the robot file.
+        """Returns the provider of the arm on this bus by its name in the robot file.
 
         Raises:
             ConfigurationError: the driver of this bus has no arms.
         """
-        raise ConfigurationError(where=f'arm."{name}"', problem="the driver of its bus has no arms; one that has is ur")
+        raise ConfigurationError(where=f'arm."{name}"', problem="the driver of its bus has no arms; use driver ur")
 
-    def monitor(self, name: str) -> CanMonitor | None:  # noqa: ARG002 - most have none
-        """The bus itself, to look at; ``name`` has the robot's before it. None if there is nothing to tell of it."""
+    def monitor(self, name: str) -> CanMonitor | None:  # noqa: ARG002 - most buses have none
+        """Returns the monitor of the bus, if it has one; ``name`` has the robot's name as prefix."""
         return None
 
-    def measures(self, bus: str) -> Iterable[Measure]:  # noqa: ARG002 - whoever keeps none has none
-        """Numbers of its own that are known already, for metrics; ``bus`` is its name with the robot's before it."""
+    def measures(self, bus: str) -> Iterable[Measure]:  # noqa: ARG002 - by default none
+        """Returns metrics from values already known; ``bus`` is its name with the robot's as prefix."""
         return ()
 
-    def watched(self, tell: Tell) -> bool:  # noqa: ARG002 - whoever does not notice is asked
-        """Have ``tell`` told what is wrong with devices of this bus, now and at every change, by whoever notices first.
+    def watched(self, tell: Tell) -> bool:  # noqa: ARG002 - by default it reports none
+        """Subscribes ``tell`` to the faults of this bus's devices, now and at each change.
 
-        Returns whether that is done; else their ``state()`` is asked again and again.
+        Returns False if the bus does not report faults; then their ``state()`` is polled.
         """
         return False
 
     def unseen(self) -> Sequence[str]:
-        """The names of the devices that were not seen at rest when they were left; whoever cannot tell names none."""
+        """Returns the names of devices that were not seen at rest when the driver left them, as far as it knows."""
         return ()
 
     @abstractmethod
     def close(self) -> None:
-        """Stop everything, leave the devices as the robot file asks, let go of the port; more than once is fine.
+        """Stops everything, leaves the devices as the robot file says, and closes the port. Idempotent.
 
         Raises:
-            TradeError: something could not be left as asked; the port is let go all the same.
+            TradeError: a device could not be left as the file says; the port is closed nevertheless.
         """
 
 
@@ -86,7 +86,7 @@ _Exchange_co = TypeVar("_Exchange_co", bound=BusCycle[Any], covariant=True)
 
 
 class ThreadedBus(AttachedBus, Generic[_Exchange_co]):
-    """An attached bus that a thread owns."""
+    """An attached bus with an owner thread."""
 
     def __init__(self, thread: BusThread[_Exchange_co]) -> None:
         self._thread = thread
@@ -106,80 +106,80 @@ class ThreadedBus(AttachedBus, Generic[_Exchange_co]):
 
 
 class AnyDriver:
-    """What every driver says of itself."""
+    """What bus drivers and sense drivers have in common."""
 
     commissioner: ClassVar[type[Commissioner] | None] = None
-    """What finds its devices and sets them up; None if they are set up otherwise."""
+    """Scans for devices and sets them up; None if the driver does not support that."""
     modules: ClassVar[tuple[str, ...]] = ()
-    """What of others it imports; installed with the extra of its name."""
+    """Libraries that the driver imports; the extra of its name installs them."""
 
     @classmethod
     def missing(cls) -> list[str]:
-        """Those of its modules that are not installed."""
+        """Returns those of ``modules`` that are not installed."""
         return [module for module in cls.modules if find_spec(module) is None]
 
 
 class Driver(AnyDriver, ABC):
-    """One vendor's devices; made without arguments, and harmless to make."""
+    """The driver of one vendor's devices; constructed without arguments and without side effects."""
 
     without_watchdog: ClassVar[str] = ""
-    """What its devices do when their driver is gone, if they have no watchdog; empty if they have one."""
+    """What the devices do without a driver if they have no watchdog; empty if they have one."""
     devices: ClassVar[tuple[type[Struct], ...]] = (robotfile.Joint, robotfile.Gripper, robotfile.Arm)
-    """What a bus of it can have."""
+    """The kinds of device on its buses."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
-        """Look at what the file alone can tell of a bus and its devices; nothing is opened, and nobody is asked.
+        """Checks a bus and its devices as far as the file shows mistakes, without access to any device.
 
         Raises:
             ConfigurationError: the vendor library is missing, or ``attach`` would refuse the file; names file and key.
         """
 
     def fits(self, bench: Bench, robot: Robot, bus: Bus, device: robotfile.Joint | robotfile.Gripper) -> None:
-        """Look whether a device on an open line is set up as the robot file needs it. Nothing is written.
+        """Checks that a device on an open line is set up as the robot file requires. Writes nothing.
 
         Raises:
-            ConfigurationError: ``attach`` would refuse it; names file and key.
-            WireError: it does not answer reliably.
+            ConfigurationError: ``attach`` would refuse the device; names file and key.
+            WireError: the device does not answer reliably.
         """
 
     @abstractmethod
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        """Take a bus over and check its devices, moving and resetting nothing; found moving, they are stopped.
+        """Opens a bus and checks its devices; moves and resets nothing, and stops devices that move.
 
         Args:
             robot: the whole file.
             bus: the bus to attach.
-            port: where it is; instead of ``bus.port``.
-            healthy: asked in every cycle; while it says no, the driver tells its devices to hold and falls silent, so
-                that their own watchdogs take over.
+            port: the port to use instead of ``bus.port``.
+            healthy: called in each cycle; while it returns False, the driver commands its devices to hold and is
+                silent, so that their own watchdogs take over.
 
         Raises:
-            ConfigurationError: the vendor library is missing, the port cannot be had, or a device is absent, another
-                model, or set wrongly.
+            ConfigurationError: the vendor library is missing, the port cannot be opened, or a device is absent,
+                another model, or misconfigured.
         """
 
 
 class SenseDriver(AnyDriver, ABC):
-    """Cameras or sensors of one kind, each with a table of its own; made without arguments, and harmless to make."""
+    """The driver of one kind of camera or sensor; constructed without arguments and without side effects."""
 
     def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
-        """Look at its options; nothing is opened, and nobody is asked.
+        """Checks the options without access to the device.
 
         Raises:
-            ConfigurationError: ``attach`` would refuse them; names file and key.
+            ConfigurationError: ``attach`` would refuse the options; names file and key.
         """
 
     @abstractmethod
     def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
-        """Look whether the device is there and is what the file says; nothing of it is moved, reset or set.
+        """Opens the device and checks that it is the one in the file; moves, resets and sets nothing.
 
         Args:
-            name: of the device, with the robot's before it.
-            device: its table; ``device.options_as(Options)`` reads its options.
-            port: where it is, instead of where its options say; None: there.
+            name: of the device, with the robot's name as prefix.
+            device: the device's table; ``device.options_as(Options)`` reads its options.
+            port: the port to use instead of the one in the options; None for that one.
 
         Raises:
-            ConfigurationError: an option is wrong, or the device is absent, another, or set wrongly.
+            ConfigurationError: an option is wrong, or the device is absent, another, or misconfigured.
         """
 
 
@@ -187,7 +187,7 @@ _Kind = TypeVar("_Kind", bound=AnyDriver)
 
 
 def drivers() -> dict[str, list[EntryPoint]]:
-    """The installed drivers by name; more than one under a name is a mistake of the installation."""
+    """Returns the installed drivers by name; more than one for a name is an installation error."""
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=_GROUP):
         found.setdefault(point.name, []).append(point)
@@ -195,15 +195,15 @@ def drivers() -> dict[str, list[EntryPoint]]:
 
 
 def load_driver(name: str, where: str, wanted: type[_Kind]) -> _Kind:
-    """The driver of that name.
+    """Loads a driver by its name.
 
     Args:
-        name: as in the robot file's ``driver``.
-        where: the key that names it, for messages.
+        name: the value of ``driver`` in the robot file.
+        where: the key of that value, for messages.
         wanted: ``Driver`` for a bus, ``SenseDriver`` for a camera or sensor, ``AnyDriver`` for either.
 
     Raises:
-        ConfigurationError: there is none, there are two, it cannot be imported, or it is of the other kind.
+        ConfigurationError: there is no such driver, there are two, it cannot be imported, or it is of the other kind.
     """
     found = drivers()
     points = found.get(name, [])
@@ -219,7 +219,7 @@ def load_driver(name: str, where: str, wanted: type[_Kind]) -> _Kind:
         problem = f"driver {name!r} ({_origin(points[0])}) cannot be imported: {broken}"
         raise ConfigurationError(where=where, problem=problem) from broken
     if not (isinstance(kind, type) and issubclass(kind, wanted)):
-        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.{wanted.__name__}"
+        problem = f"driver {name!r} ({_origin(points[0])}) is not a subclass of trade_drivers.{wanted.__name__}"
         raise ConfigurationError(where=where, problem=problem)
     return kind()
 

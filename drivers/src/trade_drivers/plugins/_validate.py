@@ -1,4 +1,4 @@
-"""What drivers have against a robot file, before any port is opened."""
+"""Validation of a robot file by its drivers, before any port is opened."""
 
 from collections.abc import Iterator
 
@@ -11,17 +11,17 @@ __all__ = ["check", "refusals"]
 
 
 def check(robot: Robot) -> None:
-    """Have the drivers of a robot look at its file. Nothing is opened, and nobody is asked.
+    """Has the drivers of a robot check its file, without access to any device.
 
     Raises:
-        ConfigurationError: the first thing that one of them refuses; names file and key.
+        ConfigurationError: the first mistake that a driver found; names file and key.
     """
     for _, refusal in refusals(robot):
         raise refusal
 
 
 def refusals(robot: Robot) -> Iterator[tuple[str, ConfigurationError]]:
-    """By bus, camera and sensor: the first thing that its driver refuses of the file, if there is any."""
+    """Yields, for each bus, camera and sensor, the first mistake that its driver found in the file."""
     parts = (*robot.buses, *robot.cameras, *robot.sensors)
     for part in parts:
         try:
