@@ -30,7 +30,7 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
 
     def prepare(bus: DynamixelBus) -> None:
         for name, value in registers.items():
-            bus.devices[0].table.set(name, value)
+            bus.devices[0].memory.set(name, value)
 
     return prepare
 

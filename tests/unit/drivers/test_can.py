@@ -63,7 +63,7 @@ def test_an_error_frame_says_how_the_controller_is(frame_id: int, data: bytes, s
 def test_a_port_is_an_interface_and_a_channel() -> None:
     assert split_port("socketcand:127.0.0.1:29536/can0", "x") == ("socketcand", "127.0.0.1:29536/can0")
     for text in ("can0", ":can0", "socketcan:", ""):
-        with pytest.raises(ConfigurationError, match="no CAN bus; write INTERFACE:CHANNEL"):
+        with pytest.raises(ConfigurationError, match="not a CAN bus; write INTERFACE:CHANNEL"):
             split_port(text, "legs.toml: bus.legs")
 
 

@@ -110,7 +110,7 @@ def test_who_looks_on_and_fails_ends_no_motion(
     robot = head.attach()
     thread: Any = robot._buses["neck"]
     monkeypatch.setattr(thread._thread._lookout, "look", lambda: 1 / 0)
-    wait_until(lambda: "are not noticed any more" in caplog.text, "that is said")
+    wait_until(lambda: "are no longer reported" in caplog.text, "that is said")
     assert robot.motor("neck.pan").move_to(0.3) == pytest.approx(0.3, abs=0.03)
 
 

@@ -61,7 +61,7 @@ def test_a_port_belongs_to_one_driver(kind: type[SerialWire], pair: Pair) -> Non
 def test_what_is_no_serial_port_is_refused_and_what_is_absent_may_come(kind: type[SerialWire], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path, tmp_path / "file"):
-        with pytest.raises(ConfigurationError, match="is no serial port"):
+        with pytest.raises(ConfigurationError, match="is not a serial port"):
             kind(str(path), 115_200).open()
     with pytest.raises(PortLost, match="there is no such device"):
         kind(str(tmp_path / "absent"), 115_200).open()

@@ -219,7 +219,7 @@ def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: 
     (tmp_path / "neck").write_text("a file\n")
     found = only(of_devices(robot_file))
     assert (found.level, "head.toml: bus.neck.port" in found.text) == ("error", True)
-    assert "is no serial port" in found.text and "end the program that uses it" not in found.fix
+    assert "is not a serial port" in found.text and "end the program that uses it" not in found.fix
 
 
 WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]

@@ -1,1 +1,1 @@
-"""What every bus has in common: one owner thread, a cycle, jobs, deadlines, and locks on ports."""
+"""The common base of all buses: an owner thread, cycles, jobs, deadlines, and locks on ports."""

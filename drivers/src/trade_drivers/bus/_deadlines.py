@@ -1,4 +1,4 @@
-"""What a service makes of the call that asks for it: until when it may begin, and until when it may last."""
+"""Deadlines of commands, from their call: the latest start, and the end of the motion."""
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -9,20 +9,20 @@ from trade import Permit, Resource, current_call, permit
 __all__ = ["Terms", "admitted", "at_once", "expiry", "span"]
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
-"""How long a plain Python call may wait for its turn on the bus."""
+"""The longest wait of a plain Python call for its turn on the bus."""
 _ANSWER_NS: Final = 100_000_000
-"""For one exchange (48 ms at most), the hold, and the way back to the caller."""
+"""The time for one exchange (48 ms at most), the hold, and the answer to the caller."""
 
 
 class Terms(NamedTuple):
-    """The terms on which a command was admitted."""
+    """The permit and the deadlines of an admitted command."""
 
     service: str
-    """The one that was called."""
+    """The service that was called."""
     expires_ns: int
-    """When it may begin at the latest."""
+    """The latest time for its start."""
     until_ns: int | None
-    """When it is ended if it is not over."""
+    """The time when its motion is ended."""
     permit: Permit
 
 
@@ -30,18 +30,18 @@ class Terms(NamedTuple):
 def admitted(
     service: str, resources: Sequence[Resource], times: tuple[int, int | None]
 ) -> Generator[Terms, None, None]:
-    """The terms of a command, under a permit for what it moves."""
+    """Admits a command under a permit for the resources that it moves."""
     with permit(resources) as permitted:
         yield Terms(service, *times, permitted)
 
 
 def at_once(clock: Callable[[], int]) -> tuple[int, None]:
-    """When a command without an end may begin at the latest."""
+    """Returns the latest start of a command without an end."""
     return expiry(clock)[0], None
 
 
 def expiry(clock: Callable[[], int]) -> tuple[int, bool]:
-    """When it may begin at the latest, and whether it must be over then: a plain Python call ends when it ends."""
+    """Returns the latest start, and whether the motion must also end; a plain Python call has no end."""
     call = current_call()
     if call is None or call.expires_ns is None:
         return clock() + _DEFAULT_EXPIRY_NS, False
@@ -49,10 +49,10 @@ def expiry(clock: Callable[[], int]) -> tuple[int, bool]:
 
 
 def span(clock: Callable[[], int]) -> tuple[int, int | None]:
-    """When a motion with an end may begin at the latest, and when it is ended if it is not over.
+    """Returns the latest start of a motion with an end, and the time when it is ended.
 
-    That is somewhat before the deadline of its call, so that the caller is told that it was stopped: stopped at the
-    deadline itself, the answer would come when nobody waits for it any more.
+    The end is slightly before the deadline of the call, so that the caller still learns that the motion was stopped. At
+    the deadline itself, no caller would be waiting for the answer.
     """
     expires_ns, ends = expiry(clock)
     if not ends:

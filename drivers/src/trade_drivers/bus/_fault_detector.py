@@ -1,6 +1,6 @@
-"""The bus thread's part of faults.
+"""Fault detection on the bus thread.
 
-After each cycle it compares each device with what is known of it, and tells of changes without waiting.
+After each cycle, it compares each device with its last reported state, and reports changes without waiting.
 """
 
 import time
@@ -14,7 +14,7 @@ from trade_drivers.faults._trouble import Respect, Tell, Trouble, found_in
 
 
 class _Seen:
-    """What is known of one device."""
+    """The last reported state of one device."""
 
     __slots__ = ("device", "fault", "link", "refusing")
 
@@ -26,7 +26,7 @@ class _Seen:
 
 
 class FaultDetector:
-    """Tells of every change once; what comes and goes between two cycles was never there."""
+    """Reports each change once; changes that revert between two cycles are not reported."""
 
     def __init__(self, exchange: BusCycle[Any], tell: Tell) -> None:
         self._exchange = exchange
@@ -34,7 +34,7 @@ class FaultDetector:
         self._seen = tuple(_Seen(device) for device in exchange.devices)
 
     def look(self) -> None:
-        """Compare every device with what is known of it."""
+        """Compares each device with its last reported state."""
         exchange = self._exchange
         now_ns, refusing, stale_ns = exchange.clock(), exchange.refusing, exchange.stale_after_ns
         for seen in self._seen:
@@ -50,7 +50,7 @@ class FaultDetector:
                 seen.link, seen.refusing = (
                     True,
                     refusing,
-                )  # until it is heard, it is as it was: it was not silent besides
+                )  # until it answers, only this cause is reported
                 self._say(device, "link", device.deaf(now_ns) if refusing is None else refusing(device))
 
     def _say(self, device: BusDevice[Any], respect: Respect, error: TradeError | None) -> None:

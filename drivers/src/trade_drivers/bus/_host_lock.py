@@ -1,4 +1,4 @@
-"""Of what is driven from a host there is one driver: a name that the kernel gives to one process at a time."""
+"""A lock that admits one driver per host to a device: a kernel name that one process at a time can own."""
 
 import errno
 import hashlib
@@ -14,24 +14,24 @@ __all__ = ["HostLock", "Taken"]
 _log = logging.getLogger("trade")
 _SOCKETS: Final = Path("/proc/net/unix")
 _LONGEST: Final = 50
-"""Letters of a holder's description: a name has 107."""
+"""Maximum length of the holder's description; a socket name has 107 bytes."""
 
 
 class Taken(Exception):
-    """Another driver of this host has it; who, as far as that is known."""
+    """Another driver on this host has the lock; the text names it, if known."""
 
 
 class HostLock:
-    """An advisory lock, whichever user asks: a Unix socket's name in the abstract namespace, as CAN interfaces have it.
+    """An advisory lock for all users: the name of a Unix socket in the abstract namespace, per network namespace.
 
-    It is free as soon as its process has ended, however that came. Where there are no such names nothing is locked.
+    The kernel frees it when its process ends, for any reason. On systems without such names, it locks nothing.
     """
 
     def __init__(self, what: str, by: str, device: str = "") -> None:
         """Args:
-        what: is locked, such as ``socketcan:can0``.
-        by: whom others are told, besides the number of this process.
-        device: a serial line that it is reached through, which drivers of servos lock by a file lock.
+        what: the locked device, such as ``socketcan:can0``.
+        by: the holder's name for others, in addition to the process id.
+        device: the serial line of the device, which drivers of servos lock with a file lock.
         """
         self._device = device
         self._name = f"trade/driver/{hashlib.sha256(what.encode()).hexdigest()[:16]}"
@@ -41,20 +41,20 @@ class HostLock:
         self._line: int | None = None
 
     def take(self) -> None:
-        """Have it, until `release`; once more is fine.
+        """Acquires the lock until `release`. Idempotent.
 
         Raises:
-            Taken: another driver has it.
+            Taken: another driver has the lock.
         """
         if self._held or not sys.platform.startswith("linux"):
             return
         try:
             self._bind(self._name)
-            self._bind(self._label)  # nobody can ask who has the first one
+            self._bind(self._label)  # others cannot query the holder of the first one
         except OSError as bad:
             if bad.errno == errno.EADDRINUSE and not self._held:
                 raise Taken(self._holder()) from None
-            _log.warning("no lock tells other drivers of this host that %s is in use: %s", self._label, bad)
+            _log.warning("cannot lock %s against other drivers on this host: %s", self._label, bad)
         if self._device:
             self._lock_device()
 
@@ -67,11 +67,11 @@ class HostLock:
         except BlockingIOError:
             self.release()
             raise Taken(f"a process that `fuser {self._device}` names") from None
-        except OSError as bad:  # whoever opens it says why
+        except OSError as bad:  # opening the device reports the reason
             _log.debug("%s: %s", self._device, bad)
 
     def release(self) -> None:
-        """Let go of it; more than once is fine."""
+        """Releases the lock. Idempotent."""
         while self._held:
             self._held.pop().close()
         if self._line is not None:

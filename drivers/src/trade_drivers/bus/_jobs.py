@@ -1,4 +1,4 @@
-"""What services ask of the thread that owns a bus: work that is waited for, and what lets a command pass."""
+"""Jobs of services for the thread that owns a bus, and the gate that a command must pass."""
 
 import threading
 from collections.abc import Callable, Generator, Sequence
@@ -29,31 +29,31 @@ __all__ = [
 ]
 
 Steps = Generator[None, None, None]
-"""Yields after each exchange on the wire, so that stops and cycles come in between."""
+"""A generator that yields after each exchange, so that stops and cycles run in between."""
 
 Gate = Callable[[], None]
-"""Called right before the bytes go out; what it raises keeps them in."""
+"""Called immediately before the bytes are sent; an exception prevents that."""
 
 TAKEN: Final = "another driver owns this port"
-"""What is said of a port that somebody else has."""
+"""The message for a port that another process has opened."""
 
 _TELL_S: Final = 0.1
 
 
 class PortLost(Exception):
-    """The port itself is gone: unplugged, down, or never opened."""
+    """The port is gone: unplugged, down, or never opened."""
 
 
 class PortOpening(PortLost):
-    """It is about to be opened, which takes a while: ask again soon."""
+    """The port is being opened; try again soon."""
 
 
 @contextmanager
 def losing(*troubles: type[Exception]) -> Generator[None, None, None]:
-    """Have these, which a library raises when its port is gone, become ``PortLost``."""
+    """Converts a library's errors about a lost port to ``PortLost``."""
     try:
         yield
-    except TradeError:  # a gate's: some of them are OSErrors, too
+    except TradeError:  # from a gate; some of them are OSErrors, too
         raise
     except troubles as gone:
         raise PortLost(str(gone)) from None
@@ -64,7 +64,7 @@ class WireError(Exception):
 
 
 class NoAnswer(WireError):
-    """Nothing came within the time that was whole and belonged to the question."""
+    """No complete answer to the request arrived in time."""
 
     def __init__(self, device_id: int, waited_s: float) -> None:
         super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
@@ -73,11 +73,11 @@ class NoAnswer(WireError):
 
 
 class BadAnswer(NoAnswer):
-    """Something came, but it was damaged or cut short."""
+    """The answer was damaged or incomplete."""
 
 
 class Refused(WireError):
-    """The device answered that it would not, and why."""
+    """The device refused the request, with a reason."""
 
     def __init__(self, device_id: int, reason: str) -> None:
         super().__init__(reason)
@@ -85,15 +85,15 @@ class Refused(WireError):
 
 
 class Device(Protocol):
-    """Something on a bus, as errors tell of it."""
+    """A device on a bus, as errors name it."""
 
     @property
     def name(self) -> str:
-        """Such as ``rosie.neck.pan``."""
+        """The full name, such as ``rosie.neck.pan``."""
         ...
 
     def faulty(self, fault: str = "") -> DeviceFault:
-        """The error of a device with a fault; by default the latched one."""
+        """Returns the error for a fault; by default the latched one."""
         ...
 
 
@@ -102,11 +102,11 @@ _Cycle_co = TypeVar("_Cycle_co", bound="BusCycle[Any]", covariant=True)
 
 
 class Work(Generic[_Device_co]):
-    """Something that is waited for. As it stands it needs no leave: it ends motion."""
+    """A job with a waiting service. The base class needs no permit: it is for jobs that end motion."""
 
     def __init__(self, devices: Sequence[_Device_co]) -> None:
         self.devices = tuple(devices)
-        """Those it touches, or waits for; at least one."""
+        """The devices that it accesses or waits for; at least one."""
         self._call = current_call()
         self._ended = threading.Event()
         self._error: TradeError | None = None
@@ -114,18 +114,18 @@ class Work(Generic[_Device_co]):
 
     @property
     def ended(self) -> bool:
-        """Its outcome is known."""
+        """Returns whether the outcome is known."""
         return self._ended.is_set()
 
     def gate(self) -> None:
-        """The last look before its bytes go out; what it raises keeps them in."""
+        """Runs the last checks before the bytes are sent; an exception prevents that."""
 
     def steps(self) -> Steps:
-        """The work."""
+        """Runs the job, and yields after each exchange."""
         raise NotImplementedError
 
     def step(self) -> bool:
-        """Do one exchange of it; False when nothing is left to do."""
+        """Runs one exchange; returns False when the job is done."""
         if self._steps is None:
             self._steps = self.steps()
         try:
@@ -138,25 +138,25 @@ class Work(Generic[_Device_co]):
         return True
 
     def note(self, done: str) -> None:
-        """Tell whoever traces the call that asked for it what has just been done, such as ``wrote goal``."""
+        """Adds an event such as ``wrote goal`` to the trace of the call."""
         if self._call is not None:
             self._call.event(f"{', '.join(device.name for device in self.devices)}: {done}")
 
     def done_stepping(self) -> None:
-        """All its exchanges have been made."""
+        """Called after the last exchange."""
         self.finish()
 
     def finish(self, error: TradeError | None = None) -> None:
-        """Let the waiting service have the outcome; only the first counts."""
+        """Passes the outcome to the waiting service; only the first one counts."""
         if not self._ended.is_set():
             self._error = error
             self._ended.set()
 
     def wait(self, alive: Callable[[], bool], tell: Callable[[], None] | None = None) -> None:
-        """Block until it has ended; call ``tell`` ten times a second meanwhile.
+        """Blocks until the job has ended; calls ``tell`` ten times a second meanwhile.
 
         Raises:
-            TradeError: what became of it.
+            TradeError: the job's error.
         """
         while not self._ended.wait(1.0 if tell is None else _TELL_S):
             if tell is not None:
@@ -168,7 +168,7 @@ class Work(Generic[_Device_co]):
 
 
 class Command(Work[_Device_co], Generic[_Device_co, _Cycle_co]):
-    """A command that may start motion: it expires, and its call was admitted under a permit."""
+    """A command that may start motion. It expires, and its call was admitted under a permit."""
 
     def __init__(self, exchange: _Cycle_co, devices: Sequence[_Device_co], terms: "Terms") -> None:
         super().__init__(devices)
@@ -178,21 +178,21 @@ class Command(Work[_Device_co], Generic[_Device_co, _Cycle_co]):
 
     @property
     def exchange(self) -> _Cycle_co:
-        """The bus it is carried out on."""
+        """Returns the exchange of its bus."""
         return self._exchange
 
     def gate(self) -> None:
-        """The last look before its bytes go out.
+        """Runs the last checks before the bytes are sent.
 
         Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+            DeadlineExceeded: the command has expired.
+            MotionStopped, LockLost, LockedByOther: a stop or another lock owner voided its permit.
         """
         if self._exchange.clock() >= self.expires_ns:
             raise self.expired()
         self.permit.gate()
 
     def expired(self) -> DeadlineExceeded:
-        """The error of a command that came too late to be carried out."""
+        """Returns the error for an expired command."""
         patience_s = max(0.0, (self.expires_ns - self._admitted_ns) / 1e9)
         return DeadlineExceeded(service=self.service, deadline_s=patience_s)

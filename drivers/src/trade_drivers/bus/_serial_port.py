@@ -1,6 +1,6 @@
-"""A serial port, as the drivers of all vendors use it: one process owns it, its thread sleeps until bytes come.
+"""A serial port for drivers of all vendors: one process owns it, and its thread sleeps until bytes arrive.
 
-Only for modules that are imported with a vendor's library: pyserial comes with that.
+Only modules that need a vendor's library may import this one, as it needs pyserial.
 """
 
 import errno
@@ -20,27 +20,27 @@ from trade_drivers.bus._jobs import TAKEN, Gate, PortLost
 __all__ = ["ANSWER_MARGIN_S", "DRAIN_S", "LONGEST_WAIT_S", "SerialLine", "SerialWire"]
 
 ANSWER_MARGIN_S: Final = 0.034
-"""Patience beyond the time the bytes take: twice the default 16 ms latency of an FTDI adapter, and 2 ms."""
+"""Timeout beyond the transmission time: twice the default 16 ms latency of an FTDI adapter, and 2 ms."""
 LONGEST_WAIT_S: Final = 0.048
-"""No exchange waits longer than this, so that a stop is never more than 50 ms from the wire."""
+"""The longest wait of an exchange, so that a stop is sent within 50 ms."""
 DRAIN_S: Final = 0.030
-"""Silence kept after a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
+"""The pause after a failed exchange, in which late answers arrive and are discarded."""
 
 _BITS_PER_BYTE: Final = 10
 
 
 class SerialLine:
-    """The bytes of one port: what vendor libraries are given instead of a port of their own.
+    """The byte stream of one port, which vendor libraries use instead of a port of their own.
 
-    All but ``close`` raises OSError or termios.error when the port is gone.
+    All methods but ``close`` raise OSError or termios.error when the port is gone.
     """
 
     gate: Gate | None = None
-    """Asked right before bytes go out."""
+    """Called immediately before bytes are sent."""
 
     def __init__(self, path: str, baud: int) -> None:
         self.received = bytearray()
-        """What has come and was not taken yet."""
+        """Received bytes that have not been read yet."""
         self._path, self._baud = path, baud
         self._byte_s = _BITS_PER_BYTE / baud
         self._port: serial.Serial | None = None
@@ -50,13 +50,13 @@ class SerialLine:
 
     @property
     def is_open(self) -> bool:
-        """It can be used."""
+        """Returns whether the port is open."""
         return self._port is not None
 
     def open(self) -> None:
-        """Take the port for this process alone; raises ValueError, too."""
+        """Opens the port for exclusive use; may also raise ValueError."""
         self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
-        with suppress(ValueError, OSError, AttributeError):  # not every adapter has it
+        with suppress(ValueError, OSError, AttributeError):  # not all adapters support it
             self._port.set_low_latency_mode(True)  # pyright: ignore[reportUnknownMemberType]
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
@@ -75,24 +75,24 @@ class SerialLine:
                 port.close()
 
     def flush(self) -> None:
-        """Throw away what has come."""
+        """Discards received bytes."""
         self.received.clear()
         termios.tcflush(self._fd, termios.TCIFLUSH)
 
     def write(self, data: bytes) -> int:
-        """Bytes out, after the gate; how many went."""
+        """Sends bytes after the gate; returns how many were sent."""
         if self.gate is not None:
             self.gate()
         self._sent = os.write(self._fd, data)
         return self._sent
 
     def expect(self, size: int) -> None:
-        """Begin to wait for an answer of that many bytes to what was just written."""
+        """Starts the timeout for an answer of this size to the last request."""
         on_the_wire = (self._sent + size) * self._byte_s
         self._deadline = time.monotonic() + min(on_the_wire + ANSWER_MARGIN_S, LONGEST_WAIT_S)
 
     def more(self, for_s: float | None = None) -> bool:
-        """Sleep until more bytes have come; False if none do: in this time, or while the answer is waited for."""
+        """Waits for more bytes; returns False if none arrive in this time or before the answer's timeout."""
         left_s = self._deadline - time.monotonic() if for_s is None else for_s
         if left_s <= 0 or not self._poll.poll(left_s * 1e3):
             return False
@@ -104,25 +104,25 @@ class SerialLine:
 
 
 class SerialWire:
-    """One serial port and the exchanges on it. Not thread safe: one thread owns it.
+    """One serial port and the exchanges on it. Not thread-safe: one thread owns it.
 
-    After an exchange that failed, the next one first keeps silent until ``settled_at``. ``pause`` is how it waits; it
-    is called before every exchange that may wait, so that whoever gives it can put in what must not.
+    After a failed exchange, the next one first waits until ``settled_at``. It waits by a call of ``pause``, which comes
+    before each exchange that may wait and can run urgent work, such as stops.
     """
 
     def __init__(self, path: str, baud: int, where: str = "bus") -> None:
         self.path = path
         self._where = where
-        """The table of the robot file that describes this bus, for messages; empty: there is none."""
+        """The bus's table in the robot file, for messages; empty if it has none."""
         self.settled_at = 0.0
         self.pause: Callable[[float], None] = time.sleep
         self._line = SerialLine(path, baud)
 
     def open(self) -> None:
-        """Take the port for this process alone.
+        """Opens the port for exclusive use.
 
         Raises:
-            ConfigurationError: another driver owns it, it is no serial port, or its baud rate or permissions are wrong.
+            ConfigurationError: another driver owns it, it is not a serial port, or baud rate or permissions are wrong.
             PortLost: there is no such device.
         """
         try:
@@ -138,7 +138,7 @@ class SerialWire:
             case errno.EACCES | errno.EPERM:
                 problem = "no permission to open it; add yourself to its group (often dialout) and log in again"
             case errno.ENOTTY | errno.EISDIR:
-                problem = "is no serial port; `ls -l /dev/serial/by-id` shows those there are"
+                problem = "is not a serial port; `ls -l /dev/serial/by-id` lists the ports"
             case errno.ENOENT:
                 return _lost("there is no such device")
             case _:
@@ -157,13 +157,13 @@ class SerialWire:
 
     @contextmanager
     def _use(self, gate: Gate | None = None) -> Generator[None, None, None]:
-        """Use the port; the gate is asked right before bytes go out. Raises ``PortLost``."""
+        """Uses the port, with a gate for sent bytes. Raises ``PortLost``."""
         if not self._line.is_open:
             raise PortLost("it is not open")
         self._line.gate = gate
         try:
             yield
-        except TradeError:  # the gate's: some of them are OSErrors, too
+        except TradeError:  # from the gate; some of them are OSErrors, too
             raise
         except (OSError, termios.error) as gone:
             raise _lost(_text(gone)) from None
@@ -187,7 +187,7 @@ def _text(bad: Exception) -> str:
 
 
 def _error_number(bad: BaseException | None) -> int | None:
-    """The system's number of an error, which pyserial often leaves in the error that its own stands for."""
+    """Returns the errno of an error, which pyserial often leaves in the original exception."""
     if bad is None:
         return None
     numbers: tuple[object, ...] = (getattr(bad, "errno", None), *bad.args[:1])

@@ -1,4 +1,4 @@
-"""The thread that owns a bus: cycles at its rate, falls silent when its process is sick, reopens its port."""
+"""The owner thread of a bus: runs its cycles, is silent while the process is unhealthy, reopens a lost port."""
 
 import logging
 import threading
@@ -24,20 +24,20 @@ _REOPEN_MOST_S: Final = 1.0
 
 
 class Port(Protocol):
-    """What the wire is reached through."""
+    """The port of a bus."""
 
     path: str
-    """For messages."""
+    """The path, for messages."""
 
     def open(self) -> None:
-        """Begin to use it; raises ``PortLost`` while it is not there, ``PortOpening`` if that is only a matter of time.
+        """Opens the port; raises ``PortLost`` if it does not exist, ``PortOpening`` if it is not ready yet.
 
-        While it is waited for, services are answered: it must not block for long.
+        It must not block for long, as services are answered meanwhile.
         """
         ...
 
     def close(self) -> None:
-        """Let go of it; more than once is fine."""
+        """Closes the port. Idempotent."""
         ...
 
 
@@ -45,7 +45,7 @@ _Exchange_co = TypeVar("_Exchange_co", bound=BusCycle[Any], covariant=True)
 
 
 class BusThread(Generic[_Exchange_co]):
-    """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
+    """The only thread that accesses a bus's port. Services queue jobs for it and read its measurements."""
 
     def __init__(self, exchange: _Exchange_co, wire: Port, bus: Bus, healthy: Callable[[], bool], name: str) -> None:
         self._exchange = exchange
@@ -59,46 +59,51 @@ class BusThread(Generic[_Exchange_co]):
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
         self.unseen: list[str] = []
-        """The devices that were not seen at rest when they were left."""
+        """The devices that were not seen at rest when the driver left them."""
         self._lookout: FaultDetector | None = None
         self.cycles = 0
-        """Since it started."""
+        """Number of cycles since the start."""
         self.late = 0
-        """Of those, how many ended so late that the next one began after its time by a whole period."""
+        """Number of cycles that delayed the next one by a whole period."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     @property
     def exchange(self) -> _Exchange_co:
-        """What it does on the wire."""
+        """Returns the exchange that the thread runs."""
         return self._exchange
 
     def start(self) -> None:
-        """Begin to cycle; the port must be open."""
+        """Starts the cycles; the port must be open."""
         self._thread.start()
 
     def watched(self, tell: Tell) -> None:
-        """Have ``tell`` told, on the bus thread, what is wrong with devices, now and whenever that changes."""
+        """Subscribes ``tell`` to the faults of devices, now and at each change; called on the bus thread."""
         self._lookout = FaultDetector(self._exchange, tell)
 
     def alive(self) -> bool:
-        """Whether the thread still runs."""
+        """Returns whether the thread is running."""
         return self._thread.is_alive()
 
     def measures(self, bus: str) -> list[Measure]:
-        """How it fares; ``bus`` is its name with the robot's before it."""
+        """Returns metrics of the thread; ``bus`` is its name with the robot's as prefix."""
         of, missed = {"bus": bus}, self.exchange.missed_answers
         return [
             Measure("bus_cycles", "Cycles of a bus.", self.cycles, of, "counter"),
             Measure("bus_late_cycles", "Cycles that ended too late by a period or more.", self.late, of, "counter"),
             Measure("bus_missed_answers", "Exchanges not answered in time.", missed, of, "counter"),
-            Measure("bus_up", "1: its port is open; 0: gone, and looked for.", float(not self._lost_at), of),
+            Measure(
+                "bus_up",
+                "1: its port is open; 0: it is gone, and retried.",
+                float(not self._lost_at),
+                of,
+            ),
         ]
 
     def close(self) -> None:
-        """Stop everything, hold or relax as the robot file says, let go of the port. More than once is fine.
+        """Stops everything, holds or relaxes as the robot file says, and closes the port. Idempotent.
 
         Raises:
-            TradeError: not everything could be left as the robot file says; the port is closed all the same.
+            TradeError: a device could not be left as the robot file says; the port is closed nevertheless.
         """
         if self._leaving:
             return
@@ -136,12 +141,12 @@ class BusThread(Generic[_Exchange_co]):
         if self._lookout is not None:
             try:
                 self._lookout.look()
-            except Exception:  # noqa: BLE001 - who looks on ends no motion
+            except Exception:  # noqa: BLE001 - a failed detector ends no motion
                 self._lookout = None
-                _log.exception("bus %s: faults of its devices are not noticed any more", self._bus.name)
+                _log.exception("bus %s: fault detection failed; its faults are no longer reported", self._bus.name)
 
     def _rest(self, next_at: float) -> float:
-        """Wait for the next cycle; stops do not wait."""
+        """Waits for the next cycle; serves stops meanwhile."""
         exchange = self.exchange
         while (left_s := next_at - time.monotonic()) > 0:
             if self._lost_at:
@@ -152,7 +157,7 @@ class BusThread(Generic[_Exchange_co]):
             if self._leaving:
                 break
         now = time.monotonic()
-        if now - next_at < 1 / self._bus.rate_hz:  # a little late, the next one is not
+        if now - next_at < 1 / self._bus.rate_hz:  # after a small delay, the next cycle is on time again
             return next_at
         self.late += 1
         return now
@@ -201,7 +206,7 @@ class BusThread(Generic[_Exchange_co]):
         self.exchange.refusing = None
 
     def _is_healthy(self) -> bool:
-        """A sick process moves nothing: everything is told to hold once, then silence lets the watchdogs judge."""
+        """Returns whether the process is healthy; if not, holds all devices once, then leaves them to watchdogs."""
         try:
             healthy = self._healthy()
         except Exception:  # noqa: BLE001 - a check that fails is a check that says no
@@ -225,10 +230,10 @@ class BusThread(Generic[_Exchange_co]):
 
 @contextmanager
 def opening(wire: Port, port: str, where: str) -> Generator[None, None, None]:
-    """Open a serial line for what is inside, which looks its devices over; it is closed if that fails.
+    """Opens a serial line for a block that checks its devices; closes the line if that fails.
 
     Raises:
-        ConfigurationError: the port cannot be had, or exchanges fail.
+        ConfigurationError: the port cannot be opened, or exchanges fail.
     """
     with ExitStack() as undo:
         undo.callback(wire.close)
@@ -236,7 +241,7 @@ def opening(wire: Port, port: str, where: str) -> Generator[None, None, None]:
             wire.open()
             yield
         except PortLost as lost:
-            problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
+            problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` lists the ports"
             raise ConfigurationError(where=f"{where}.port", problem=problem) from None
         except WireError as bad:
             problem = f"the bus does not work reliably: {bad}; check cable and power"
@@ -250,7 +255,7 @@ _Exchange = TypeVar("_Exchange", bound=BusCycle[Any])
 def start_thread(
     exchange: _Exchange, wire: Port, robot: str, bus: Bus, healthy: Callable[[], bool]
 ) -> BusThread[_Exchange]:
-    """Start the owner thread of a bus whose port is open; the port is closed if that fails."""
+    """Starts the owner thread of a bus with an open port; closes the port if that fails."""
     with ExitStack() as undo:
         undo.callback(wire.close)
         thread = BusThread(exchange, wire, bus, healthy, name=f"bus {robot}.{bus.name}")

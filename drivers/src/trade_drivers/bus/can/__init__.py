@@ -1,4 +1,4 @@
-"""CAN buses through python-can: one port, used by one thread; its load, its errors, its loss."""
+"""CAN buses through python-can: a port for one thread, with load, error state and reconnection."""
 
 from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
 from trade_drivers.bus.can._errors import ErrorState, error_state

@@ -1,4 +1,4 @@
-"""How full a bus is: bits of frames against bits per second. Pure, but for the clock it is given."""
+"""Bus load: the bits of frames as a share of the bit rate. Pure, with the time as an argument."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ _WINDOW_NS: Final = 1_000_000_000
 
 
 def frame_bits(size: int) -> int:
-    """The most bits a standard data frame of that many bytes takes on the wire, the pause behind it included.
+    """Returns the maximum bits of a standard data frame of this size, including the interframe space.
 
     Source: ISO 11898-1; 47 bits and the data, and one stuffed bit for every four of the 34 + 8 n that can be stuffed.
     """
@@ -25,12 +25,12 @@ class LoadMeter:
         self.load = 0.0
 
     def add(self, bits: int, now_ns: int) -> None:
-        """So many bits went over the bus."""
+        """Adds bits that went over the bus."""
         self._bits += bits
         self.tick(now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Time has passed."""
+        """Advances the time."""
         elapsed_ns = now_ns - self._since_ns
         if elapsed_ns >= _WINDOW_NS:
             self.load = self._bits * 1e9 / elapsed_ns / self._bitrate

@@ -1,4 +1,4 @@
-"""What an error frame says of the bus: pure, no I/O.
+"""Decoding of CAN error frames. Pure, no I/O.
 
 Source: Linux ``include/uapi/linux/can/error.h``: the class is in the identifier, the controller's state in data[1].
 """
@@ -19,19 +19,19 @@ _ACTIVE: Final = 0x40
 
 
 class ErrorState(IntEnum):
-    """How the controller of this end of the bus is doing; the greater the worse."""
+    """The error state of this end's controller; a higher value is worse."""
 
     ACTIVE = 0
-    """All is well."""
+    """No problem."""
     WARNING = 1
     PASSIVE = 2
-    """It may no longer signal errors to others."""
+    """The controller may no longer signal errors to others."""
     BUS_OFF = 3
-    """It has switched itself off the bus."""
+    """The controller has switched itself off the bus."""
 
     @property
     def word(self) -> ErrorWord:
-        """Its name in ISO 11898-1."""
+        """Returns the name in ISO 11898-1."""
         return _WORDS[self]
 
 
@@ -44,7 +44,7 @@ _WORDS: Final[dict[ErrorState, ErrorWord]] = {
 
 
 def error_state(frame_id: int, data: bytes) -> ErrorState | None:
-    """What an error frame changes the state to; None if it says nothing of it."""
+    """Returns the state that an error frame reports, or None."""
     if frame_id & _BUS_OFF:
         return ErrorState.BUS_OFF
     if frame_id & _RESTARTED:

@@ -1,4 +1,4 @@
-"""Who is told of which frames of a bus; everything belongs to the thread that owns the port."""
+"""Dispatch of received frames to listeners, on the thread that owns the port."""
 
 import time
 from collections.abc import Callable
@@ -9,31 +9,31 @@ from trade_drivers.bus.can._port import CanPort
 __all__ = ["Listeners"]
 
 _SLICE_S: Final = 0.004
-"""Longest wait for a frame before stops are looked for."""
+"""The longest wait for a frame before stops are served."""
 
 
 class Listeners:
-    """One CAN bus, and who listens to what on it."""
+    """One CAN bus and its listeners by identifier."""
 
     def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
         self.port = port
         self._between = between
-        """Called between frames: it may send, but not wait."""
+        """Called between frames; may send, but not wait."""
         self._meanwhile = meanwhile
-        """The same, but only where there is time left."""
+        """Called between frames if there is time left."""
         self._listeners: dict[int, Callable[[bytes], None]] = {}
         self._heard_at = 0.0
 
     def heard_until(self, moment: float) -> bool:
-        """Whether all that had come by then (``time.monotonic()``) has been taken in."""
+        """Returns whether all frames received by this time (``time.monotonic()``) have been processed."""
         return self._heard_at > moment
 
     def hear(self, can_id: int, listener: Callable[[bytes], None]) -> None:
-        """Have frames of an identifier given to a listener."""
+        """Subscribes a listener to an identifier."""
         self._listeners[can_id] = listener
 
     def take_in(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
-        """Take frames in for that long, or until it is enough; 0 takes in what has come already.
+        """Processes frames for a time, or until ``enough`` returns True; 0 processes those already received.
 
         Raises:
             PortLost: the bus is gone.

@@ -1,4 +1,4 @@
-"""A CAN bus as others see it: a service that tells how it is."""
+"""A service that reports the state of a CAN bus."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -14,37 +14,37 @@ ErrorWord = Literal["error-active", "error-warning", "error-passive", "bus-off"]
 
 
 class CanBusState(Struct, frozen=True, kw_only=True):
-    """How a CAN bus is, seen from the driver's end of it."""
+    """The state of a CAN bus at the driver's end."""
 
     name: str
     """The bus, such as ``rosie.bus.legs``."""
     port: str
-    """Such as ``socketcan:can0``."""
+    """The port, such as ``socketcan:can0``."""
     up: bool
-    """False: it is unplugged, down or off the bus; the driver tries to open it again."""
+    """False if the bus is unplugged, down or bus-off; the driver tries to reopen it."""
     state: ErrorWord
-    """Of this end's controller: as its system told when it was opened, then as error frames tell."""
+    """Error state of this end's controller: from the system at opening, then from error frames."""
     load: float
-    """Share of the bit rate that frames took in the last second, 0 to 1, stuffed bits reckoned at their most."""
+    """Share of the bit rate used in the last second, 0 to 1, with the maximum number of stuff bits."""
     error_frames: int
-    """Received since the driver was attached."""
+    """Error frames received since the driver was attached."""
     bus_offs: int
-    """How often it went bus-off since then."""
+    """Number of bus-offs since then."""
 
 
 class CanMonitor:
-    """A CAN bus, to look at. Asking puts nothing on it."""
+    """Monitors a CAN bus. Its services send nothing on the bus."""
 
     def __init__(self, look: Callable[[], CanBusState]) -> None:
         self._look = look
 
     @service(effect="read")
     def bus_state(self) -> CanBusState:
-        """Error state, load, error frames and bus-offs of the bus; also while it is gone."""
+        """Returns error state, load, error frames and bus-offs of the bus, also while it is gone."""
         return self._look()
 
     def health(self) -> str:
-        """What is wrong with everything on this bus, as the registry says it."""
+        """Returns the health of all devices on this bus, as the registry shows it."""
         state = self._look()
         if state.state in {"error-passive", "bus-off"}:
             return f"degraded: CAN {state.state}"

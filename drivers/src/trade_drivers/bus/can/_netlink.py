@@ -1,4 +1,4 @@
-"""What the system knows of one of its CAN interfaces: whether it is up, and how its controller is.
+"""The state of a CAN interface according to Linux: whether it is up, and its controller.
 
 Sources: linux/rtnetlink.h, linux/if_link.h (the request, the attributes), linux/can/netlink.h (those of a controller).
 """
@@ -23,7 +23,7 @@ _LINK_INFO: Final = 18
 _INFO_DATA: Final = 2
 _CAN_BIT_TIMING: Final = 1
 _BITRATE_SIZE: Final = 4
-"""The bit rate comes first in it."""
+"""The structure that begins with the bit rate."""
 _CAN_STATE: Final = 4
 _KIND_MASK: Final = 0x3FFF
 """The two bits above it are flags."""
@@ -32,17 +32,17 @@ _LONGEST: Final = 65_536
 
 
 class Link(NamedTuple):
-    """An interface."""
+    """The state of an interface."""
 
     up: bool
     state: ErrorState | None
-    """None: it has no controller (``vcan``), or it is stopped."""
+    """None if the interface has no controller (``vcan``) or is stopped."""
     bitrate: int | None = None
-    """Bits per second; None: it has no controller, or none was set."""
+    """Bits per second; None if the interface has no controller, or no rate is set."""
 
 
 def look_at(channel: str) -> Link:
-    """Ask the system; raises OSError if there is no such interface."""
+    """Queries the system; raises OSError if there is no such interface."""
     try:
         index = socket.if_nametoindex(channel)
     except OSError:
@@ -56,9 +56,9 @@ def look_at(channel: str) -> Link:
 
 
 def parse_link(answer: bytes) -> Link:
-    """What the system's answer says; raises OSError if it is a refusal."""
+    """Parses the system's answer; raises OSError for a refusal."""
     if len(answer) < _HEADER.size + _LINK.size or _HEADER.unpack_from(answer)[1] != _NEW_LINK:
-        raise OSError("the system does not tell of the interface")
+        raise OSError("the system reports nothing about the interface")
     *_, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
     data = _within(_within(answer[_HEADER.size + _LINK.size :], _LINK_INFO), _INFO_DATA)
     number = int.from_bytes(_within(data, _CAN_STATE) or b"\xff", "little")
@@ -67,7 +67,7 @@ def parse_link(answer: bytes) -> Link:
 
 
 def _within(data: bytes, kind: int) -> bytes:
-    """The attribute of that kind; empty if there is none."""
+    """Returns the attribute of a kind; empty if there is none."""
     return next((value for found, value in _attributes(data) if found == kind), b"")
 
 

@@ -1,4 +1,4 @@
-"""One end of a CAN bus, through python-can: frames out and in, and everything that can go wrong as ``PortLost``."""
+"""One end of a CAN bus through python-can; all its failures become ``PortLost``."""
 
 import logging
 import os
@@ -26,52 +26,52 @@ if TYPE_CHECKING:
 __all__ = ["CanPort", "Frame", "split_port"]
 
 _log = logging.getLogger("trade")
-logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of every frame in two pieces
+logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of each split frame
 _HELLO_S: Final = 1.0
 _SOCKETCAND_PORT: Final = 29536
 _HELLO: Final = b"< hi >"
 _TROUBLE: Final = (can.CanError, OSError, ValueError, IndexError)
-"""What python-can's interfaces raise: not only its own errors."""
+"""The errors that python-can's interfaces raise; not only its own."""
 _FULL: Final = 0.9
 _SLICE_S: Final = 0.01
 _SLOWEST_S: Final = 0.8
-"""Every driver of this project that is not held up says something in it: the slowest cycle there may be is 0.67 s."""
+"""Each running driver of this project sends a frame within this time: the longest cycle is 0.67 s."""
 
 
 class Frame(NamedTuple):
-    """What was received."""
+    """A data frame."""
 
     id: int
     data: bytes
 
 
 def split_port(port: str, where: str) -> tuple[str, str]:
-    """Interface and channel of a text such as ``socketcan:can0``.
+    """Splits a text such as ``socketcan:can0`` into interface and channel.
 
     Raises:
-        ConfigurationError: it is no such text.
+        ConfigurationError: the text has another form.
     """
     interface, colon, channel = port.partition(":")
     if not (interface and colon and channel):
-        problem = f"{port!r} is no CAN bus; write INTERFACE:CHANNEL, such as socketcan:can0"
+        problem = f"{port!r} is not a CAN bus; write INTERFACE:CHANNEL, such as socketcan:can0"
         raise ConfigurationError(where=where, problem=problem)
     return interface, channel
 
 
 def _nobody(_: Talk) -> Collection[int]:
-    """Whoever talks does not matter."""
+    """Accepts any traffic."""
     return ()
 
 
 class CanPort:
-    """A CAN bus as one thread uses it, and no other driver of this host.
+    """A CAN bus for one thread, with a lock against other drivers on this host.
 
     Args:
         path: ``INTERFACE:CHANNEL``.
-        bitrate: bits a second.
-        where: the table of the robot file that describes this bus, for messages; empty: there is none.
-        listen_s: how long to listen, each time it is opened, before anything may be sent.
-        orders: identifiers among what was heard then that only another driver sends.
+        bitrate: bits per second.
+        where: the bus's table in the robot file, for messages; empty if it has none.
+        listen_s: how long to listen after each opening before anything may be sent.
+        orders: returns the identifiers of that traffic that only another driver sends.
     """
 
     def __init__(
@@ -85,11 +85,11 @@ class CanPort:
         self.path = path
         self.state = ErrorState.ACTIVE
         self.errors = 0
-        """Error frames received, ever."""
+        """Total number of error frames received."""
         self.bus_offs = 0
-        """How often it went bus-off."""
+        """Number of bus-offs."""
         self.talk = Talk({})
-        """What was heard when it was opened."""
+        """The traffic heard at the last opening."""
         self._where = where
         self._listen_s, self._orders = listen_s, orders
         self._interface, self._channel = split_port(path, where or path)
@@ -98,20 +98,20 @@ class CanPort:
         self._bitrate = bitrate
         self._bus: can.BusABC | None = None
         self.meter = LoadMeter(bitrate, time.monotonic_ns())
-        self._told_full = False
+        self._was_full = False
 
     @classmethod
     def of(cls, path: str, bus: "CanBus", where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
-        """For a driver: it listens for as long as watchdogs take.
+        """Returns a port for a driver: it listens for as long as watchdogs take.
 
-        What has torque then is fed by somebody else, or is not watched.
+        A device that has torque after that is fed by another driver, or has no watchdog.
         """
         return cls(path, bus.bitrate, where, max(_SLOWEST_S, bus.watchdog_s + 0.1), orders)
 
     def _known_as(self) -> str:
-        """What this bus is to all of this host."""
+        """Returns the name of this bus for all processes on this host."""
         match self._interface:
-            case "virtual":  # each process has its own
+            case "virtual":  # private to each process
                 return f"{self.path} of {os.getpid()}"
             case _ if self._channel.startswith("/"):
                 return f"{self._interface}:{os.path.realpath(self._channel)}"
@@ -119,12 +119,12 @@ class CanPort:
                 return self.path
 
     def open(self) -> None:
-        """Begin to use it, after listening who talks there. Nothing is sent.
+        """Opens the bus after listening for other drivers. Sends nothing.
 
         Raises:
-            PortLost: it is not there, at present.
-            ConfigurationError: another driver has it, on this host or elsewhere; python-can knows no such interface, or
-                it needs another package.
+            PortLost: the bus is not present.
+            ConfigurationError: another driver has the bus, on this host or elsewhere; or python-can does not know the
+                interface, or needs another package for it.
         """
         self.close()
         try:
@@ -140,7 +140,7 @@ class CanPort:
 
     def _begin(self) -> None:
         options = self._options()
-        if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
+        if self.state is not ErrorState.BUS_OFF:  # only a frame or the system shows the end of bus-off
             self.state = ErrorState.ACTIVE
         if self._interface == "socketcan":
             self._look_over()
@@ -167,10 +167,10 @@ class CanPort:
             raise self._wrong("channel", problem)
 
     def _look_over(self) -> None:
-        """What the system knows of the interface already.
+        """Checks the state of the interface in the system.
 
         Raises:
-            PortLost: it is not there, is down, or its controller is bus-off.
+            PortLost: the interface does not exist, is down, or its controller is bus-off.
         """
         with losing(OSError):
             link = look_at(self._channel)
@@ -180,7 +180,7 @@ class CanPort:
             self._enter(link.state)
 
     def look(self, name: str) -> CanBusState:
-        """How it is now; from any thread."""
+        """Returns the current state; callable from any thread."""
         return CanBusState(
             name=name,
             port=self.path,
@@ -200,7 +200,7 @@ class CanPort:
                 return {"host": host, "port": port, "channel": channel, "tcp_tune": True}
             case "slcan":
                 return {"channel": self._channel, "bitrate": self._bitrate, "sleep_after_open": 0}
-            case "socketcan" | "virtual":  # the system sets the one's bit rate, the other has none
+            case "socketcan" | "virtual":  # socketcan's bit rate is set by the system, virtual has none
                 return {"channel": self._channel}
             case _:
                 return {"channel": self._channel, "bitrate": self._bitrate}
@@ -217,7 +217,7 @@ class CanPort:
         return host, int(port or _SOCKETCAND_PORT), channel
 
     def close(self) -> None:
-        """Let go of it; more than once is fine."""
+        """Closes the bus. Idempotent."""
         bus, self._bus = self._bus, None
         self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
         if bus is not None:
@@ -226,18 +226,18 @@ class CanPort:
         self._lock.release()
 
     def send(self, frame_id: int, data: bytes) -> None:
-        """One frame out; never waits.
+        """Sends one frame; never waits.
 
         Raises:
-            PortLost: it could not be sent.
+            PortLost: the frame could not be sent.
         """
         self.send_all([Frame(frame_id, data)])
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Frames out, in this order, and in one write where the interface has that; never waits.
+        """Sends frames in this order, in one write if the interface supports that; never waits.
 
         Raises:
-            PortLost: they could not be sent, or not all of them.
+            PortLost: not all frames could be sent.
         """
         messages = [can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False) for frame in frames]
         bus = self._open_bus()
@@ -252,10 +252,10 @@ class CanPort:
         self._count(sum(frame_bits(len(frame.data)) for frame in frames))
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """One data frame, or None when none has come in that time (or an error frame has).
+        """Returns a data frame, or None if none arrives in time or an error frame does.
 
         Raises:
-            PortLost: the bus is gone, or this end has switched itself off it.
+            PortLost: the bus is gone, or this end is bus-off.
         """
         bus = self._open_bus()
         try:
@@ -269,7 +269,7 @@ class CanPort:
             self._take_error(message.arbitration_id, bytes(message.data))
             return None
         if self.state is ErrorState.BUS_OFF:
-            self._enter(ErrorState.ACTIVE)  # nothing is heard in bus-off
+            self._enter(ErrorState.ACTIVE)  # nothing is received in bus-off
         self._count(frame_bits(len(message.data)))
         if message.is_extended_id or message.is_remote_frame:
             return None
@@ -283,11 +283,11 @@ class CanPort:
     def _count(self, bits: int) -> None:
         self.meter.add(bits, time.monotonic_ns())
         full = self.meter.load > _FULL
-        if full and not self._told_full:
+        if full and not self._was_full:
             _log.warning(
                 "%s: the bus is %.0f %% full; lower rate_hz or raise the bit rate", self.path, self.meter.load * 100
             )
-        self._told_full = full
+        self._was_full = full
 
     def _take_error(self, frame_id: int, data: bytes) -> None:
         self.errors += 1
@@ -296,7 +296,7 @@ class CanPort:
             self._enter(state)
 
     def _enter(self, state: ErrorState) -> None:
-        """Note how its controller is; raises PortLost for bus-off."""
+        """Records the state of the controller; raises PortLost for bus-off."""
         before, self.state = self.state, state
         if state != before:
             _log.log(logging.INFO if state < before else logging.WARNING, "%s: the bus is %s", self.path, state.word)
@@ -314,10 +314,10 @@ class CanPort:
 
 
 def _greet(host: str, port: int) -> None:
-    """Find out with a deadline whether a server answers: python-can's own client has none."""
+    """Checks with a timeout whether a server answers, as python-can's client has no timeout."""
     try:
         with socket.create_connection((host, port), _HELLO_S) as probe:
             if not probe.recv(len(_HELLO)).startswith(b"<"):
-                raise PortLost(f"{host}:{port} is no socketcand")
+                raise PortLost(f"{host}:{port} is not a socketcand server")
     except OSError as bad:
         raise PortLost(f"{host}:{port}: {bad}") from None

@@ -1,4 +1,4 @@
-"""Who talks on a bus by itself, to be heard before anything is said: what asks one kind of device commands another.
+"""Listening for traffic before sending, since a request to one kind of device commands another kind.
 
 Sources: ODrive documentation, "CANSimple protocol" (heartbeat); CiA 301 (error control).
 """
@@ -9,25 +9,25 @@ from typing import Final
 __all__ = ["Talk"]
 
 _BEAT: Final = 0x01
-"""The low five bits of an ODrive's heartbeat; the others are its node."""
+"""The low five bits of the identifier of an ODrive's heartbeat; the others are its node."""
 _BEAT_SIZE: Final = 8
 _MOST_STATE: Final = 14
 _MOST_RESULT: Final = 14
 _ERROR_CONTROL: Final = 0x700
-"""Added to the node of a CANopen device, which tells its state in one byte."""
+"""Added to the node for the identifier of a CANopen device's heartbeat, which has one byte."""
 _STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
 _NODE: Final = 0x7F
 
 
 class Talk:
-    """What was heard, by identifier."""
+    """Received frames by identifier."""
 
     def __init__(self, frames: Mapping[int, Sequence[bytes]]) -> None:
         self.frames = frames
 
     @property
     def canopen(self) -> frozenset[int]:
-        """Nodes of CANopen that tell their state."""
+        """Returns the CANopen nodes that send heartbeats."""
         return frozenset(
             can_id & _NODE
             for can_id, frames in self.frames.items()
@@ -36,10 +36,10 @@ class Talk:
 
     @property
     def odrives(self) -> dict[int, bytes]:
-        """Nodes of ODrives, and the last heartbeat of each.
+        """Returns the nodes of ODrives with the last heartbeat of each.
 
-        The measurements of a CANopen node may have such an identifier and look alike: where one has told its state,
-        they are taken for its own.
+        Measurements of a CANopen node may have the same identifier and form. If that node has sent a heartbeat, the
+        frames are attributed to it.
         """
         theirs = self.canopen
         return {

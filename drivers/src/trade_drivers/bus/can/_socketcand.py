@@ -10,8 +10,8 @@ __all__ = ["ServerBus"]
 
 
 class ServerBus(SocketCanDaemonBus):
-    """python-can's own; each write of its wakes the server, and is acknowledged."""
+    """python-can's bus; each write wakes the server and is acknowledged, so several frames share one."""
 
     def send_all(self, messages: Iterable[can.Message]) -> None:
-        """Frames out, in this order."""
+        """Sends frames in this order."""
         self._tcp_send("".join(map(convert_can_message_to_ascii_message, messages)))
