@@ -25,8 +25,7 @@ _STILL_S: Final = 0.04
 """For so long a device of these tests may go unattended."""
 _LATE: Final = re.compile(
     r"was held up for [\d.]+ s|did not answer on [^\s;]+( for [\d.]+ s)?|did not answer within \d+ ms"
-    r"|no(body| device) answers;"
-    r"|it was away; remove the cause|it heard nothing for too long; remove the cause"
+    r"|no(body| device) answers;|it was away; remove the cause|it heard nothing for too long; remove the cause"
 )
 _CLOCK: Final = f"""
 import os, time

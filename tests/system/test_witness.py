@@ -70,4 +70,4 @@ def test_a_joint_of_one_robot_fails_and_the_camera_of_another_takes_a_picture(
     assert fault["id"] in listed.stdout
     nobody = trade_command("faults", "show", "dora-none")
     assert nobody.returncode == 1
-    assert "there is no fault 'dora-none'; `trade faults` lists those there are" in nobody.stderr
+    assert "there is no fault 'dora-none'; `trade faults` lists all faults" in nobody.stderr

@@ -87,9 +87,7 @@ def test_what_is_no_serial_port_is_named_with_its_key(head: Rig, tmp_path: Path,
     (tmp_path / "file").touch()
     port = {"file": tmp_path / "file", "folder": tmp_path, "device": Path("/dev/null")}[kind]
     text = refused(head, ports={"neck": str(port)})
-    assert (
-        text == f"head.toml: bus.neck.port: {port}: is no serial port; `ls -l /dev/serial/by-id` shows those there are"
-    )
+    assert text == f"head.toml: bus.neck.port: {port}: is not a serial port; `ls -l /dev/serial/by-id` lists the ports"
 
 
 def test_the_port_of_the_file_is_used_unless_another_is_given(head: Rig) -> None:
@@ -156,7 +154,7 @@ def test_a_gear_is_refused_where_it_would_not_be_heeded(head: Rig) -> None:
             ('driver = "dynamixel"', 'driver = "dynamixle"'),
             "there is no driver 'dynamixle'; installed: cia402, damiao, dynamixel, ",
         ),
-        (("XL430-W250", "AX-12A"), "'AX-12A' is unknown to the driver dynamixel; it knows XL430-W250, XC430-W150, "),
+        (("XL430-W250", "AX-12A"), "'AX-12A' is unknown to the driver dynamixel; it supports XL430-W250, XC430-W150, "),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nrate_hz = 5'), "rate_hz: 5 is too slow"),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 57600\nrate_hz = 200'), "at most"),
         (

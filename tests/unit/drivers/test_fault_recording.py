@@ -251,7 +251,7 @@ def test_a_device_of_another_driver_is_asked_and_its_mistakes_are_faults_too() -
         "overload": ("rosie.pan: overload", False),
         "silent": (str(silent), False),
         "TypeError": (
-            "rosie.pan: its state cannot be read: TypeError('NoneType is no record of what was measured')",
+            "rosie.pan: its state cannot be read: TypeError('NoneType is not a state or a reading')",
             False,
         ),
         "ZeroDivisionError": ("rosie.pan: its state cannot be read: ZeroDivisionError('oops')", False),

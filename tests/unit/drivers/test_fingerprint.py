@@ -52,7 +52,7 @@ def test_a_feetech_servo_with_another_firmware_is_refused_and_both_are_named(tai
 def test_servos_have_no_serial_number(rig: Rig) -> None:
     rig.configure(("id = 1\n", "id = 1\nserial_number = 7\n"))
     rig.plug()
-    with pytest.raises(ConfigurationError, match="tell no serial number; leave this key out"):
+    with pytest.raises(ConfigurationError, match="report no serial number; remove this key"):
         rig.attach()
 
 

@@ -41,7 +41,7 @@ def send(bus: can.BusABC, node: int, command: Command, data: bytes) -> None:
         (('leave = "relax"', 'leave = "hold"'), "lets go"),
         (('model = "ODrive S1"', 'model = "ODrive S1"\ncounts_per_rev = 4096'), "turns, not counts"),
         (('model = "ODrive S1"', 'model = "ODrive S1"\nhoming_counts = 7'), "is for servos"),
-        (('model = "ODrive S1"', 'model = "ODrive v3.6"'), "is none of"),
+        (('model = "ODrive S1"', 'model = "ODrive v3.6"'), "is not one of"),
         (('model = "ODrive S1"', 'model = "ODrive S1"\nserial_number = 7'), "no serial number here"),
         (("id = 2", "id = 63"), "is no node"),
         (("watchdog_s = 0.4", "watchdog_s = 0.6"), "enable.. waits"),
@@ -61,7 +61,7 @@ def test_an_odrive_is_refused_for_what_the_file_says(odrives: MotorRig, change: 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (('model = "DM4310"', 'model = "DM1"'), "is none of"),
+        (('model = "DM4310"', 'model = "DM1"'), "is not one of"),
         (('model = "DM4310"', 'model = "DM4310"\nhoming_counts = 7'), "is for servos"),
         (('model = "DM4310"', 'model = "DM4310"\nserial_number = 7'), "no serial number here"),
         (("id = 2", "id = 16"), "1 to 15"),

@@ -40,11 +40,11 @@ def test_the_examples_are_refused_by_nobody(path: Path) -> None:
     [
         (TAIL, ("min_rad = -1.4", "min_rad = -70"), 'joint."tail.root".min_rad', "to 3.14"),
         (TAIL, ("min_rad = -1.4", "min_rad = -70"), 'joint."tail.root".min_rad', "degrees? radians are meant"),
-        (TAIL, ("max_rad = 0.6", "max_rad = 4"), 'joint."tail.tip".max_rad', "4 is outside of what an STS3215 can"),
+        (TAIL, ("max_rad = 0.6", "max_rad = 4"), 'joint."tail.tip".max_rad', "4 is outside the range of an STS3215"),
         (HEAD, ("max_rad = 1.4", "max_rad = 50"), 'joint."neck.pan".max_rad', "degrees? radians are meant"),
         (TAIL, ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 60"), 'joint."tail.root".max_accel_rad_s2', "above"),
         (TAIL, ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 0.5"), 'joint."tail.root".max_accel_rad_s2', "takes"),
-        (TAIL, ('"STS3215"', '"STS3216"'), 'joint."tail.root".model', "it knows STS3215"),
+        (TAIL, ('"STS3215"', '"STS3216"'), 'joint."tail.root".model', "it supports STS3215"),
         (TAIL, ("[bus.tail]", "[bus.tail]\nbaud = 57600"), "bus.tail.baud", "57600 is no rate of these servos"),
         (TAIL, ("[bus.tail]", "[bus.tail]\nbaud = 1_000_001"), "bus.tail.baud", "they know 115200, 128000"),
         (HEAD, ("[bus.neck]", "[bus.neck]\nbaud = 38400"), "bus.neck.baud", "they know 9600"),
@@ -59,7 +59,7 @@ def test_the_examples_are_refused_by_nobody(path: Path) -> None:
         (LEG, ('"socketcan"', '"socketcan"\nrate_hz = 5'), "bus.legs.rate_hz", "too slow"),
         (PICTURES, ("url", "urls"), "camera.eye.urls", "unknown key; the keys are url, "),
         (PICTURES, ("http:", "ftp:"), "camera.eye.url", ""),
-        (PICTURES, ('"snapshot"', '"feetech"'), "camera.eye.driver", "is no subclass of trade_drivers.SenseDriver"),
+        (PICTURES, ('"snapshot"', '"feetech"'), "camera.eye.driver", "is not a subclass of trade_drivers.SenseDriver"),
     ],
 )
 def test_what_a_driver_cannot_do_is_refused_with_file_key_and_what_would_be_right(

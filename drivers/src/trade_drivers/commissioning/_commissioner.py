@@ -190,7 +190,7 @@ class Commissioner(ABC):
         """
         where = f"{port}, id {device_id}"
         if to not in self.bauds:
-            problem = f"{to} is not a rate of these devices; use one of {', '.join(map(str, self.bauds))}"
+            problem = f"{to} is no rate of these devices; they know {', '.join(map(str, self.bauds))}"
             raise ConfigurationError(where=where, problem=problem)
         if to != baud:
             with self._changing(port, to, where) as bench:

@@ -88,7 +88,7 @@ class Lockable(ABC):
     """A device that locks, fences and stops apply to."""
 
     members: Members = MappingProxyType({})
-    """The joints of each group of the robot, from the robot file; a lock of a group is a lock of all its joints."""
+    """The devices of each group of the robot, from the robot file; a lock of a group is a lock of all of them."""
 
     @property
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Joints with a position drive on a bus: what drivers of every vendor have in common, one owner thread a bus."""
+"""The common base of drivers for joints with a position drive, with one owner thread per bus."""
 
 from trade_drivers.bus._jobs import Gate, PortLost, Steps, Work
 from trade_drivers.bus._thread import BusThread, Port, start_thread

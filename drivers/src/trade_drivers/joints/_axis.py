@@ -1,4 +1,4 @@
-"""One joint as its bus thread knows it: what was measured last, how it is, and how counts become radians."""
+"""The state of one joint on its bus thread, and the conversion of counts to radians."""
 
 import time
 from abc import abstractmethod
@@ -26,24 +26,24 @@ _AT_REST: Final = 2
 
 
 class Grain(Struct, frozen=True):
-    """What one count of a device means, and how much of it is noise."""
+    """The resolution of a device's counts, and its thresholds for rest and arrival."""
 
     rad: float
-    """Of a position."""
+    """Radians per count of a position."""
     rad_s: float
-    """Of a velocity."""
+    """rad/s per count of a velocity."""
     rad_s2: float
-    """Of an acceleration."""
+    """rad/s^2 per count of an acceleration."""
     centre: float
-    """The position that is the joint's offset."""
+    """The position in counts at the joint's offset."""
     still_velocity: int
-    """Measured slower than this, or as slow, it may be at rest."""
+    """The maximum measured speed at rest."""
     still_counts: int
-    """So it may if its position has not changed by more."""
+    """The maximum change of position at rest."""
     arrived: int
-    """Closer than this to its goal and at rest: arrived."""
+    """A joint at rest within this distance of its goal has arrived."""
     near: int
-    """Closer than this and no longer coming closer: arrived too, as far as the position loop goes."""
+    """A joint within this distance that makes no progress has also arrived, within the limits of its position loop."""
 
 
 class Sample(Struct, frozen=True, gc=False):
@@ -56,7 +56,7 @@ class Sample(Struct, frozen=True, gc=False):
 
 
 class Goal(Struct, frozen=True, gc=False):
-    """Where to, and how fast at most, in counts."""
+    """Goal position and maximum speed, in counts."""
 
     position: int
     accel: int
@@ -64,7 +64,7 @@ class Goal(Struct, frozen=True, gc=False):
 
 
 class Scale:
-    """Counts of the device to radians of the joint and back."""
+    """Converts counts of the device to radians of the joint and back."""
 
     def __init__(self, joint: Joint, grain: Grain) -> None:
         self._sign = -1 if joint.reversed else 1
@@ -72,19 +72,19 @@ class Scale:
         self._grain = grain
 
     def counts(self, angle_rad: float) -> float:
-        """Where an angle lies, in counts; not rounded."""
+        """Returns an angle in counts, not rounded."""
         return self._grain.centre + (angle_rad - self._offset_rad) * self._sign / self._grain.rad
 
     def angle_rad(self, counts: int) -> float:
-        """The joint angle of a position."""
+        """Returns the joint angle of a position."""
         return self._offset_rad + (counts - self._grain.centre) * self._sign * self._grain.rad
 
     def speed_rad_s(self, counts: int) -> float:
-        """The joint's speed, with its sign."""
+        """Returns the joint's speed, with its sign."""
         return counts * self._sign * self._grain.rad_s
 
     def load(self, counts: int, full: int) -> float:
-        """Effort as a fraction of full, with the joint's sign, at most 1."""
+        """Returns the effort as a fraction of ``full``, with the joint's sign, at most 1."""
         return max(-1.0, min(1.0, counts * self._sign / full))
 
 
@@ -103,15 +103,15 @@ class Axis(BusDevice[Sample]):
         self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 
         self.remedy = ""
-        """What helps against a fault the device itself has latched."""
+        """The remedy for a fault that the device itself has latched."""
         self.ready = False
-        """Enabled by this driver, which has checked and armed it since."""
+        """True after this driver has enabled the joint, with its checks done and its watchdog armed."""
         self.motion: Motion[Any] | None = None
         self.held_counts: int | None = None
-        """Where it was last told to hold."""
+        """The position of the last hold command."""
 
     def note(self, sample: Sample) -> None:
-        """Keep a cyclic measurement."""
+        """Stores a cyclic measurement."""
         before, self.sample = self.sample, sample
         resting = abs(sample.velocity) <= self.grain.still_velocity and (
             before is not None and abs(sample.position - before.position) <= self.grain.still_counts
@@ -122,32 +122,32 @@ class Axis(BusDevice[Sample]):
     @property
     @abstractmethod
     def may_hold_torque(self) -> bool:
-        """Torque is on, or nobody knows."""
+        """Returns True if torque is on or unknown."""
 
     @abstractmethod
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
-        """What was last measured.
+        """Returns the newest measurement.
 
         Raises:
-            DeviceSilent: it is too old.
+            DeviceSilent: the measurement is too old.
         """
 
     def tell_moving(self) -> None:
-        """Let the resource know whether it moves: as last measured or commanded, turned by hand does not count."""
+        """Sets ``resource.moving`` from measurements and commands; turning by hand does not count."""
         under_way = self.motion is not None or self.halting_since_ns > 0
         if under_way or not (self.silent or self.doubted):
             self.resource.moving = under_way or (self.still < _AT_REST and self.may_hold_torque)
 
     @property
     def moved_since_held(self) -> bool:
-        """Whether it was measured, since it was last told to hold, and found moving."""
+        """Returns whether a measurement after the last hold command shows motion."""
         return not self.silent and not self.still and self.sample is not None and self.sample.at_ns > self.held_ns
 
     def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
-        """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way.
+        """Returns where to hold: the measured position, or, if that is old, the position expected from the motion.
 
-        Not heard for longer than ``blind_ns``, it has stopped by itself, no farther than where it got by then. Told to
-        hold and not measured since, it stays there: to go back to the measurement would be motion.
+        A joint without an answer for ``blind_ns`` has stopped by itself, no farther than it could move in that time. A
+        joint that was not measured since its last hold command stays there, as going back would be motion.
         """
         sample = self.sample
         if sample is None:
@@ -163,20 +163,20 @@ class Axis(BusDevice[Sample]):
         return round(max(low, min(high, sample.position + travelled)))
 
     def check_goal(self, counts: int) -> None:
-        """The last look before the wire.
+        """Runs the last check of a goal before it is sent.
 
         Raises:
-            LimitExceeded: outside the joint's range.
+            LimitExceeded: the goal is outside the joint's range.
         """
         if not self.low <= counts <= self.high:
             joint, value = self.joint, self.scale.angle_rad(counts)
             raise LimitExceeded(what=self.name, value=value, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
 
     def check_usable(self, now_ns: int, stale_after_ns: int) -> Sample:
-        """The newest measurement, if the joint may be commanded.
+        """Returns the newest measurement if the joint may be commanded.
 
         Raises:
-            DeviceSilent: it does not answer.
+            DeviceSilent: the joint does not answer.
             DeviceFault: a fault is latched.
         """
         if self.fault:
@@ -204,7 +204,7 @@ class Axis(BusDevice[Sample]):
         temperature_c: float | None,
         voltage_v: float | None,
     ) -> MotorState:
-        """A state with this measurement in it."""
+        """Returns a state with this measurement."""
         age_s = (now_ns - sample.at_ns) / 1e9
         return MotorState(
             name=self.name,

@@ -1,4 +1,4 @@
-"""The cyclic exchange with the joints of one bus, whoever built them: stops, work, motions, holding."""
+"""The cyclic exchange with the joints of one bus: stops, work, motions, holding."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,68 +15,68 @@ __all__ = ["Exchange"]
 
 
 class Exchange(BusCycle[AxisT]):
-    """What happens on one bus of joints. ``stop`` is for any thread, too."""
+    """The exchange with the joints of one bus. Any thread may also call ``stop``."""
 
-    # --- what a device of this kind is told, and how
+    # --- commands, which depend on the kind of device
 
     @abstractmethod
     def write_goals(self, goals: Mapping[AxisT, Goal], gate: Gate) -> None:
-        """Send joints on their way, all of them or none; the gate is asked right before the bytes go out."""
+        """Sends goals to all joints or none; the gate is called immediately before the bytes are sent."""
 
     @abstractmethod
     def write_positions(self, positions: Mapping[AxisT, int], gate: Gate) -> None:
-        """The same for joints on their way, as fast as they are already; only if they ``can_take_goals``."""
+        """Sends new goals to moving joints at an unchanged speed; only if they ``can_take_goals``."""
 
-    def cycles_a_goal(self, axes: Sequence[AxisT]) -> int:  # noqa: ARG002 - most devices take one in each
-        """How many cycles it takes at most until these joints can take the next position of a trajectory."""
+    def cycles_a_goal(self, axes: Sequence[AxisT]) -> int:  # noqa: ARG002 - most devices accept one in each
+        """Returns the maximum number of cycles between two positions of a trajectory for these joints."""
         return 1
 
     def reached_ns(self, axes: Sequence[AxisT]) -> int | None:  # noqa: ARG002 - as above
-        """When joints that go from position to position are at one that is written now.
+        """Returns when joints that interpolate between positions reach one that is written now.
 
-        None for joints that brake by themselves for each: theirs is to be where they would come to rest.
+        None for joints that brake for each goal by themselves; their goal is the point where they would come to rest.
         """
         return None
 
-    def can_take_goals(self, axes: Sequence[AxisT]) -> bool:  # noqa: ARG002 - most devices take a goal at any time
-        """Whether these joints can take new goals now, and nothing else is about to give them some."""
+    def can_take_goals(self, axes: Sequence[AxisT]) -> bool:  # noqa: ARG002 - most devices accept goals at any time
+        """Returns whether these joints can accept new goals now, and no other motion is about to send any."""
         return True
 
     @abstractmethod
     def write_holds(self, positions: Mapping[AxisT, int]) -> None:
-        """Have joints brake as hard as they may and hold, near these positions. Never waits."""
+        """Makes joints brake at their maximum deceleration and hold near these positions. Never waits."""
 
     @abstractmethod
     def enabling(self, job: Work[AxisT], axis: AxisT) -> Steps:
-        """Torque on where the joint is measured to be, watchdog armed, all of it read back; then it is ``ready``."""
+        """Arms the watchdog and switches torque on at the measured position, reads both back, and sets ``ready``."""
 
     @abstractmethod
     def relaxing(self, job: Work[AxisT], axis: AxisT) -> Steps:
-        """Torque off, watchdog disarmed."""
+        """Switches torque off and disarms the watchdog."""
 
     @abstractmethod
     def looking(self, axis: AxisT) -> Steps:
-        """How the joint is, asked now."""
+        """Reads the joint's health now."""
 
     def making_way(self, job: Motion[AxisT]) -> Steps:  # noqa: ARG002 - as above
-        """Wait until its joints can take what it will tell them; ends what moves them, if that must rest first."""
+        """Waits until the joints can accept the commands; ends their current motion if they must be at rest."""
         yield from ()
 
     @abstractmethod
     def leaving(self, job: Work[AxisT], axis: AxisT, *, relax: bool) -> Steps:
-        """Torque off or left on, watchdog disarmed where it may be."""
+        """Switches torque off or leaves it on, and disarms the watchdog where that is allowed."""
 
     # --- from any thread
 
     def stop(self, axes: Sequence[AxisT], reason: str = "") -> StopTicket[AxisT]:
-        """Void what was admitted for these joints, and have them hold before anything else happens on the bus."""
+        """Voids all permits for these joints, and makes them hold before anything else happens on the bus."""
         reason = reason or self.why(axes)
         return self.order_stop(axes, reason, lambda: self.halt(axes, reason))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:
         if not self.devices:
             return
-        with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
+        with suppress(TradeError):  # an offline joint keeps its watchdog; the others are left properly
             self.stop(self.devices, "its driver is leaving").wait(alive)
         leave = Leave(self, self.devices, relax=relax)
         self.submit(leave)
@@ -85,7 +85,7 @@ class Exchange(BusCycle[AxisT]):
     # --- from the bus thread
 
     def halt(self, axes: Iterable[AxisT], reason: str) -> None:
-        """End the motions of these joints, whole groups, and have all of them hold where they are."""
+        """Ends the motions of these joints and their groups, and makes all of them hold where they are."""
         held = dict.fromkeys(axes)
         for axis in tuple(held):
             if (motion := axis.motion) is not None:
@@ -102,17 +102,17 @@ class Exchange(BusCycle[AxisT]):
         self.halt(self.devices, reason)
 
     def _at_rest(self, axis: AxisT, now_ns: int) -> bool:
-        """Nothing to stop: no torque, or no motion of ours and seen not to move."""
+        """Returns whether there is nothing to stop: no torque, or no commanded motion and measured at rest."""
         idle = axis.motion is None and axis.still >= 2 and axis.age_ns(now_ns) <= self.stale_after_ns
         return idle or not axis.may_hold_torque
 
     def end_motion(self, axis: AxisT, reason: str) -> None:
-        """End the motion of a joint that is being relaxed; the other members of its group hold."""
+        """Ends the motion of a joint that is being relaxed; the other members of its group hold."""
         if (motion := axis.motion) is not None:
             self.halt(motion.devices, reason)
 
     def release(self, motion: Motion[AxisT], error: TradeError | None) -> None:
-        """A watched motion has ended: well, or with an error and all its joints held."""
+        """Completes a watched motion: successfully, or with an error and all its joints holding."""
         try:
             if error is not None:
                 self.hold([axis for axis in motion.devices if axis.may_hold_torque], self.clock())
@@ -122,7 +122,7 @@ class Exchange(BusCycle[AxisT]):
             self._forget(motion, error)
 
     def take_over(self, motion: Motion[AxisT]) -> None:
-        """A motion's goals are out: those it replaces have ended, and what they left behind holds."""
+        """Starts to watch a motion after its goals are sent; ends the motions it replaces, whose other joints hold."""
         motion.note("wrote goal")
         motion.attended_ns = self.lasting_clock()
         replaced = dict.fromkeys(axis.motion for axis in motion.devices if axis.motion is not None)
@@ -139,14 +139,14 @@ class Exchange(BusCycle[AxisT]):
             self._forget(device.motion, error_of(device))
 
     def require_answering(self, axis: AxisT) -> None:
-        """Raises ``DeviceSilent`` for a joint that is left out because it does not answer."""
+        """Raises ``DeviceSilent`` for a joint that is left out of the cycles because it does not answer."""
         if axis.silent:
             raise axis.deaf(self.clock())
 
     # --- parts of a cycle
 
     def watch(self) -> None:
-        """Look at motions and stops with what was measured, and end what is over."""
+        """Checks motions and stops against the new measurements, and completes those that are over."""
         now_ns = self.clock()
         for motion in dict.fromkeys(axis.motion for axis in self.devices if axis.motion is not None):
             motion.watch(now_ns)
@@ -160,17 +160,17 @@ class Exchange(BusCycle[AxisT]):
         self.answer_stops(now_ns)
 
     def _watch_halt(self, axis: AxisT, now_ns: int, again: list[AxisT]) -> None:
-        """A fault says nothing of its having stopped; but who has one is told nothing more.
+        """Repeats the hold of a joint that still moves, unless it has a fault; a fault does not prove that it stopped.
 
-        Of who is silent nobody sees the rest: a stop says so, and who is back is not told to hold by an old one.
+        An offline joint cannot be seen at rest: its stop reports that, and it is not repeated when the joint is back.
         """
         if axis.still >= 2 or not axis.may_hold_torque or axis.silent:
             axis.halting_since_ns = 0
         elif not axis.fault and now_ns - axis.halting_since_ns <= HALT_NS and axis.moved_since_held:
-            again.append(axis)  # it was still on its way: so it need not come back as far
+            again.append(axis)  # still moving, so that it comes back a shorter way
 
     def hold(self, axes: Sequence[AxisT], now_ns: int) -> None:
-        """Have joints hold, and watch them until they are at rest."""
+        """Makes joints hold, and watches them until they are at rest."""
         positions: dict[AxisT, int] = {}
         for axis in axes:
             axis.held_counts = axis.hold_counts(now_ns, self.watchdog_ns)

@@ -1,4 +1,4 @@
-"""Checks of a robot file that are the same for joints of every vendor."""
+"""Checks of a robot file for joints of all vendors."""
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
@@ -15,7 +15,7 @@ _BRAKING_S: Final = 1.5
 
 
 class Unfit(Exception):
-    """A joint's device cannot be used as it is; what is wrong, and of which key of the joint."""
+    """A joint's device cannot be used as it is; has the reason and the key of the joint."""
 
     def __init__(self, problem: str, key: str = "") -> None:
         super().__init__(problem)
@@ -23,10 +23,10 @@ class Unfit(Exception):
 
 
 def check_joints(axes: Iterable[AxisT], where: str, check: Callable[[AxisT], None]) -> None:
-    """Check each joint, and whether it brakes in time.
+    """Checks each joint, and whether it brakes in time.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     for axis in axes:
         try:
@@ -44,7 +44,7 @@ def _check_braking(axis: Axis) -> None:
 
 
 def check_least(axis: Axis, least: str) -> None:
-    """Raises ``Unfit`` for limits below what the device resolves; ``least`` says what that is."""
+    """Raises ``Unfit`` for limits below the device's resolution; ``least`` describes it."""
     for key, value, count in (
         (".max_speed_rad_s", axis.joint.max_speed_rad_s, axis.grain.rad_s),
         (".max_accel_rad_s2", axis.joint.max_accel_rad_s2, axis.grain.rad_s2),
@@ -54,7 +54,7 @@ def check_least(axis: Axis, least: str) -> None:
 
 
 def check_rate(bus: "Bus", where: str, times: int) -> None:
-    """Raises ``ConfigurationError`` for a rate with fewer cycles than that before a watchdog expires."""
+    """Raises ``ConfigurationError`` for a rate with too few cycles before a watchdog expires."""
     least_hz = times / min(bus.watchdog_s, bus.stale_after_s)
     if bus.rate_hz < least_hz:
         problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"

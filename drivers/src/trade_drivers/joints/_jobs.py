@@ -1,4 +1,4 @@
-"""What services ask of the bus thread: work of several exchanges, done one exchange at a time between the cycles."""
+"""Jobs of services for the bus thread, which runs them one exchange at a time between cycles."""
 
 from collections.abc import Sequence
 from enum import Enum
@@ -15,18 +15,18 @@ __all__ = ["Enable", "Halt", "Leave", "Manner", "Relax"]
 
 
 class Manner(Enum):
-    """What a motion is going to tell its joints, for devices that have a mode for each."""
+    """The kind of a motion's commands, for devices with a mode for each."""
 
     GOALS = "goals"
-    """Where to go, now and then."""
+    """A goal to move to."""
     POSITIONS = "positions"
-    """Where to be, in every cycle."""
+    """A position in each cycle."""
     SPEEDS = "speeds"
-    """How fast to turn, and where to end at the latest."""
+    """A velocity, and the position where it must end."""
 
 
 class Enable(Command[AxisT, "Exchange[AxisT]"]):
-    """Torque on, holding where the joints are. A joint that is enabled already is only looked at, not disturbed."""
+    """Switches torque on at the measured positions. A joint that is already enabled is only checked."""
 
     def steps(self) -> Steps:
         for axis in self.devices:
@@ -38,7 +38,7 @@ class Enable(Command[AxisT, "Exchange[AxisT]"]):
 
 
 class Halt(Command[AxisT, "Exchange[AxisT]"]):
-    """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
+    """Ends any motion of the joints, which then hold. Unlike a stop, it needs a permit and voids none."""
 
     def steps(self) -> Steps:
         self.gate()
@@ -49,7 +49,7 @@ class Halt(Command[AxisT, "Exchange[AxisT]"]):
 
 
 class Relax(Command[AxisT, "Exchange[AxisT]"]):
-    """Torque off."""
+    """Switches torque off."""
 
     def steps(self) -> Steps:
         for axis in self.devices:
@@ -61,10 +61,10 @@ class Relax(Command[AxisT, "Exchange[AxisT]"]):
 
 
 class Leave(Work[AxisT]):
-    """The driver goes, after it has stopped everything: hold or relax, as the robot file says.
+    """The shutdown of the driver after all joints were stopped: hold or relax, as the robot file says.
 
-    A joint that holds is disarmed once it was seen at rest: silence on the bus is then what is wanted, and an expired
-    watchdog would only hinder whoever comes next. Not seen at rest, or silent: its watchdog stays armed.
+    The watchdog of a holding joint is disarmed after the joint was seen at rest, since the driver's silence is then
+    intended and an expired watchdog would hinder the next driver. Otherwise it stays armed.
     """
 
     def __init__(self, exchange: "Exchange[AxisT]", axes: Sequence[AxisT], *, relax: bool) -> None:

@@ -1,4 +1,4 @@
-"""A move: checked and released at the wire, watched until at rest, ended by whatever comes first."""
+"""Motions: checked immediately before they are sent, and watched until they are at rest or ended."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -23,25 +23,25 @@ _MOST_PER_CYCLE_S: Final = 0.1
 
 
 class _Progress(Struct):
-    """How one joint's move is coming along."""
+    """The progress of one joint's move."""
 
     goal: int
     closest: int
     measured_ns: int
-    """When it was last looked at."""
+    """The time of the last check."""
     waiting_s: float = 0.0
-    """How long it was seen not to come closer."""
+    """How long the joint has made no progress."""
 
 
 class Motion(Command[AxisT, "Exchange[AxisT]"]):
-    """What sets joints moving, and is watched until something ends it."""
+    """A command that moves joints, and is watched until it ends."""
 
     manner = Manner.GOALS
     attended_ns = 0
-    """When it was last looked after, by the lasting clock."""
+    """When it was last checked, by the lasting clock."""
 
     def steps(self) -> Steps:
-        """Enable what is relaxed, then launch."""
+        """Enables relaxed joints, then launches."""
         exchange = self.exchange
         for axis in self.devices:
             axis.check_usable(exchange.clock(), exchange.stale_after_ns)
@@ -52,19 +52,19 @@ class Motion(Command[AxisT, "Exchange[AxisT]"]):
         self.launch()
 
     def launch(self) -> None:
-        """Write all goals in one packet, and take the joints over."""
+        """Writes all goals in one packet, and takes the joints over."""
         raise NotImplementedError
 
     def goal_of(self, axis: AxisT) -> int:
-        """Where one of its joints is going, in counts."""
+        """Returns a joint's goal, in counts."""
         raise NotImplementedError
 
     def watch(self, now_ns: int) -> None:
-        """Look at the newest measurements; end it if it is over or must not go on."""
+        """Checks the newest measurements, and ends the motion if it is over or must not continue."""
         raise NotImplementedError
 
     def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
-        """Why none of its joints may go on: a driver that was held up, a fault, silence, or the end of its call."""
+        """Returns why the motion must end: an interrupted driver, a fault, an offline joint, or the call's deadline."""
         attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
         if held_up := self.exchange.held_up(attended_ns):
             axis = next((axis for axis in self.devices if axis.fault), self.devices[0])
@@ -81,7 +81,7 @@ class Motion(Command[AxisT, "Exchange[AxisT]"]):
         return None
 
     def done_stepping(self) -> None:
-        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+        """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
 
 
 class Move(Motion[AxisT]):
@@ -158,14 +158,14 @@ class Move(Motion[AxisT]):
         return distance <= axis.grain.arrived or (distance <= axis.grain.near and progress.waiting_s > _SETTLING_S)
 
     def _stuck(self) -> TradeError | None:
-        """Why it does not arrive, as far as that was measured: silence is another matter."""
+        """Returns the fault of a joint that was measured without progress towards its goal."""
         for axis, progress in self._progress.items():
             late = (progress.measured_ns - self._began_ns) / 1e9 > self._patience_s
             blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
             if late or blocked:
                 short_rad = progress.closest * axis.grain.rad
                 fault = f"it makes no progress, {short_rad:.3g} rad short of its goal, as if blocked"
-                if blocked:  # it stands: nothing moves it until somebody has looked
+                if blocked:  # blocked: latched, so that it does not move until a client enables it
                     axis.fault, axis.ready = fault, False
                 return axis.faulty(fault)
         return None

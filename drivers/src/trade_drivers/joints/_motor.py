@@ -1,4 +1,4 @@
-"""Motor and JointGroup on a bus: they check, hand over to the bus thread, wait, and never touch the port."""
+"""Motor and JointGroup on a bus. They check arguments, queue a job for the bus thread, and wait for it."""
 
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
@@ -26,7 +26,7 @@ _Exchange = TypeVar("_Exchange", bound=Exchange[Any])
 
 
 class _Joints(Generic[AxisT, _Exchange]):
-    """What one motor and a group have in common: a bus and some of its joints."""
+    """The base of motor and group: a bus and some of its joints."""
 
     def __init__(self, name: str, thread: BusThread[_Exchange], axes: Sequence[AxisT]) -> None:
         self._name = name
@@ -68,7 +68,7 @@ class _Joints(Generic[AxisT, _Exchange]):
     def _set(
         self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float, manner: Manner = Manner.GOALS
     ) -> None:
-        """Begin a set-point, or take over from the one before; returns once it is on the wire."""
+        """Sends a set-point, which replaces the previous one; returns once it is sent."""
         until_ns = self._exchange.clock() + int(valid_s * 1e9)
         with admitted(service, self.resources, at_once(self._exchange.clock)) as terms:
             self._finish(SetPoint(self._exchange, self._axes, goals, speeds, terms, until_ns, manner))
@@ -152,7 +152,7 @@ class BusGroup(_Joints[Axis, Exchange[Any]], JointGroup):
 
 
 class AttachedJoints(ThreadedBus[Exchange[Any]]):
-    """A bus with its joints, and the thread that owns it."""
+    """A bus with its joints and its owner thread."""
 
     def __init__(self, thread: BusThread[Exchange[Any]], motor: type[BusMotor[Any, Any]] = BusMotor) -> None:
         super().__init__(thread)
@@ -168,9 +168,9 @@ class AttachedJoints(ThreadedBus[Exchange[Any]]):
 
 
 def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
-    """Where a motion in this direction ends at the latest: the device brakes by itself before it gets there."""
+    """Returns the end of the range in this direction; the device brakes by itself before it."""
     joint, sample = axis.joint, axis.sample
-    # farther outside of its range than its grain, a joint is not told to go on outwards
+    # a joint outside its range by more than its resolution must not move further out
     end = joint.max_rad if velocity_rad_s > 0 else joint.min_rad
     angle_rad = end if sample is None else axis.scale.angle_rad(sample.position)
     if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * axis.grain.arrived * axis.grain.rad:

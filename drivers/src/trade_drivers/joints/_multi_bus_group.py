@@ -1,6 +1,6 @@
-"""A group whose joints are on several buses: it sees to it that they begin together, arrive together and stop together.
+"""A joint group across several buses, whose joints start, arrive and stop together.
 
-It knows nothing of any vendor: each of its parts is the group of those of its joints that share a bus.
+It is vendor-neutral: each of its parts is a group of the joints that share a bus.
 """
 
 import threading
@@ -22,15 +22,15 @@ __all__ = ["AcrossGroup"]
 _Result = TypeVar("_Result")
 _LEAST_RAD_S: Final = 1e-3
 _TOLERANCES: Final = Tolerances(start_rad=0.3, path_rad=0.3, goal_rad=0.035, goal_time_s=1.0)
-"""Of a move: where it begins was measured a moment ago, and the joints may be moving already."""
+"""Tolerances of a move: its start is a recent measurement, and the joints may already be moving."""
 
 
 class AcrossGroup(JointGroup):
-    """Joints of several buses of one process as a group.
+    """A group of joints on several buses of one process.
 
     Args:
         joints: their full names, in the order of all values.
-        parts: the groups of one bus each, that together have just these joints.
+        parts: one group for each bus; together they have exactly these joints.
     """
 
     def __init__(self, joints: Sequence[str], parts: Sequence[JointGroup]) -> None:
@@ -78,7 +78,7 @@ class AcrossGroup(JointGroup):
             try:
                 self._all(lambda part, joints: part.servo([goals[joint] for joint in joints], valid_s))
             except BaseException:
-                with suppress(TradeError):  # whoever asked hears why it could not be done; who is told to stop, stops
+                with suppress(TradeError):  # the caller gets the original error, whether or not the stop succeeds
                     self.stop()
                 raise
 
@@ -95,7 +95,7 @@ class AcrossGroup(JointGroup):
         try:
             ended = {joint: angle for part in self._all(follow) for joint, angle in part.items()}
         except TradeError as error:
-            raise plan.course.failed or error from None  # the first that failed, not the first to tell
+            raise plan.course.failed or error from None  # the first failure, not the first report
         return [ended[joint] for joint in self._joints]
 
     def stop(self) -> None:
@@ -115,7 +115,7 @@ class AcrossGroup(JointGroup):
         ]
 
     def _all(self, act: Callable[[JointGroup, list[str]], _Result]) -> list[_Result]:
-        """Do it on every bus at the same time and wait for all of them; the first error counts."""
+        """Runs an action on all buses at the same time and waits for all; the first error counts."""
         results: list[_Result] = []
         errors: list[BaseException] = []
 

@@ -1,4 +1,4 @@
-"""Speeds and accelerations for joints that start together and arrive together: arithmetic in the device's counts."""
+"""Trapezoidal profiles for joints that start and arrive together, in the device's counts."""
 
 from collections.abc import Sequence
 from math import sqrt
@@ -10,7 +10,7 @@ __all__ = ["Leg", "Profile", "together"]
 
 
 class Leg(NamedTuple):
-    """What one joint has to do: how far, and how fast at most."""
+    """One joint's distance, with its maximum speed and acceleration."""
 
     distance_counts: int
     speed_counts: int
@@ -19,7 +19,7 @@ class Leg(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """What goes into a device's profile registers, and how long the move takes with it."""
+    """The values of a device's profile registers, and the resulting duration."""
 
     accel_counts: int
     speed_counts: int
@@ -27,9 +27,9 @@ class Profile(NamedTuple):
 
 
 def together(legs: Sequence[Leg]) -> list[Profile]:
-    """Profiles under which all legs end at the same time, that of the slowest; none above its own limits.
+    """Returns profiles with which all legs end together with the slowest one, within their own limits.
 
-    Each is the leg's own fastest trapezoid stretched in time. 0 is never used: a device takes it for "no limit".
+    Each is the leg's own fastest trapezoid, stretched in time. 0 is never used, since devices take it for "no limit".
     """
     duration_s = max(_duration_s(leg, leg.speed_counts, leg.accel_counts) for leg in legs)
     return [_stretched(leg, duration_s) for leg in legs]
@@ -58,10 +58,10 @@ def _stretched(leg: Leg, duration_s: float) -> Profile:
 
 
 def _accel_for(leg: Leg, speed: int, duration_s: float, ideal: float) -> int:
-    """The acceleration that makes up for the rounding of the speed, within the limit."""
+    """Returns the acceleration that compensates for the rounded speed, within the limit."""
     cruise_s = abs(leg.distance_counts) * leg.grain.rad / (speed * leg.grain.rad_s)
     if 0 < cruise_s < duration_s:
         exact = speed * leg.grain.rad_s / (duration_s - cruise_s) / leg.grain.rad_s2
-        # a trapezoid only while it reaches its speed; else the triangle's own acceleration is the right one
+        # only a profile that reaches its speed is a trapezoid; otherwise the triangle's acceleration is right
         ideal = exact if cruise_s >= duration_s / 2 else ideal
     return max(1, min(leg.accel_counts, round(ideal)))

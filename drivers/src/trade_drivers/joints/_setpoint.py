@@ -1,4 +1,4 @@
-"""A set-point: goals that hold for a short while only; not renewed in time, the joints ramp to a stop."""
+"""Set-points: goals that are valid for a short time; if they are not renewed, the joints ramp to a stop."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,9 +16,9 @@ __all__ = ["SetPoint"]
 
 
 class SetPoint(Motion[AxisT]):
-    """Goals in counts and the speed to go there; whoever waits for it is let go as soon as it is on the wire.
+    """Goals in counts and the speed to reach them; the service returns as soon as they are sent.
 
-    Each renewal is a set-point of its own, admitted anew, that takes over from the one before.
+    Each renewal is a set-point of its own, with its own permit, and replaces the previous one.
     """
 
     def __init__(
@@ -49,11 +49,11 @@ class SetPoint(Motion[AxisT]):
             goals[axis] = Goal(self._goals[axis], axis.accel_counts, self._speeds[axis])
         self.exchange.write_goals(goals, self.gate)
         self.exchange.take_over(self)
-        self.expires_ns = self._until_ns  # on its way, it lasts as long as it was said to
+        self.expires_ns = self._until_ns  # once sent, it is valid for its own time
         self.finish()
 
     def watch(self, now_ns: int) -> None:
-        """What would keep it off the wire ends it, too: its time, a stop, a lock, a fault, silence."""
+        """Ends the set-point for each reason that would prevent sending it: expiry, stop, lock, fault, no answer."""
         try:
             self.gate()
             if ending := self.trouble(now_ns, None):

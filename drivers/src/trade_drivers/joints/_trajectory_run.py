@@ -1,4 +1,4 @@
-"""A trajectory on one bus: in every cycle what is due goes out, and every joint is compared with where it should be."""
+"""The execution of a trajectory on one bus: each cycle sends the set-points due and compares each joint with them."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 __all__ = ["Follow"]
 
 _VALID_NS: Final = 200_000_000
-"""A goal that is on its way holds as long as a set-point does by default: nothing due for longer, and it is over."""
+"""The validity of a sent goal, as for a set-point; the trajectory ends if no goal is sent for longer."""
 _FOREVER_NS: Final = 2**63
 
 
 class Follow(Motion[AxisT]):
-    """A plan for some joints of this bus.
+    """The execution of a plan for some joints of this bus.
 
-    A device that goes from position to position is sent where it should be when it gets there. Any other brakes in
-    time for its goal: so that is where the joint would come to rest if it braked at that moment; it keeps the speed it
-    should have, and comes to rest within its range if no goal follows.
+    A device that interpolates gets the position due when it arrives there. Any other device brakes for each goal. So
+    its goal is the point where the joint would come to rest if it braked at that time: it keeps its planned speed, and
+    comes to rest within its range if no goal follows.
     """
 
     manner = Manner.POSITIONS
@@ -42,8 +42,8 @@ class Follow(Motion[AxisT]):
         self._plan = plan
         self._curves = {axis: track.curve for axis, track in zip(axes, plan.tracks, strict=True)}
         self._goals: dict[AxisT, int] = {}
-        self._told_ns = 0
-        """When the joints' goals were last what was due."""
+        self._sent_ns = 0
+        """When the goals due were last sent."""
         self.final_rad: list[float] = []
 
     def goal_of(self, axis: AxisT) -> int:
@@ -71,8 +71,8 @@ class Follow(Motion[AxisT]):
         exchange.write_goals(whole, self.gate)
         self._goals = goals
         exchange.take_over(self)
-        self.expires_ns = _FOREVER_NS  # it began in time: how long it may take is another matter
-        self._told_ns = now_ns
+        self.expires_ns = _FOREVER_NS  # it started in time; its duration is checked separately
+        self._sent_ns = now_ns
         self._plan.course.ready(now_ns)
 
     def watch(self, now_ns: int) -> None:
@@ -90,7 +90,7 @@ class Follow(Motion[AxisT]):
             self.exchange.release(self, ending)
 
     def _check_rate(self) -> None:
-        """Raises ``ConfigurationError`` where goals cannot follow each other as fast as they must."""
+        """Raises ``ConfigurationError`` if the bus cannot send goals fast enough."""
         exchange, cycles = self.exchange, self.exchange.cycles_a_goal(self.devices)
         if (every_ns := cycles * exchange.period_ns) > _VALID_NS:
             problem = f"its joints take a goal every {every_ns / 1e9:.2g} s; a trajectory needs one every 0.2 s"
@@ -104,10 +104,10 @@ class Follow(Motion[AxisT]):
                 return
             self.exchange.write_positions(goals, self.gate)
             self._goals = goals
-        self._told_ns = now_ns
+        self._sent_ns = now_ns
 
     def _due(self, now_ns: int) -> dict[AxisT, int]:
-        """The goals of this moment, in counts; within the range of each joint, or of where it comes in from."""
+        """Returns the goals due now, in counts, limited to each joint's range, extended to a start outside it."""
         reached_ns = self.exchange.reached_ns(self.devices)
         elapsed_s = self._plan.course.elapsed_s(now_ns if reached_ns is None else reached_ns)
         goals: dict[AxisT, int] = {}
@@ -120,14 +120,14 @@ class Follow(Motion[AxisT]):
         return goals
 
     def _trouble(self, now_ns: int) -> TradeError | None:
-        if (held_up_ns := now_ns - self._told_ns) > _VALID_NS:
-            reason = f"its bus was held up, or took no goal: for {held_up_ns / 1e9:.2g} s nothing told it where to go"
+        if (held_up_ns := now_ns - self._sent_ns) > _VALID_NS:
+            reason = f"its bus was held up, or accepted no goal: it got no set-point for {held_up_ns / 1e9:.2g} s"
             return MotionStopped(device=self.devices[0].name, reason=reason)
         tolerance_rad = self._plan.tolerances.path_rad
         return next((problem for axis in self.devices if (problem := self._astray(axis, "path", tolerance_rad))), None)
 
     def _over(self) -> bool:
-        """Whether all were measured at rest at the end; raises if they had the time to be and were not."""
+        """Returns whether all joints are at rest at the end; raises if they are not after the allowed time."""
         seen_ns = min(axis.sample.at_ns if axis.sample else 0 for axis in self.devices)
         late_s = self._plan.course.elapsed_s(seen_ns) - self._plan.course.duration_s
         if late_s < 0:
@@ -140,7 +140,7 @@ class Follow(Motion[AxisT]):
         return not off and not moving
 
     def _astray(self, axis: AxisT, what: str, tolerance_rad: float) -> ToleranceExceeded | None:
-        """How far the newest measurement is from where the joint should have been then, if that is too far."""
+        """Returns the error for a joint whose newest measurement is too far from its set-point of that time."""
         if (sample := axis.sample) is None:
             return None
         should_rad, _ = self._curves[axis].at(self._plan.course.elapsed_s(sample.at_ns))

@@ -1,4 +1,4 @@
-"""Waiting for what a joint's own frames are to say, for devices that report and are not read."""
+"""Waiting for reports of a device, for devices that send frames by themselves instead of being read."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 __all__ = ["next_measurement", "until"]
 
 _CHANGE_NS: Final = 600_000_000
-"""How long a device may take to go from one state to the next."""
+"""The time allowed for a device's change of state."""
 _WAIT_S: Final = 0.001
 
 
 def next_measurement(bus: "Exchange[AxisT]", axis: AxisT) -> Steps:
-    """Wait for one that was asked for from now on."""
+    """Waits for a measurement requested after this call."""
     since_ns = bus.clock()
     yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
 
@@ -29,16 +29,16 @@ def until(
     otherwise: str,
     patience_ns: int = _CHANGE_NS,
 ) -> Steps:
-    """Wait for what the device's frames are to say; ``bus.idle`` takes them in.
+    """Waits until the device's frames show a condition; ``bus.idle`` processes the frames.
 
     Raises:
-        DeviceFault: it did not come; ``otherwise`` says what is wrong then.
-        DeviceSilent: the device fell silent.
+        DeviceFault: the condition was not met in time; ``otherwise`` is the fault.
+        DeviceSilent: the device no longer answers.
     """
     give_up_ns = bus.clock() + patience_ns
     while not condition():
         bus.require_answering(axis)
-        if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # what it did not say is another matter
+        if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # it answers, but the condition is not met
             raise axis.faulty(otherwise)
         bus.idle(_WAIT_S)
         yield

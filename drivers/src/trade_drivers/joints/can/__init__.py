@@ -1,4 +1,4 @@
-"""Motors with controllers of their own on a CAN bus, asked in every cycle: what those of all vendors have in common."""
+"""The common base of drivers for motors with their own controllers on a CAN bus, polled in each cycle."""
 
 from trade_drivers.joints.can._axis import Another, MotorAxis, grain_of
 from trade_drivers.joints.can._driver import CanMotorDriver, axes_of

@@ -1,4 +1,4 @@
-"""One motor as the bus thread knows it: whether it is here, what was asked of it, what speaks against moving on."""
+"""The state of one motor on the bus thread: its presence, its open request, and its faults."""
 
 from abc import abstractmethod
 from math import isfinite, tau
@@ -15,7 +15,7 @@ _NEAR_RAD: Final = 0.03
 
 
 def grain_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Grain:
-    """What counts of a motor mean: positions in counts, speeds in counts a second, and so on."""
+    """Returns the resolution of a motor: positions in counts, speeds in counts per second, and so on."""
     rad = tau / (counts_per_rev * joint.gear)
     return Grain(
         rad=rad,
@@ -30,7 +30,7 @@ def grain_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Grain:
 
 
 class Another(Unfit):
-    """Another motor than the one the robot file names."""
+    """The motor is another one than in the robot file."""
 
     def __init__(self, key: str, expected: str, found: str, kind: str = "motor") -> None:
         super().__init__(f"its {key} is {found}, not {expected}: it is another {kind}", f".{key}")
@@ -38,32 +38,32 @@ class Another(Unfit):
 
 
 class MotorAxis(Axis):
-    """One motor. While it is ``silent`` it is left out; it comes back only after it was looked over."""
+    """One motor. While it is ``silent``, it is left out, and returns only after it was checked."""
 
     beat_ns = 0
-    """When it last said anything by itself, or answered."""
+    """When a frame of the motor was last received."""
     asked_ns = 0
-    """When it was last asked for a measurement that has not come; 0 if it has."""
+    """When the open request for a measurement was sent; 0 if there is none."""
     since_ns = 0
-    """When it was taken on."""
+    """When the motor was accepted."""
     stranger = False
-    """It was taken on just now, and may be moving."""
+    """True directly after it was accepted, when it may be moving."""
     hushed = False
-    """It is not asked: whether its watchdog notices that is being tried."""
+    """True while the driver sends it nothing, to test its watchdog."""
 
     @property
     @abstractmethod
     def torque(self) -> bool | None:
-        """Whether its motor is powered; None while nobody knows."""
+        """Returns whether torque is on; None if unknown."""
 
     @property
     def may_hold_torque(self) -> bool:
         return self.torque is not False
 
     def measured_at(self, position: float, velocity: float, effort: float, now_ns: int) -> None:
-        """It has told where it is, in counts: the answer to what it was asked last, if it was asked.
+        """Stores a measurement in counts, which answers the open request, if there is one.
 
-        Dated when it was asked, not when it came: a frozen process would take old values for new.
+        Its time is that of the request, not of the arrival, as a frozen process would take old values for new.
         """
         asked_ns, self.asked_ns = self.asked_ns, 0
         at_ns = now_ns if self.hushed else asked_ns
@@ -72,18 +72,18 @@ class MotorAxis(Axis):
         self.note(Sample(round(position), round(velocity), round(effort), at_ns))
 
     def latch(self, fault: str) -> None:
-        """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
+        """Latches a fault until the motor is enabled again; the first one is kept."""
         self.fault = self.fault or fault
         self.ready = False
 
     def forget(self, now_ns: int) -> None:
-        """Leave it out until it was looked over again."""
+        """Leaves the motor out until it was checked again."""
         if not self.silent:
             self.silent, self.silent_since_ns = True, now_ns
         self.asked_ns, self.hushed = 0, False
 
     def welcome(self, now_ns: int) -> None:
-        """It is fit and heard."""
+        """Accepts a motor that answers and has passed its checks."""
         if self.ready:
             self.latch("it was away")
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None

@@ -1,4 +1,4 @@
-"""Who is on a CAN bus of motors; their numbers are set by the vendor's tool, not from here."""
+"""Scanning a CAN bus for motors, whose ids only the vendor's tool can set."""
 
 from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
@@ -17,13 +17,13 @@ class CanMotorCommissioner(Commissioner):
 
     wire = "can"
     bauds = (1_000_000,)
-    """The system sets the rate of an interface; frames at another one would disturb who talks there."""
+    """The system sets the rate of an interface; frames at another rate would disturb the bus."""
     libraries: ClassVar[str] = "python-can"
-    ports = "is the interface up? `ip link show type can` shows those there are"
+    ports = "is the interface up? `ip link show type can` lists the interfaces"
 
     @abstractmethod
     def bench(self) -> "type[CanBench]":
-        """Raises ImportError where a library is missing."""
+        """Returns the class of its bench; raises ImportError if a library is missing."""
 
     def open(self, port: str, baud: int) -> Bench:
         try:

@@ -1,4 +1,4 @@
-"""The cyclic exchange with motors that are asked one by one: measurements, work, motions, and who is away."""
+"""The cyclic exchange with motors that are polled one by one: measurements, work, motions, reconnection."""
 
 import logging
 import time
@@ -19,20 +19,20 @@ __all__ = ["MotorExchange", "asked"]
 
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25
-"""Patience for one answer: motors take a millisecond, but a busy host takes its time."""
+"""Timeout of one answer: motors take a millisecond, but a busy host takes longer."""
 _AGAIN_NS: Final = 1_500_000_000
-"""How long who does not answer is left alone: what comes that late is not taken for an answer to the next question."""
+"""The pause after a missing answer, so that a late one is not taken for the answer to the next request."""
 _FIRST: Final = 3
-"""Cycles until it is seen whether a motor moves."""
+"""Cycles until motion of a motor is detected."""
 
 _Axis = TypeVar("_Axis", bound=MotorAxis)
 
 
 def asked(bus: "MotorExchange[Any]", axis: MotorAxis, frames: Sequence[Frame], there: Callable[[], bool]) -> Steps:
-    """Send a question, and wait until the answer is there.
+    """Sends a request and waits for the answer.
 
     Raises:
-        NoAnswer: it has not come in time.
+        NoAnswer: no answer arrived in time.
     """
     bus.port.send_all(frames)
     began = time.monotonic()
@@ -43,12 +43,12 @@ def asked(bus: "MotorExchange[Any]", axis: MotorAxis, frames: Sequence[Frame], t
 
 
 class MotorExchange(Exchange[_Axis]):
-    """What happens on one bus of such motors."""
+    """The exchange with the motors of one CAN bus."""
 
     deaf_ns: int
-    """A motor of which nothing was heard for so long is left out."""
+    """A motor without any frame for this time is left out."""
     again_ns: ClassVar[int] = _AGAIN_NS
-    """How long a motor that is left out is not asked."""
+    """The pause before an offline motor is tried again."""
 
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[_Axis], clock: Callable[[], int] = time.monotonic_ns
@@ -57,34 +57,34 @@ class MotorExchange(Exchange[_Axis]):
         self.port = port
         self.net = Listeners(port, between=self.serve_stops, meanwhile=self.admit)
         self.problems: dict[_Axis, Exception] = {}
-        """Why those that are away were not taken on when they were last looked over."""
+        """Why motors were not accepted at their last check."""
         self._looks: dict[_Axis, Generator[None, None, None]] = {}
         self._began_ns = self._listening_ns = clock()
-        """When the last cycle began, and since when they have followed each other in time."""
+        """The start of the last cycle, and the time since which cycles have been on time."""
         for axis in axes:
             axis.forget(clock())
             axis.probe_at_ns = clock()
 
-    # --- what a motor of this kind is asked, and how
+    # --- requests, which depend on the kind of motor
 
     def question(self, axis: _Axis) -> Frame:
-        """What makes it tell where it is; feeds its watchdog."""
+        """Returns the request for a measurement, which also feeds the watchdog."""
         raise NotImplementedError
 
     def look_over(self, axis: _Axis) -> Steps:
-        """Find out who it is and whether it is fit; yields while an answer is awaited. Enables and moves nothing.
+        """Checks identity and settings of a motor; yields while it waits for answers. Enables and moves nothing.
 
         Raises:
-            Unfit: it cannot be used.
-            NoAnswer: it does not answer.
+            Unfit: the motor cannot be used.
+            NoAnswer: the motor does not answer.
         """
         raise NotImplementedError
 
     def look_after(self, axis: _Axis) -> None:
-        """What else is asked of it, and seen to, once in a cycle."""
+        """Runs further requests and checks of a motor once per cycle."""
 
     def opened(self) -> None:
-        """Its port was opened for the first time, after listening to who talks there."""
+        """Called after the port was first opened and had listened for other drivers."""
 
     # --- from the bus thread
 
@@ -92,12 +92,12 @@ class MotorExchange(Exchange[_Axis]):
         self.net.take_in(seconds)
 
     def cycle(self) -> None:
-        """One round: stops, measurements, work, motions."""
+        """Runs one cycle: stops, measurements, work, motions."""
         began_ns = self.clock()
         if began_ns - self._began_ns > self.stale_after_ns // 2:
             self._listening_ns = began_ns
         self._began_ns = began_ns
-        self.net.take_in(0.0)  # what came late is no answer to the next question
+        self.net.take_in(0.0)  # a late frame must not answer the next request
         self.measure(began_ns)
         self._listen(began_ns)
         self.settle(began_ns)
@@ -106,7 +106,7 @@ class MotorExchange(Exchange[_Axis]):
         self.watch()
 
     def measure(self, began_ns: int) -> None:
-        """Ask every motor where it is, and take in what they say."""
+        """Requests a measurement from each motor, and processes the answers."""
         here = [axis for axis in self.devices if not axis.silent and not axis.hushed]
         for axis in here:
             axis.asked_ns = began_ns
@@ -118,18 +118,18 @@ class MotorExchange(Exchange[_Axis]):
                 self.look_after(axis)
 
     def _listen(self, now_ns: int) -> None:
-        """Who has not been heard for too long is left out, and looked over now and then whether it is back."""
+        """Leaves out motors without a frame for too long; they are tried from time to time."""
         if now_ns - self._listening_ns <= self.stale_after_ns:
-            return  # on a busy host it was this thread that was silent
+            return  # on a busy host, this thread itself was late
         for axis in self.devices:
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
-                silences.warning("%s is not heard on %s", axis.name, axis.bus)
+                silences.warning("%s does not answer on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns
 
     def settle(self, now_ns: int) -> None:
-        """What was moving when it was taken on is told to hold: nobody owns that motion."""
+        """Makes motors hold that were moving when they were accepted, since no client owns that motion."""
         for axis in self.devices:
             if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
                 axis.stranger = False
@@ -137,7 +137,7 @@ class MotorExchange(Exchange[_Axis]):
                     self.hold([axis], now_ns)
 
     def admit(self) -> None:
-        """Go on with those that are away; it never waits for them. An unhealthy process admits nobody (S06)."""
+        """Continues the checks of offline motors without waiting. An unhealthy process accepts none (S06)."""
         if self.refusing is not None:
             return
         for axis in self.devices:
@@ -149,13 +149,13 @@ class MotorExchange(Exchange[_Axis]):
         try:
             next(look)
         except StopIteration:
-            _log.info("%s is heard on %s", axis.name, axis.bus)
+            _log.info("%s answers on %s", axis.name, axis.bus)
             axis.welcome(self.clock())
             self.problems.pop(axis, None)
         except (Unfit, NoAnswer) as problem:
             self.problems[axis] = problem
             if isinstance(problem, Unfit):
-                axis.fault, axis.ready = str(problem), False  # whatever was wrong before, this has to be mended first
+                axis.fault, axis.ready = str(problem), False  # replaces an earlier fault, as this must be fixed first
             axis.probe_at_ns = self.clock() + _AGAIN_NS
         else:
             return

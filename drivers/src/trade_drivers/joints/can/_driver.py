@@ -1,4 +1,4 @@
-"""Bringing a bus of such motors up, and handing them out."""
+"""The base class of drivers for motors on a CAN bus."""
 
 import time
 from abc import abstractmethod
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["AttachedMotors", "CanMotorDriver", "axes_of"]
 
 _PATIENCE_S: Final = 1.0
-"""A motor that has just been switched on needs a moment before it answers."""
+"""The time that a motor may need after power-on before it answers."""
 _FIRST_CYCLES: Final = 5
-"""As many measurements as it takes to see whether a joint moves."""
+"""The number of measurements needed to detect motion."""
 
 
 _Motor = TypeVar("_Motor", bound=MotorAxis)
@@ -33,23 +33,23 @@ _Exchange = TypeVar("_Exchange", bound="MotorExchange[Any]")
 
 
 class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
-    """One vendor's motors on a CAN bus, through python-can."""
+    """The driver of one vendor's motors on a CAN bus, through python-can."""
 
     modules = ("can",)
     devices = (Joint,)
     name: ClassVar[str]
     models: ClassVar[Collection[str]]
-    """What it knows, as printed on them; empty: any."""
+    """Supported models, as printed on the motors; empty if all."""
     libraries: ClassVar[str] = "python-can"
 
     @abstractmethod
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> _Exchange:
-        """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
+        """Checks the file and returns an exchange with a closed port. Raises ``ConfigurationError``."""
 
     @staticmethod
     @abstractmethod
     def orders(talk: "Talk", nodes: Collection[int]) -> Collection[int]:
-        """Identifiers among what was heard that only another driver sends, to these nodes or any."""
+        """Returns the identifiers among the traffic that only another driver sends, to these nodes or any."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
         can = self._can(robot, bus)
@@ -61,7 +61,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
         return AttachedMotors(thread, exchange.port, self.motor())
 
     def motor(self) -> type[BusMotor[Any, Any]]:
-        """What its joints are handed out as."""
+        """Returns the class of its motors."""
         return BusMotor
 
     def _can(self, robot: Robot, bus: Bus) -> CanBus:
@@ -71,7 +71,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
         return bus
 
     def _built(self, robot: Robot, bus: CanBus, port: str) -> _Exchange:
-        """What it is driven by, out of the file; not open yet."""
+        """Returns the exchange described by the file; its port is closed."""
         self._check_models(robot, bus)
         nodes = [joint.id for joint in robot.joints_on(bus.name)]
         try:
@@ -86,14 +86,14 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
             if self.models and joint.model not in self.models:
-                problem = f"{joint.model!r} is none of {', '.join(self.models)}"
+                problem = f"{joint.model!r} is not one of {', '.join(self.models)}"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
 
     def open_exchange(self, robot: Robot, bus: CanBus, port: str) -> _Exchange:
-        """Open the port and look every motor over, without a thread: ``cycle()`` is the caller's to call.
+        """Opens the port and checks each motor without a thread; the caller must call ``cycle()``.
 
         Raises:
-            ConfigurationError: the port cannot be had, or a motor is absent, another, or cannot be used as it is.
+            ConfigurationError: the port cannot be opened, or a motor is absent, another, or cannot be used as it is.
         """
         where = f"{robot.where}: bus.{bus.name}"
         exchange = self._built(robot, bus, port)
@@ -105,13 +105,13 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
                 exchange.opened()
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
-                problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
+                problem = f"{port}: {lost}; is the interface up? `ip link` lists the interfaces"
                 raise ConfigurationError(where=f"{where}.channel", problem=problem) from None
             undo.pop_all()
         return exchange
 
     def _bring_in(self, exchange: _Exchange, where: str) -> None:
-        """Cycle until every motor is taken on and measured."""
+        """Runs cycles until each motor is accepted and measured."""
         until = time.monotonic() + _PATIENCE_S
         while away := [axis for axis in exchange.devices if axis.silent]:
             for axis in away:
@@ -121,13 +121,13 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
         self.first_look(exchange)
 
     def first_look(self, exchange: _Exchange) -> None:
-        """Cycle until it is seen whether motors move."""
+        """Runs cycles until motion of motors is detected."""
         for _ in range(_FIRST_CYCLES):
             exchange.cycle()
             exchange.idle(exchange.period_ns / 1e9)
 
     def check_away(self, exchange: _Exchange, axis: _Motor, where: str, *, last: bool) -> None:
-        """Raises ``ConfigurationError`` for one that cannot be taken on; ``last``: also if it does not answer."""
+        """Raises ``ConfigurationError`` for a motor that cannot be accepted; with ``last``, also without an answer."""
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
             case Another() as other:
@@ -148,7 +148,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
 
 
 class AttachedMotors(AttachedJoints):
-    """A bus of motors."""
+    """An attached bus of motors."""
 
     def __init__(
         self,
@@ -166,7 +166,7 @@ class AttachedMotors(AttachedJoints):
 def axes_of(
     kind: Callable[[str, str, Joint, float, Sequence[str]], AxisT], robot: Robot, bus: CanBus, port: str
 ) -> list[AxisT]:
-    """The axes of a bus, as far as the file tells."""
+    """Returns the axes of a bus from the robot file."""
     return [
         kind(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
         for joint in robot.joints_on(bus.name)

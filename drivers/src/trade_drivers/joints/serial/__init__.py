@@ -1,10 +1,10 @@
-"""Servos behind one serial line that are asked and answer: what drivers of every vendor have in common.
+"""The common base of drivers for servos on a serial line with requests and answers.
 
-Nothing here knows a vendor's registers or packets; ``_wire`` alone needs pyserial, and comes with a vendor's wire.
+It is independent of a vendor's registers and packets. Only ``_wire`` needs pyserial; a vendor's wire imports it.
 """
 
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused, WireError
-from trade_drivers.joints.serial._asking import health_of, still_homed, told, tried
+from trade_drivers.joints.serial._asking import health_of, still_homed, tried, written
 from trade_drivers.joints.serial._axis import Answer, Health, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.joints.serial._driver import ServoDriver
@@ -27,6 +27,6 @@ __all__ = [
     "first_look",
     "health_of",
     "still_homed",
-    "told",
     "tried",
+    "written",
 ]

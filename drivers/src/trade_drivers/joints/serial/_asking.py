@@ -1,4 +1,4 @@
-"""Exchanges with one servo within a retry budget, one after the other: what its jobs are made of."""
+"""Exchanges with one servo within a retry budget, as steps of jobs."""
 
 from collections.abc import Callable, Generator
 from typing import Any, Final, TypeVar
@@ -9,7 +9,7 @@ from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
-__all__ = ["check_homing", "health_of", "still_homed", "told", "tried"]
+__all__ = ["check_homing", "health_of", "still_homed", "tried", "written"]
 
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
@@ -17,14 +17,14 @@ _ATTEMPTS: Final = 3
 AnyExchange = ServoExchange[Any, Any]
 
 
-def told(bus: AnyExchange, job: Work[Any], axis: ServoAxis[Any], register: Register, value: int) -> Steps:
-    """A register written, and confirmed."""
+def written(bus: AnyExchange, job: Work[Any], axis: ServoAxis[Any], register: Register, value: int) -> Steps:
+    """Writes a register and waits for the confirmation."""
     data = register.encode(value)
     yield from tried(bus, axis, lambda: bus.wire.write(axis.id, register.address, data, job.gate))
 
 
 def health_of(bus: AnyExchange, axis: ServoAxis[_Health]) -> Generator[None, None, _Health]:
-    """How it is, asked now."""
+    """Reads the servo's health now."""
 
     def look() -> _Health:
         asked_ns = bus.clock()
@@ -34,7 +34,7 @@ def health_of(bus: AnyExchange, axis: ServoAxis[_Health]) -> Generator[None, Non
 
 
 def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
-    """One exchange within the retry budget; a ping before each retry keeps late answers from being taken for new."""
+    """Runs one exchange within the retry budget; a ping before each retry discards late answers."""
     asked, waited_s = False, 0.0
     for _ in range(_ATTEMPTS):
         try:
@@ -43,7 +43,7 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
                 yield
             result = act()
         except DeadlineExceeded as late:
-            if asked:  # it went out before, and nobody heard what became of it
+            if asked:  # an earlier attempt was sent, and its outcome is unknown
                 raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
             raise
         except NoAnswer as silent:
@@ -59,7 +59,7 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
 
 
 def zero_moved(axis: ServoAxis[Any], found: int) -> str:
-    """What is wrong with a homing offset; empty if it is the one that the robot file was calibrated with."""
+    """Returns what is wrong with a homing offset; empty if it is the one of the robot file's calibration."""
     expected = axis.joint.homing_counts
     if found == expected:
         return ""
@@ -68,7 +68,7 @@ def zero_moved(axis: ServoAxis[Any], found: int) -> str:
 
 
 def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
-    """Raises ``WrongDevice`` for a servo whose zero is another one; its registers are given from address 0 on."""
+    """Raises ``WrongDevice`` for a servo with another zero; ``settings`` are its registers from address 0."""
     found = axis.homing.decode(settings, 0)
     if problem := zero_moved(axis, found):
         expected = str(axis.joint.homing_counts)
@@ -76,10 +76,10 @@ def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
 
 
 def still_homed(bus: AnyExchange, axis: ServoAxis[Any]) -> Steps:
-    """See that a servo's zero is the calibrated one: it may have lost what was not kept, or be another one by now.
+    """Checks that a servo's zero is the calibrated one, as it may have lost settings or have been replaced.
 
     Raises:
-        DeviceFault: its zero has moved.
+        DeviceFault: the zero has moved.
     """
     register = axis.homing
     answer = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, register.address, register.size))

@@ -1,4 +1,4 @@
-"""One servo as the bus thread knows it, whoever built it: what is read of it, and what speaks against moving on."""
+"""The state of one servo on the bus thread: its measurements, and faults that forbid motion."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -16,35 +16,35 @@ _HEALTH_STALE_NS: Final = 2_000_000_000
 
 
 class Register(Protocol):
-    """One item of a vendor's table."""
+    """One register of a vendor's control table."""
 
     @property
     def address(self) -> int: ...
     @property
     def size(self) -> int: ...
     def decode(self, data: bytes, start: int = 0) -> int:
-        """Counts, out of a block of bytes read from address ``start``."""
+        """Returns the counts from a block of bytes read from address ``start``."""
         ...
 
     def encode(self, counts: int) -> bytes:
-        """The bytes of a number of counts."""
+        """Returns the bytes of a number of counts."""
         ...
 
 
 class Answer(NamedTuple):
-    """A status packet's contents."""
+    """The contents of a status packet."""
 
     data: bytes
     alert: bool
-    """The device has something to complain of; its health says what."""
+    """True if the device reports an error; its health says which."""
 
 
 class Health(Struct, frozen=True, gc=False, kw_only=True):
-    """One slow measurement."""
+    """One measurement of the slow block: health values."""
 
     torque: bool
     error: int
-    """Bits of what it has to complain of."""
+    """Error bits."""
     moving: bool
     voltage_v: float
     temperature_c: float
@@ -58,13 +58,13 @@ class ServoAxis(Axis, Generic[_Health]):
     """One servo."""
 
     cyclic: ClassVar[tuple[int, int]]
-    """Address and size of what is read of every joint in every cycle."""
+    """Address and size of the block read from each joint in each cycle."""
     slow: ClassVar[tuple[int, int]]
-    """Address and size of what is read of one joint at a time."""
+    """Address and size of the slow block, read from one joint at a time."""
     homing: ClassVar[Register]
-    """What it adds to its position, or takes from it."""
+    """The register of the homing offset."""
     error_remedy: ClassVar[str]
-    """What helps against what it complains of."""
+    """The remedy for errors that it reports."""
 
     def __init__(
         self,
@@ -79,29 +79,29 @@ class ServoAxis(Axis, Generic[_Health]):
     ) -> None:
         super().__init__(name, bus, joint, grain, coupled)
         self.model_number = model_number
-        """What a servo of the model in the robot file answers to a ping."""
+        """The model number of the model in the robot file."""
         self._full_effort_counts = full_effort_counts
         self.health: _Health | None = None
         self.health_due_ns = 0
 
     @abstractmethod
     def sampled(self, data: bytes, at_ns: int) -> Sample:
-        """The measurement in a cyclic block."""
+        """Decodes the measurement in a cyclic block."""
 
     @abstractmethod
     def examined(self, data: bytes, at_ns: int) -> _Health:
-        """The measurement in a slow block."""
+        """Decodes the measurement in a slow block."""
 
     @abstractmethod
     def problem(self, before: _Health | None, now: _Health) -> str:
-        """What in it speaks against moving on; empty if nothing does."""
+        """Returns the fault that forbids motion; empty if there is none."""
 
     def take_sample(self, data: bytes, at_ns: int) -> None:
-        """Note a cyclic measurement."""
+        """Stores a cyclic measurement."""
         self.note(self.sampled(data, at_ns))
 
     def take_health(self, data: bytes, at_ns: int) -> _Health:
-        """Note a slow measurement, and latch what speaks against moving on."""
+        """Stores a slow measurement, and latches its fault."""
         before, self.health = self.health, self.examined(data, at_ns)
         self.remedy = self.error_remedy if self.health.error else ""
         if problem := self.problem(before, self.health):
@@ -110,12 +110,12 @@ class ServoAxis(Axis, Generic[_Health]):
 
     @property
     def in_doubt(self) -> bool:
-        """It missed an exchange, and its torque was not read since."""
+        """Returns whether its torque is unread since a missed exchange."""
         return self.doubted or self.silent
 
     @property
     def may_hold_torque(self) -> bool:
-        """Torque is on, or nobody knows."""
+        """Returns True if torque is on or unknown."""
         return self.health is None or self.health.torque
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:

@@ -1,4 +1,4 @@
-"""Setting servos of any vendor up: what their registers are called differs, what is done with them does not."""
+"""Setting up servos of any vendor, with the registers as parameters."""
 
 from abc import abstractmethod
 from contextlib import suppress
@@ -16,11 +16,11 @@ __all__ = ["ServoBench"]
 
 _LOOKS: Final = 3
 _SHARED: Final = (
-    "what answers is garbled or comes twice: two devices may share this id, or there is noise. Unplug all devices "
-    "but one, give it an id of its own, then plug in the next"
+    "the answer is garbled or arrives twice: two devices may share this id, or there is noise. Unplug all devices "
+    "but one, give it its own id, then plug in the next"
 )
 
-_UNKNOWN: Final = "this driver does not know that model; look at it with the vendor's tool"
+_UNKNOWN: Final = "this driver does not know that model; check it with the vendor's tool"
 _Wire = TypeVar("_Wire", bound="ServoWire")
 
 
@@ -29,9 +29,9 @@ class ServoBench(Bench, Generic[_Wire]):
 
     driver: ClassVar[str]
     restless: ClassVar[tuple[int, int]]
-    """Address and size of what is hardly the same in two servos: two that answer alike would look like one."""
+    """Address and size of values that differ between servos, since two with equal answers would look like one."""
     mute: ClassVar[str]
-    """What is wrong with a servo that tells its model and nothing else."""
+    """The problem of a servo that answers a ping but no read."""
     grain: ClassVar[Grain]
     torque: ClassVar[Register]
     position: ClassVar[Register]
@@ -43,11 +43,11 @@ class ServoBench(Bench, Generic[_Wire]):
 
     @abstractmethod
     def model_of(self, number: int) -> str:
-        """What a model is called; empty if this driver does not know it."""
+        """Returns the name of a model; empty if this driver does not know it."""
 
     @abstractmethod
     def firmware_of(self, device_id: int) -> str:
-        """The version of its program."""
+        """Returns the firmware version."""
 
     def anybody(self) -> bool:
         return True
@@ -55,7 +55,7 @@ class ServoBench(Bench, Generic[_Wire]):
     def look(self, device_id: int) -> Found | None:
         found = self._look(device_id)
         for _ in range(_LOOKS - 1):
-            if found is not None and found.problem == self.mute:  # one answer that got lost says nothing of it
+            if found is not None and found.problem == self.mute:  # one lost answer does not prove that
                 found = self._look(device_id)
         return found
 
@@ -65,10 +65,10 @@ class ServoBench(Bench, Generic[_Wire]):
         except BadAnswer:
             return self._found(device_id, problem=_SHARED)
         except NoAnswer:
-            self.wire.settled_at = 0.0  # an answer that comes now is not taken for that of the next id
+            self.wire.settled_at = 0.0  # a late answer must not be taken for that of the next id
             return None
         model = self.model_of(number)
-        if not model:  # its registers may mean anything
+        if not model:  # the meaning of its registers is unknown
             return self._found(device_id, f"model number {number}", problem=_UNKNOWN)
         try:
             shared = self.wire.answers_twice()
@@ -105,11 +105,11 @@ class ServoBench(Bench, Generic[_Wire]):
         return self.read(device_id, self.homing)
 
     def read(self, device_id: int, register: Register) -> int:
-        """What a register holds, in counts."""
+        """Returns the value of a register, in counts."""
         return register.decode(self.wire.read(device_id, register.address, register.size).data, register.address)
 
     def write(self, device_id: int, register: Register, value: int) -> None:
-        """Write once; its answer may come under another id or at another rate, so nobody waits for it twice."""
+        """Writes once without a retry, since the answer may come under another id or at another rate."""
         with suppress(NoAnswer):
             self.wire.write(device_id, register.address, register.encode(value))
 

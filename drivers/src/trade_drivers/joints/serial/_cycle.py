@@ -22,7 +22,7 @@ _HEALTH_NS: Final = 500_000_000
 _CLEAN_NS: Final = 1_000_000_000
 _WAIT_S: Final = 0.001
 _CHUNK_S: Final = 0.014
-"""A group is read in pieces that take no longer than this on the wire, so that a stop can come in between."""
+"""The maximum duration of one sync read; larger groups are split, so that a stop can be sent in between."""
 
 
 _Servo = TypeVar("_Servo", bound=ServoAxis[Any])
@@ -30,12 +30,12 @@ _Wire_co = TypeVar("_Wire_co", bound="ServoWire", covariant=True)
 
 
 class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
-    """What happens on one bus of servos."""
+    """The exchange with the servos of one bus."""
 
     sizes: ClassVar[tuple[int, ...]]
-    """Sizes of the cyclic read: after a failure the next one is used, so that a late answer has another length."""
+    """Sizes of the cyclic read; each failure selects the next one, so that a late answer has another length."""
     answer_overhead: ClassVar[int]
-    """Bytes that a joint adds to a cyclic exchange, beside what is read of it."""
+    """Bytes of overhead per joint in a cyclic exchange."""
 
     def __init__(
         self,
@@ -54,23 +54,23 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
 
     @property
     def wire(self) -> _Wire_co:
-        """The line, for the bus thread alone."""
+        """Returns the line, for the bus thread only."""
         return self._wire
 
-    # --- what differs
+    # --- parts that differ between vendors
 
     @abstractmethod
     def admit(self, axis: _Servo) -> None:
-        """Take a joint on that was looked over: found moving, it is stopped."""
+        """Accepts a checked joint, and stops it if it moves."""
 
     def name_of(self, model_number: int) -> str:
-        """What a model is called, or its number."""
+        """Returns the name of a model, or its number."""
         return str(model_number)
 
     def look_after(self, axis: _Servo) -> None:
-        """Do at once what the health just read asks for. Raises ``NoAnswer``."""
+        """Reacts to the health just read. Raises ``NoAnswer``."""
 
-    # --- who missed an exchange may have restarted without torque: it is sent no goal before that was read
+    # --- a joint that missed an exchange may have restarted without torque: it gets no goal until that is read
 
     def can_take_goals(self, axes: Sequence[_Servo]) -> bool:
         return not any(axis.in_doubt for axis in axes)
@@ -85,7 +85,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
     # --- from the bus thread
 
     def cycle(self) -> None:
-        """One round: stops, gaps, measurements, work, motions, one joint's health."""
+        """Runs one cycle: stops, gaps, measurements, work, motions, one joint's health."""
         began_ns = self.clock()
         self.serve_stops()
         attended_ns, self._attended_ns = self._attended_ns, self.lasting_clock()
@@ -98,19 +98,19 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         self._read_health()
 
     def readmit(self, axis: _Servo) -> None:
-        """Look a joint over that was away, or missed an exchange: its model, its health.
+        """Checks model and health of a joint that was offline or missed an exchange.
 
-        Never enables, never moves; found moving and owned by nobody, it is stopped.
+        Never enables or moves it; stops a motion that no client owns.
 
         Raises:
-            NoAnswer: it is still away.
+            NoAnswer: the joint is still offline.
         """
         number = self.wire.ping(axis.id)
         if number != axis.model_number:
             found = self.name_of(number)
             axis.fault = f"another model answers with its id: {found}, not {axis.joint.model}"
             axis.ready = False
-            axis.sample = None  # what was measured of ours means nothing to this one: it is told nothing
+            axis.sample = None  # measurements of the original are void: this one gets no commands
             axis.silent = True
             return
         self._refresh_health(axis)
@@ -122,7 +122,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             self.stop_found_moving(axis)
 
     def stop_found_moving(self, axis: _Servo) -> None:
-        """Have a joint hold that moves and is owned by nobody."""
+        """Makes a joint hold if it moves and no client owns the motion."""
         if axis.health is not None and axis.health.torque and axis.health.moving:
             axis.take_sample(self.wire.read(axis.id, *axis.cyclic).data, self.clock())
             self.hold([axis], self.clock())
@@ -130,7 +130,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
     # --- parts of a cycle
 
     def _look_after_a_gap(self) -> None:
-        """The process was frozen: what became of the joints comes before anything else."""
+        """Checks the joints first after the process was frozen."""
         for axis in self.devices:
             axis.health_due_ns = 0
             if not axis.silent and not axis.doubted and not self._try_health(axis):
@@ -143,7 +143,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         size = self.sizes[self._size]
         for at in range(0, len(asked), self._chunk):
             part = asked[at : at + self._chunk]
-            asked_ns = self.clock()  # not when it came: a frozen process would take old values for new
+            asked_ns = self.clock()  # not the arrival, as a frozen process would take old values for new
             silent = {axis.id: axis for axis in part}
             for device_id, answer in self.wire.sync_read(part[0].cyclic[0], size, list(silent)):
                 if (axis := silent.pop(device_id, None)) is not None:
@@ -160,7 +160,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         super().missed(device)
 
     def _recover(self) -> None:
-        """Look over those in doubt, and those silent when it is their turn; the first that fails ends the round."""
+        """Checks joints in doubt, and offline ones when they are due; the first failure ends the round."""
         now_ns = self.clock()
         for axis in self.devices:
             due = axis.silent and now_ns >= axis.probe_at_ns

@@ -1,4 +1,4 @@
-"""Bringing a bus of servos up, and handing out its motors."""
+"""The base class of drivers for servos on a serial bus."""
 
 import time
 from abc import abstractmethod
@@ -26,22 +26,22 @@ _Wire = TypeVar("_Wire", bound="ServoWire")
 
 
 class ServoDriver(Driver, Generic[_Servo, _Wire]):
-    """One vendor's servos in position control on a serial bus."""
+    """The driver of one vendor's servos in position control on a serial bus."""
 
     devices = (Joint,)
     name: ClassVar[str]
     models: ClassVar[Mapping[str, object]]
-    """Those it knows, by the name printed on them."""
+    """Supported models by the name printed on them."""
     bauds: ClassVar[Collection[int]]
-    """Rates they can be set to."""
+    """Supported baud rates."""
 
     @abstractmethod
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange[_Servo, _Wire]:
-        """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
+        """Checks the file and returns an exchange with a closed port. Raises ``ConfigurationError``."""
 
     @abstractmethod
     def look_over(self, wire: _Wire, bus: SerialBus, axis: _Servo, clock_ns: Callable[[], int], where: str) -> None:
-        """Check one joint's device and take its first measurements. Raises ``ConfigurationError``."""
+        """Checks one joint's device and takes its first measurements. Raises ``ConfigurationError``."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
         serial = self._serial(robot, bus)
@@ -57,10 +57,10 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
         return AttachedJoints(start_thread(exchange, exchange.wire, robot.name, bus, healthy))
 
     def open_exchange(self, robot: Robot, bus: SerialBus, port: str) -> ServoExchange[_Servo, _Wire]:
-        """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
+        """Opens the port and checks each joint without a thread; the caller must call ``cycle()``.
 
         Raises:
-            ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
+            ConfigurationError: the port cannot be opened, or a device is absent, another, or set wrongly.
         """
         exchange = self.exchange(robot, bus, port, self._known(robot, bus))
         with opening(exchange.wire, port, f"{robot.where}: bus.{bus.name}"):
@@ -84,12 +84,12 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
         joints = robot.joints_on(bus.name)
         for joint in joints:
             if joint.model not in self.models:
-                problem = f"{joint.model!r} is unknown to the driver {self.name}; it knows {', '.join(self.models)}"
+                problem = f"{joint.model!r} is unknown to the driver {self.name}; it supports {', '.join(self.models)}"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
             if joint.counts_per_rev is not None or joint.gear != 1:
                 problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
             if joint.serial_number is not None:
-                problem = "these servos tell no serial number; leave this key out"
+                problem = "these servos report no serial number; remove this key"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".serial_number', problem=problem)
         return joints

@@ -1,4 +1,4 @@
-"""Looking a bus of servos over before anything may be commanded: what the file tells, and who is there."""
+"""Checks of a servo bus before anything may be commanded: the robot file, and the devices."""
 
 from collections.abc import Callable, Sequence
 from math import tau
@@ -22,40 +22,40 @@ _Result = TypeVar("_Result")
 
 
 class Kept(NamedTuple):
-    """What servos of one vendor keep without power, and what it says of them."""
+    """The layout of the persistent registers of one vendor's servos."""
 
     size: int
-    """Bytes, from address 0 on."""
+    """Size in bytes, from address 0."""
     registers: tuple[int, int]
-    """Those of the id and of the baud rate."""
+    """The registers of the id and the baud rate."""
     name_of: Callable[[int, str], str]
-    """What a model number means, or else."""
+    """Returns the name of a model number, or a default."""
     firmware: Callable[[bytes], str]
 
 
 def check_ranges(axis: ServoAxis[Any]) -> None:
-    """Raises ``Unfit`` for a range that is not one of its device, or a limit that cannot be set."""
+    """Raises ``Unfit`` for a range that exceeds the device's, or a limit that cannot be set."""
     _check_turn(axis)
-    check_least(axis, f"the least an {axis.joint.model} can be set to")
+    check_least(axis, f"the least setting of an {axis.joint.model}")
 
 
 def _check_turn(axis: ServoAxis[Any]) -> None:
-    """In position control a servo has one turn."""
+    """Checks that the range fits into one turn, as position control requires."""
     joint, last = axis.joint, int(2 * axis.grain.centre) - 1
     if axis.low >= 0 and axis.high <= last:
         return
     low, high = sorted((axis.scale.angle_rad(0), axis.scale.angle_rad(last)))
     key, value = (".min_rad", joint.min_rad) if joint.min_rad < low else (".max_rad", joint.max_rad)
     degrees = "; degrees? radians are meant" if max(abs(joint.min_rad), abs(joint.max_rad)) > tau else ""
-    problem = f"{value:.6g} is outside of what an {joint.model} can: {low:.6g} to {high:.6g} rad{degrees}"
+    problem = f"{value:.6g} is outside the range of an {joint.model}: {low:.6g} to {high:.6g} rad{degrees}"
     raise Unfit(problem, key)
 
 
 def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> None:
-    """Whether a cycle comes often enough, and its bytes fit into it.
+    """Checks that cycles are frequent enough and long enough for their bytes.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: they are not; names the key and the right value.
     """
     check_rate(bus, where, 3)
     cycle_s = cycle_bytes * 10 / bus.baud
@@ -65,14 +65,12 @@ def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> N
 
 
 def first_ping(wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], key: str, registers: Sequence[int]) -> int:
-    """The model number of a joint's device; raises ``ConfigurationError`` if it is absent, or not alone."""
+    """Returns the model number of a joint's device; raises ``ConfigurationError`` if it is absent or shares its id."""
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         f"cable, its id (register {registers[0]}) and its baud rate (register {registers[1]})"
     )
-    twice = (
-        f"what answers to id {axis.id} is garbled or answers twice: two devices may share this id, or there is noise"
-    )
+    twice = f"the answer of id {axis.id} is garbled or arrives twice: two devices may share this id, or there is noise"
     for _ in range(_ATTEMPTS):
         try:
             number = wire.ping(axis.id)
@@ -88,11 +86,11 @@ def first_ping(wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], key: s
 
 
 def again(wire: "ServoWire", axis: ServoAxis[Any], act: Callable[[], _Result]) -> _Result:
-    """An exchange, tried three times.
+    """Runs an exchange, with up to three attempts.
 
     Raises:
-        ConfigurationError: it was refused.
-        NoAnswer: nothing came.
+        ConfigurationError: the device refused.
+        NoAnswer: no answer arrived.
     """
     for _ in range(_ATTEMPTS - 1):
         try:
@@ -112,7 +110,7 @@ def check_model(axis: ServoAxis[Any], number: int, name: str, key: str) -> None:
 
 
 def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
-    """Raises ``WrongDevice`` for a device with another firmware than the robot file names, if it names one."""
+    """Raises ``WrongDevice`` for a device with another firmware than the robot file's, if that has one."""
     expected = axis.joint.firmware
     if expected is not None and firmware != expected:
         raise WrongDevice(where=key, key="firmware", expected=expected, found=firmware)
@@ -121,14 +119,14 @@ def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
 def first_look(
     wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], kept: Kept, clock_ns: Callable[[], int], key: str
 ) -> bytes:
-    """Check that a joint's device is that of the robot file, and take its first measurements.
+    """Checks that a joint's device is that of the robot file, and takes its first measurements.
 
     Returns:
-        The bytes that it keeps without power, from address 0 on.
+        The bytes of its persistent registers, from address 0.
 
     Raises:
-        ConfigurationError: it is absent, another model, or not alone under its id.
-        NoAnswer: it answers a ping, and no read.
+        ConfigurationError: the device is absent, another model, or shares its id.
+        NoAnswer: the device answers a ping, but no read.
     """
     number = first_ping(wire, bus, axis, key, kept.registers)
     check_model(axis, number, kept.name_of(number, "a model this driver does not know"), key)
@@ -144,11 +142,11 @@ def first_look(
 
 
 def check_own_range(axis: ServoAxis[Any], low: int, high: int, registers: str, key: str) -> None:
-    """Raises ``ConfigurationError`` for a joint whose range is wider than the one set in its device."""
+    """Raises ``ConfigurationError`` for a joint whose range exceeds the one set in its device."""
     if axis.low < low or axis.high > high:
         joint, ends = axis.joint, sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         raise ConfigurationError(
             where=key,
             problem=f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the device's own range "
-            f"({registers}), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other",
+            f"({registers}), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the former or widen the latter",
         )

@@ -1,4 +1,4 @@
-"""The serial line of servos: what every vendor's packets are exchanged by."""
+"""The base class of packet protocols on a serial line of servos."""
 
 import time
 from abc import abstractmethod
@@ -17,39 +17,39 @@ _WHOLE_SECOND_ANSWER_S: Final = 0.005
 
 
 class ServoWire(SerialWire):
-    """One serial port and the packets on it. All but a sync write may wait until the line is settled.
+    """One serial port and the packets on it. All exchanges but sync writes may wait until the line is settled.
 
-    Raises ``NoAnswer`` where nothing whole comes in time, ``Refused`` where a device says no, ``PortLost``.
+    They raise ``NoAnswer`` if no complete answer arrives in time, ``Refused`` if the device refuses, and ``PortLost``.
     """
 
     @abstractmethod
     def ping(self, device_id: int) -> int:
-        """The model number of a device. Its answer is as long as no other but that of another ping."""
+        """Returns the model number of a device. Only answers to pings have this length."""
 
     @abstractmethod
     def read(self, device_id: int, address: int, size: int) -> Answer:
-        """Bytes of one device's control table."""
+        """Reads bytes of one device's control table."""
 
     @abstractmethod
     def write(self, device_id: int, address: int, data: bytes, gate: Gate | None = None) -> None:
-        """Change one device's control table, and hear that it did."""
+        """Writes to one device's control table, with confirmation."""
 
     @abstractmethod
     def sync_write(self, address: int, data: Mapping[int, bytes], gate: Gate | None = None) -> None:
-        """The same registers of several devices, in one packet that nobody answers. Never waits, not even to settle."""
+        """Writes the same registers of several devices in one packet without answers. Never waits."""
 
     @abstractmethod
     def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
-        """The same registers of several devices, as their answers come; who does not answer properly is left out."""
+        """Reads the same registers of several devices; yields the valid answers as they arrive."""
 
     def answers_twice(self) -> bool:
-        """Whether anything follows the answer just received, as it does when two devices share an id."""
+        """Returns whether bytes follow the last answer, as they do when two devices share an id."""
         with self._use():
             return bool(self._line.received) or self._line.more(_WHOLE_SECOND_ANSWER_S)
 
     @contextmanager
     def _exchange(self, device_id: int, gate: Gate | None = None) -> Generator[None, None, None]:
-        """Ask one device, once the line is settled; it is not any more if no answer comes."""
+        """Wraps one request after the line is settled; without an answer, the line is unsettled again."""
         self._settle()
         began = time.monotonic()
         with self._use(gate):

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.joints import Goal, Steps, Work
-from trade_drivers.joints.serial import NoAnswer, health_of, still_homed, told, tried
+from trade_drivers.joints.serial import NoAnswer, health_of, still_homed, tried, written
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import DynamixelAxis, DynamixelHealth
 
@@ -37,8 +37,8 @@ def goal_block(goal: Goal) -> bytes:
 def relaxing(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
     """Torque off, and its watchdog disarmed."""
     axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
-    yield from told(bus, job, axis, table.TORQUE_ENABLE, 0)
-    yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
+    yield from written(bus, job, axis, table.TORQUE_ENABLE, 0)
+    yield from written(bus, job, axis, table.BUS_WATCHDOG, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
         raise axis.faulty("told to relax, but its torque is still on")
@@ -49,11 +49,11 @@ def leaving(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelA
     health = yield from health_of(bus, axis)
     if relax and health.torque:
         axis.ready = False
-        yield from told(bus, job, axis, table.TORQUE_ENABLE, 0)
+        yield from written(bus, job, axis, table.TORQUE_ENABLE, 0)
     elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
         return
     if health.watchdog:
-        yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
+        yield from written(bus, job, axis, table.BUS_WATCHDOG, 0)
     axis.ready = False
 
 
@@ -69,11 +69,11 @@ def enabling(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: Dynamixel
         raise axis.faulty()
     yield from still_homed(bus, axis)
     if health.watchdog:
-        yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
+        yield from written(bus, job, axis, table.BUS_WATCHDOG, 0)
     block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
     armed = bus.watchdog_counts
-    yield from told(bus, job, axis, table.BUS_WATCHDOG, armed)
-    yield from told(bus, job, axis, table.TORQUE_ENABLE, 1)
+    yield from written(bus, job, axis, table.BUS_WATCHDOG, armed)
+    yield from written(bus, job, axis, table.TORQUE_ENABLE, 1)
     axis.ready = False
     health = yield from health_of(bus, axis)
     kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *_GOAL_BLOCK).data)

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.joints import Goal, Steps, Work
-from trade_drivers.joints.serial import health_of, still_homed, told, tried
+from trade_drivers.joints.serial import health_of, still_homed, tried, written
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import FeetechAxis
 
@@ -31,7 +31,7 @@ def goal_block(goal: Goal) -> bytes:
 def relaxing(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
     """Torque off."""
     axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
-    yield from told(bus, job, axis, table.TORQUE, 0)
+    yield from written(bus, job, axis, table.TORQUE, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
         raise axis.faulty("told to relax, but its torque is still on")
@@ -50,16 +50,16 @@ def enabling(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) 
     health = yield from health_of(bus, axis)
     if health.error and health.torque:  # off and on again is what ends an overload
         axis.ready = False
-        yield from told(bus, job, axis, table.TORQUE, 0)
+        yield from written(bus, job, axis, table.TORQUE, 0)
         health = yield from health_of(bus, axis)
     if health.error:
         raise axis.faulty()
     yield from still_homed(bus, axis)
     if not health.locked:
-        yield from told(bus, job, axis, table.LOCK, 1)
+        yield from written(bus, job, axis, table.LOCK, 1)
         health = yield from health_of(bus, axis)
     block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
-    yield from told(bus, job, axis, table.TORQUE, table.TORQUE_ON)
+    yield from written(bus, job, axis, table.TORQUE, table.TORQUE_ON)
     axis.ready = False
     health = yield from health_of(bus, axis)
     kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *GOAL_BLOCK).data)
