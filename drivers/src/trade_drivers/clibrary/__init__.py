@@ -1,4 +1,4 @@
-"""Functions of C libraries as services: the header says what they take, a Python signature says what that means."""
+"""Functions of C libraries as services: a C header declares them, a Python signature defines their types."""
 
 from trade_drivers.clibrary._library import CFunctionFailed, CLibrary
 

@@ -1,4 +1,4 @@
-"""A C library and its functions as methods."""
+"""A C library whose functions become methods."""
 
 import inspect
 import threading
@@ -36,16 +36,16 @@ class CFunctionFailed(DeviceError, RuntimeError):
 
 
 class CLibrary:
-    """A shared library, opened by the declarations of its header.
+    """A shared library, opened with the declarations of its header.
 
-    ``c`` calls its functions as they are, and ``ffi`` makes C values; both are cffi's. Functions are called without
-    the interpreter's lock: other threads run on, and calls of one library may come at the same time. A service that
-    must not run beside another one is marked ``serial=True``; a stop never waits for it, so what a library does when
-    it is told to stop in the middle of another call has to be known.
+    ``c`` calls its functions directly, and ``ffi`` makes C values; both are cffi's. Functions run without the
+    interpreter's lock, so other threads continue, and calls of one library can overlap. Mark a service that must not
+    overlap with another one ``serial=True``. A stop does not wait for it, so the library must allow a stop during
+    another call.
 
-    Right before a function is called, whether its call may still begin is looked at once more (S01, S08). A function
-    that stops is called again while one that moves, and was let in before, still runs: between that last look and the
-    first line of the other function no library can be told to stop.
+    Immediately before a function is called, its deadline and permit are checked again (S01, S08). A stop function is
+    repeated while a motion function that passed this check still runs, because the library cannot notice a stop
+    between the check and the first line of the function.
     """
 
     def __init__(
@@ -56,22 +56,21 @@ class CLibrary:
         failed: Callable[[int], bool] | None = None,
         text: str | None = None,
     ) -> None:
-        """Open it.
+        """Opens the library.
 
         Args:
-            path: of the shared library; a bare name is looked for as the system's loader does.
-            header: declarations of what is used, without preprocessor lines; types, structs and functions.
-            failed: whether a status means failure, of functions that return one; by default one below zero does, and
-                false.
-            text: a function that makes a text of a status, ``const char *name(int)``.
+            path: of the shared library; the system's loader searches for a bare name.
+            header: declarations of the types, structs and functions in use, without preprocessor lines.
+            failed: returns whether a status means failure; by default, a status below zero or false does.
+            text: a function that returns the text of a status, ``const char *name(int)``.
 
         Raises:
-            ConfigurationError: it cannot be opened or the declarations cannot be read; cffi is not installed.
+            ConfigurationError: the library cannot be opened, the declarations are invalid, or cffi is not installed.
         """
         self.path: Final = fspath(path)
         self._failed = failed
         self._moving: set[int] = set()
-        """Calls of functions that move something: before their last look, until they have returned."""
+        """Calls of motion functions, from before their last check until they have returned."""
         self._moves = 0
         self._guard = threading.Lock()
         self._text = text
@@ -84,23 +83,23 @@ class CLibrary:
     def function(
         self, name: str, *, status: bool | None = None, handle: str | None = None, out: int | Sequence[int] = ()
     ) -> Callable[[Method], Method]:
-        """Have a method do what a C function does; the method's own body stays empty.
+        """Implements a method by a C function; the method's own body stays empty.
 
-        Its parameters are the C function's first ones, in order, compared here once: ``float``, ``int`` and ``bool``
-        are numbers, ``str`` is ``const char *`` (UTF-8), ``list[float]`` and ``list[int]`` a pointer and the count
-        after it, a dataclass a struct by value. Pointers after them are where the results come back: numbers,
-        structs, arrays; of several the method returns a tuple. Numbers that C cannot hold are refused, never cut. A
-        function that wants it otherwise is called through ``c``.
+        Its parameters are the first ones of the C function, in order, and are compared once, here. ``float``, ``int``
+        and ``bool`` are numbers, ``str`` is ``const char *`` (UTF-8), ``list[float]`` and ``list[int]`` are a pointer
+        and a count, and a dataclass is a struct by value. Pointers after them receive results: numbers, structs or
+        arrays; several results are a tuple. Numbers that C cannot hold are refused, never truncated. Call functions
+        with other conventions through ``c``.
 
         Args:
             name: of the C function.
-            status: whether what it returns says if it failed; by default, if it returns something that is not the
-                method's result. False: it says something else, which is thrown away.
-            handle: attribute of the object that is the function's first argument, such as what ``open`` returned.
-            out: how many elements come back, of each array.
+            status: whether the function returns a status; by default, if its return value is not the method's result.
+                False: the return value is discarded.
+            handle: attribute of the object with the function's first argument, such as the result of ``open``.
+            out: number of elements of each array that it returns.
 
         Returns:
-            A decorator; ``@service`` goes above it. The method raises CFunctionFailed, and InvalidArgument.
+            A decorator, placed below ``@service``. The method raises CFunctionFailed and InvalidArgument.
 
         Raises:
             ConfigurationError: there is no such function, or it does not fit the method.
@@ -163,10 +162,10 @@ class CLibrary:
             return self._failed(status)
         return status is False or status < 0
 
-    # --- what moves, and what stops it
+    # --- motion functions and stop functions
 
     def _let_in(self, call: Callable[..., Any], put: Sequence[Any]) -> Any:
-        """Raises DeadlineExceeded, MotionStopped, LockLost, LockedByOther: it must not begin any more."""
+        """Calls a motion function. Raises DeadlineExceeded, MotionStopped, LockLost, LockedByOther: too late."""
         asked = current_call()
         if asked is None or asked.permit is None:
             return call(*put)
@@ -189,7 +188,7 @@ class CLibrary:
                 self._moving.discard(number)
 
     def _stop(self, call: Callable[..., Any], put: Sequence[Any]) -> Any:
-        """Until what was let in before has returned, for some time at most; what it returned last counts."""
+        """Repeats a stop until earlier motion functions have returned, for a limited time; the last result counts."""
         with self._guard:
             before = set(self._moving)
         until, returned = time.monotonic() + _STOPPED_WITHIN_S, call(*put)

@@ -1,4 +1,4 @@
-"""How a method's arguments become those of a C function, and what comes back; planned once, when it is declared."""
+"""Conversion of a method's arguments and results to those of a C function, planned once at declaration."""
 
 # pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 
@@ -16,31 +16,31 @@ _FLOATS: Final = ("float", "double", "long double")
 _TEXTS: Final = ("char *", "char const *")
 
 Into = Callable[[Any], Sequence[Any]]
-"""An argument as one or two of C's."""
+"""Converts an argument to one or two C arguments."""
 OutOf = Callable[[Any], Any]
 
 
 class _Back(NamedTuple):
-    """Something that C puts where a pointer leads."""
+    """A result that C writes through a pointer."""
 
     type: str
     length: int
-    """Given to C after the pointer; 0: not asked for."""
+    """The count passed after the pointer; 0 if there is none."""
     read: OutOf
 
 
 class Passing(NamedTuple):
-    """The plan of one function."""
+    """The conversion plan of one function."""
 
     ffi: Any
     into_c: Sequence[Into]
     backs: Sequence[_Back]
     returned: OutOf | None
-    """Of what it returns; None: that is not the result."""
+    """Converts the return value; None if it is not the result."""
     has_status: bool
 
     def into(self, first: Sequence[Any], args: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        """What the function is called with, and the places of it where something comes back."""
+        """Returns the C arguments, and those of them that receive results."""
         given = list(first)
         for put, value in zip(self.into_c, args, strict=True):
             given.extend(put(value))
@@ -50,7 +50,7 @@ class Passing(NamedTuple):
         return given, places
 
     def out_of(self, returned: Any, places: Sequence[Any]) -> Any:
-        """The method's result."""
+        """Returns the method's result."""
         if self.returned is not None:
             return self.returned(returned)
         results = [one.read(place) for one, place in zip(self.backs, places, strict=True)]
@@ -84,23 +84,23 @@ def plan(
 
 
 class _Planning:
-    """Goes through the parameters of both sides together."""
+    """Matches the parameters of both sides, one after the other."""
 
     def __init__(self, ffi: Any, where: str, kinds: list[Any], lengths: list[int]) -> None:
         self._ffi = ffi
         self._where = where
         self.kinds = kinds
-        """Of the C function, those not yet planned."""
+        """Parameters of the C function that are not yet matched."""
         self._lengths = lengths
         self.into_c: list[Into] = []
 
     def wrong(self, problem: str) -> ConfigurationError:
         return ConfigurationError(where=self._where, problem=problem)
 
-    # --- what goes in
+    # --- arguments
 
     def take(self, name: str, hint: Any) -> None:
-        """The next parameter of the method."""
+        """Matches the next parameter of the method."""
         if not self.kinds:
             raise self.wrong(f"the function has no parameter for {name}")
         kind = self.kinds.pop(0)
@@ -125,9 +125,9 @@ class _Planning:
             raise self.wrong(f"{_named(hint)} has no {', '.join(missing)}, which {kind.cname} has")
 
         def put(value: Any) -> Sequence[Any]:
-            told = {one: getattr(value, one) for one in members}
-            struct = self._ffi.new(made, told)
-            for one, number in told.items():
+            given = {one: getattr(value, one) for one in members}
+            struct = self._ffi.new(made, given)
+            for one, number in given.items():
                 _fits(number, getattr(struct, one))
             return (struct[0],)
 
@@ -150,10 +150,10 @@ class _Planning:
     def _is_count(self) -> bool:
         return bool(self.kinds) and self.kinds[0].kind == "primitive" and _python(self.kinds[0]) is int
 
-    # --- what comes back
+    # --- results
 
     def give_back(self, result: Any) -> list[_Back]:
-        """All that is left comes back as the method's result says."""
+        """Matches all remaining parameters with the method's result."""
         backs: list[_Back] = []
         several = get_origin(result) is tuple
         wanted = [*get_args(result)] if several else [] if result is _NONE else [result]
@@ -188,7 +188,7 @@ class _Planning:
         return _Back(f"{kind.item.cname}[{length}]", length if counted else 0, each)
 
     def reads(self, kind: Any, hint: Any, what: str) -> OutOf:
-        """How a C value becomes a Python one."""
+        """Returns the conversion of a C value to Python."""
         if hint is str and kind.cname in _TEXTS:
             return lambda value: "" if value == self._ffi.NULL else self._ffi.string(value).decode(errors="replace")
         if kind.kind == "struct" and is_dataclass(hint):
@@ -208,7 +208,7 @@ class _Planning:
 
 
 def _python(kind: Any) -> type | None:
-    """The type that a number of C is in Python."""
+    """Returns the Python type of a C number."""
     if kind.kind == "enum":
         return int
     if kind.kind != "primitive" or kind.cname in ("char", "wchar_t"):
@@ -217,14 +217,14 @@ def _python(kind: Any) -> type | None:
 
 
 def is_never_negative(kind: Any) -> bool:
-    """Whether no value of a C type of numbers is below zero, so that none can be told for a failure by that."""
+    """Returns whether a C number type has no values below zero, so that none can mean failure."""
     if kind.kind == "enum":
         return min(kind.elements, default=0) >= 0
     return kind.cname.startswith(("uint", "unsigned")) or kind.cname == "size_t"
 
 
 def _fits(value: Any, held: Any) -> Any:
-    """The value. Raises OverflowError: as a float of C it is infinite."""
+    """Returns the value; raises OverflowError if it is infinite as a C float."""
     if isinstance(value, float) and isfinite(value) and not isfinite(float(held)):
         raise OverflowError(f"{value} is more than a float of C holds")
     return value
