@@ -1,9 +1,9 @@
-"""What every driver must do: a contract for each kind of device, run by pytest on its simulation and on hardware.
+"""Contract tests for drivers, one class per kind of device, run by pytest on simulated and real devices.
 
-The contracts are plain classes with ``test_`` methods, run in a subclass that says by a fixture what is tested.
+The contracts are plain classes with ``test_`` methods. A subclass provides the tested device as a fixture.
 ``python -m trade_drivers.testing --hil ROBOT.toml`` runs them on the devices of a robot file.
 
-``FakeJointGroup`` stands for a robot in tests of what uses one.
+``FakeJointGroup`` is a test double for programs that use a robot.
 """
 
 from trade_drivers.testing._arms import ArmContract

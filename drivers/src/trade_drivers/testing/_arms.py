@@ -1,4 +1,4 @@
-"""What every Arm promises, whoever built it."""
+"""The contract of Arm, for drivers of all vendors."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -19,7 +19,7 @@ _LINE_M: Final = 0.02
 
 
 class ArmContract:
-    """Subclass it with a fixture ``arm``: attached, powered, its brakes released, at rest, with room around it."""
+    """Subclass it with a fixture ``arm``: attached, powered, with released brakes, at rest, with space around it."""
 
     def test_state_tells_what_was_measured_and_when(self, arm: Arm) -> None:
         state, limits = arm.state(), arm.limits()
@@ -37,7 +37,7 @@ class ArmContract:
 
     def test_a_later_state_is_measured_later(self, arm: Arm) -> None:
         first = arm.state()
-        until(lambda: arm.state().measured_at > first.measured_at, "a later measurement is there")
+        until(lambda: arm.state().measured_at > first.measured_at, "a later measurement has arrived")
 
     def test_move_joints_returns_at_rest_at_the_goal(self, arm: Arm) -> None:
         for part in (1.0, 0.0):
@@ -63,7 +63,7 @@ class ArmContract:
 
     def test_set_points_are_followed_and_end_by_themselves(self, arm: Arm) -> None:
         start, goal = arm.state().positions_rad, _ahead(arm, 0.2)
-        until(lambda: arm.servo(goal, 0.3) or _off(arm.state().positions_rad, goal) < NEAR_RAD / 3, "it is there")
+        until(lambda: arm.servo(goal, 0.3) or _off(arm.state().positions_rad, goal) < NEAR_RAD / 3, "it has arrived")
         until(lambda: not arm.resources[0].moving, "the set-point has ended")
         arm.move_joints(start, SPEED_RAD_S)
 
@@ -139,7 +139,7 @@ def _off(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _ahead(arm: Arm, part: float) -> list[float]:
-    """A short way of the last joint, to the side where there is more room."""
+    """Returns a short motion of the last joint, to the side with more room."""
     angles, limit = arm.state().positions_rad, arm.limits().joints[-1]
     up = limit.max_rad - angles[-1] >= angles[-1] - limit.min_rad
     return [*angles[:-1], angles[-1] + (REACH_RAD if up else -REACH_RAD) * part]

@@ -1,4 +1,4 @@
-"""How the contracts ask: refusals, waits with a deadline, calls in threads of their own, streams, short ways."""
+"""Helpers of the contracts: refusals, waits with a deadline, calls in threads, streams, short motions."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -17,11 +17,11 @@ from trade_drivers.motion._plan import JointLimits
 __all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "at_once", "refused", "streamed", "until"]
 
 REACH_RAD: Final = 0.12
-"""No joint is sent farther from where it is found."""
+"""The maximum distance of a joint from its initial position."""
 SPEED_RAD_S: Final = 0.2
-"""Nor faster."""
+"""The maximum speed."""
 NEAR_RAD: Final = 0.03
-"""As close as a joint has to come to its goal."""
+"""The required distance to a goal."""
 _PATIENCE_S: Final = 20.0
 
 _Result = TypeVar("_Result")
@@ -29,7 +29,7 @@ _Result = TypeVar("_Result")
 
 @contextmanager
 def refused(error: type[TradeError]) -> Generator[None, None, None]:
-    """What runs within must be refused with this error."""
+    """Requires that the block is refused with this error."""
     try:
         yield
     except error:
@@ -38,7 +38,7 @@ def refused(error: type[TradeError]) -> Generator[None, None, None]:
 
 
 def until(true: Callable[[], object], what: str) -> None:
-    """Wait for something that must come about."""
+    """Waits for a condition, and fails after a time."""
     deadline = time.monotonic() + _PATIENCE_S
     while not true():
         assert time.monotonic() < deadline, f"waited {_PATIENCE_S:g} s in vain until {what}"
@@ -46,7 +46,7 @@ def until(true: Callable[[], object], what: str) -> None:
 
 
 class Caller(Generic[_Result]):
-    """A call that takes its time, in a thread of its own."""
+    """A long call in a thread of its own."""
 
     def __init__(self, act: Callable[[], _Result]) -> None:
         self._act = act
@@ -62,25 +62,25 @@ class Caller(Generic[_Result]):
             self._error = error
 
     def error(self) -> TradeError | None:
-        """What it raised, once it has ended."""
+        """Waits for the end of the call, and returns its error."""
         self._thread.join(_PATIENCE_S)
         assert not self._thread.is_alive(), "the call does not end"
         return self._error
 
     def result(self) -> _Result:
-        """What it returned; raises what it raised."""
+        """Waits for the end of the call, and returns its result or raises its error."""
         if (error := self.error()) is not None:
             raise error
         return self._results[0]
 
 
 def at_once(act: Callable[[], _Result], callers: int) -> list[_Result]:
-    """What as many calls at the same time return."""
+    """Returns the results of several simultaneous calls."""
     return [caller.result() for caller in [Caller(act) for _ in range(callers)]]
 
 
 def streamed(provider: object, group: str, service: str) -> tuple[Any, Any]:
-    """Two samples of a service, as they reach another container."""
+    """Returns two samples of a service as another container receives them."""
     with memory_system() as system:
         driver, listener = system.container("driver"), system.container("listener")
         driver.register(provider, group)
@@ -92,7 +92,7 @@ def streamed(provider: object, group: str, service: str) -> tuple[Any, Any]:
 
 
 def ahead(states: Sequence[MotorState], limits: Sequence[JointLimits], part: float = 1.0) -> list[float]:
-    """A short way from where the joints are, to the side where there is more room."""
+    """Returns a short motion from the joints' positions, to the side with more room."""
     goals: list[float] = []
     for state, limit in zip(states, limits, strict=True):
         up, down = limit.max_rad - state.position_rad, state.position_rad - limit.min_rad

@@ -1,4 +1,4 @@
-"""What every Camera promises, whoever built it."""
+"""The contract of Camera, for drivers of all vendors."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -14,7 +14,7 @@ _BYTES_PER_PIXEL: Final = {"rgb8": 3, "mono8": 1}
 
 
 class CameraContract:
-    """Subclass it with a fixture ``camera``: attached, with something to see. Nothing moves."""
+    """Subclass it with a fixture ``camera``: attached, with a visible scene. Nothing moves."""
 
     def test_an_image_is_what_it_says_it_is(self, camera: Camera) -> None:
         image, info = camera.image(), camera.info()

@@ -1,4 +1,4 @@
-"""A joint group in memory, for tests of what uses one: it moves at once, and refuses what any other one refuses."""
+"""A joint group in memory for tests: it moves instantly, and refuses the same commands as a real one."""
 
 import math
 import time
@@ -19,10 +19,10 @@ _ACCEL_RAD_S2: Final = 50.0
 
 
 class FakeJointGroup(JointGroup):
-    """Joints that are at once where they are told to be. For tests of behaviours, not of drivers.
+    """Joints that reach each goal instantly. For tests of behaviours, not of drivers.
 
-    Its services, types, limits and refusals are those of a `JointGroup`; locks, stops and e-stops hold for it. It has
-    no time and no torque: nothing is ever under way, so no stop or deadline ends a motion of it.
+    Its services, types, limits and refusals are those of a `JointGroup`; locks, stops and e-stops apply to it. It has
+    no time and no torque: no motion takes time, so no stop or deadline ends one.
     """
 
     def __init__(self, joints: Sequence[str], limits: Sequence[JointLimits] | None = None) -> None:
@@ -30,10 +30,10 @@ class FakeJointGroup(JointGroup):
 
         Args:
             joints: their full names, such as ``rosie.neck.pan``.
-            limits: of each; by default 2.6 rad to either side, 6 rad/s and 50 rad/s2.
+            limits: of each joint; by default 2.6 rad to either side, 6 rad/s and 50 rad/s2.
         """
         self.went: list[list[float]] = []
-        """Where it was told to be, in rad, oldest first; of a trajectory its end."""
+        """Commanded positions in rad, oldest first; for a trajectory, its end."""
         self._joints = list(joints)
         self._limits = [_limits(joint) for joint in joints] if limits is None else list(limits)
         self._resources = tuple(Resource(joint) for joint in joints)
@@ -42,15 +42,15 @@ class FakeJointGroup(JointGroup):
 
     @property
     def resources(self) -> tuple[Resource, ...]:
-        """The joints."""
+        """Returns the resources of the joints."""
         return self._resources
 
     def joints(self) -> list[str]:
-        """Their names."""
+        """Returns the names of the joints."""
         return list(self._joints)
 
     def state(self) -> list[MotorState]:
-        """At rest where they are, with no load."""
+        """Returns states at rest, without load."""
         now = time.monotonic()
         return [
             MotorState(
@@ -69,11 +69,11 @@ class FakeJointGroup(JointGroup):
         ]
 
     def limits(self) -> list[JointLimits]:
-        """As it was made with."""
+        """Returns the limits from the constructor."""
         return list(self._limits)
 
     def move_to(self, positions_rad: list[Position], speed_rad_s: Speed | None = None) -> list[float]:
-        """Be there; returns the angles."""
+        """Sets the positions, and returns them."""
         goals = self._checked(positions_rad, "move_to")
         if speed_rad_s is not None:
             for limits in self._limits:
@@ -81,12 +81,12 @@ class FakeJointGroup(JointGroup):
         return self._go(goals)
 
     def servo(self, positions_rad: list[Position], valid_s: Valid = 0.2) -> None:
-        """Be there."""
+        """Sets the positions."""
         valid(valid_s, "servo")
         self._go(self._checked(positions_rad, "servo"))
 
     def stream(self, plan: Plan) -> list[float]:
-        """Be at the end of a trajectory that begins where they are, and tell of its whole way."""
+        """Sets the positions to the end of a trajectory, and reports its whole progress."""
         starts, goals = ([curve.at(moment)[0] for _, curve in plan.tracks] for moment in (0.0, math.inf))
         for joint, angle, start in zip(self._joints, self._angles, starts, strict=True):
             if abs(angle - start) > (allowed := plan.tolerances.start_rad):
@@ -98,14 +98,14 @@ class FakeJointGroup(JointGroup):
         return at_rest
 
     def stop(self) -> None:
-        """Nothing is under way."""
+        """Does nothing but stop the resources, as no motion takes time."""
 
     def enable(self) -> None:
-        """Torque on, as far as it tells."""
+        """Reports torque as on."""
         self._switch(on=True)
 
     def relax(self) -> None:
-        """Torque off, as far as it tells."""
+        """Reports torque as off."""
         self._switch(on=False)
 
     def _checked(self, positions_rad: Sequence[float], service: str) -> list[float]:

@@ -1,4 +1,4 @@
-"""What every Gripper promises, whoever built it."""
+"""The contract of Gripper, for drivers of all vendors."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -16,7 +16,7 @@ _NEAR_M = 0.002
 class GripperContract:
     """Subclass it with a fixture ``gripper``: attached, activated, open, at rest, with nothing between its fingers.
 
-    It opens and closes all the way, at its limits of speed and force.
+    The tests open and close it completely, at its limits of speed and force.
     """
 
     def test_state_tells_what_was_measured_and_when(self, gripper: Gripper) -> None:
@@ -28,7 +28,7 @@ class GripperContract:
 
     def test_a_later_state_is_measured_later(self, gripper: Gripper) -> None:
         first = gripper.state()
-        until(lambda: gripper.state().measured_at > first.measured_at, "a later measurement is there")
+        until(lambda: gripper.state().measured_at > first.measured_at, "a later measurement has arrived")
 
     def test_move_to_returns_at_rest_at_the_width(self, gripper: Gripper) -> None:
         limits = gripper.limits()

@@ -1,4 +1,4 @@
-"""What every JointGroup promises, whoever built it, on one bus or on several."""
+"""The contract of JointGroup, for drivers of all vendors, on one bus or several."""
 
 # ruff: noqa: N802, S101 - these are tests
 
@@ -20,7 +20,7 @@ __all__ = ["JointGroupContract"]
 class JointGroupContract:
     """Subclass it with a fixture ``group``: attached, relaxed, at rest, within its limits and free to move a little.
 
-    Its joints go 0.12 rad at most from where they are found, at 0.2 rad/s. The fixture relaxes it after every test.
+    Its joints move at most 0.12 rad from their initial positions, at 0.2 rad/s. The fixture relaxes it after each test.
     """
 
     def test_everything_is_in_the_order_of_its_joints(self, group: JointGroup) -> None:
@@ -155,7 +155,7 @@ class JointGroupContract:
         bent = _trajectory(group, (0.0, before), (2.0, before), (1.0, before))
         late = _trajectory(group, (1.0, before), (2.0, before))
         endless = _trajectory(group, (0.0, before), (math.inf, before))
-        others = Trajectory(joints=[*group.joints()[1:], "somebody.else"], points=bent.points)
+        others = Trajectory(joints=[*group.joints()[1:], "another.robot"], points=bent.points)
         for trajectory in (bent, late, endless, others, _trajectory(group, (0.0, before)), _trajectory(group)):
             with refused(InvalidArgument):
                 group.follow(trajectory)
@@ -218,13 +218,13 @@ def _trajectory(group: JointGroup, *points: tuple[float, list[float]]) -> Trajec
 
 
 def _there(group: JointGroup, goals: list[float]) -> Trajectory:
-    """A short and slow one, over a point in between."""
+    """Returns a short and slow trajectory with an intermediate point."""
     starts, duration_s = _angles(group), 2 * REACH_RAD / SPEED_RAD_S
     return _trajectory(group, (0.0, starts), (duration_s / 2, _between(starts, goals, 0.5)), (duration_s, goals))
 
 
 def _under_way(group: JointGroup, act: Callable[[], object]) -> Caller[object]:
-    """A motion in which every joint has begun to move."""
+    """Starts a motion, and waits until each joint moves."""
     group.enable()
     starts = _angles(group)
     mover = Caller(act)

@@ -1,4 +1,4 @@
-"""The contracts on the devices of a robot file: hardware in the loop."""
+"""Runs the contracts on the devices of a robot file (hardware in the loop)."""
 
 import argparse
 import os
@@ -31,19 +31,19 @@ _KINDS: Final[Mapping[str, type[object]]] = {
     "camera": Camera,
     "sensor": Sensor,
 }
-"""Fixtures of the contracts, and what of the robot each of them goes through."""
+"""Fixtures of the contracts, and the devices that each of them covers."""
 _REFUSED: Final = 2
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the contracts on a robot; the exit code is pytest's, or 2 if nothing was run."""
+    """Runs the contracts on a robot; returns pytest's exit code, or 2 if no test ran."""
     parser = argparse.ArgumentParser(
         prog="python -m trade_drivers.testing",
-        description="Runs the contracts of all drivers on the devices of a robot file. Further words go to pytest.",
+        description="Runs the contracts of all drivers on the devices of a robot file. Further arguments go to pytest.",
     )
     parser.add_argument("--hil", metavar="ROBOT.toml", required=True, help="the robot file")
-    parser.add_argument("--port", metavar="BUS=PORT", action="append", default=[], help="another port than the file's")
-    parser.add_argument("--yes", action="store_true", help="do not ask before anything moves")
+    parser.add_argument("--port", metavar="BUS=PORT", action="append", default=[], help="instead of the file's port")
+    parser.add_argument("--yes", action="store_true", help="do not ask for confirmation before devices move")
     options, rest = parser.parse_known_args(words)
     try:
         robot = load(options.hil)
@@ -61,11 +61,11 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 _WORDS: Final = ("-c", os.devnull, "--import-mode=importlib", "-p", "no:cacheprovider", "-v")
-"""The suite runs as it is, whatever the folder it is started in asks of pytest."""
+"""Options that make the suite independent of pytest settings in the current folder."""
 
 
 def _keep(*_: object) -> None:
-    """The providers are called here and announced to nobody."""
+    """Registers nothing, as the providers are only called in this process."""
 
 
 def _port(word: str) -> tuple[str, str]:
@@ -76,10 +76,10 @@ def _port(word: str) -> tuple[str, str]:
 
 
 def _refuse_if_in_use(robot: Robot) -> None:
-    """Two that drive one robot fight over it, and not every wire can be locked.
+    """Refuses a robot with another driver, since not all buses can be locked.
 
     Raises:
-        ConfigurationError: its services are offered in this system; with who has locked them.
+        ConfigurationError: the robot's services are offered in this system; names the owners of their locks.
     """
     offered = trade.services(where(group=robot.name))
     if not offered:
@@ -94,13 +94,13 @@ def _refuse_if_in_use(robot: Robot) -> None:
         }
     )
     locked = f" and locked by {', '.join(owners)}" if owners else ""
-    problem = f"its services are offered by {', '.join(places)}{locked}; end that first"
+    problem = f"its services are offered by {', '.join(places)}{locked}; end those programs first"
     raise ConfigurationError(where=robot.name, problem=problem)
 
 
 def _agreed(robot: Robot) -> bool:
     if not (robot.joints or robot.grippers or robot.arms):
-        return True  # nothing of it moves
+        return True  # cameras and sensors do not move
     if robot.joints:
         sys.stderr.write(
             f"{len(robot.joints)} joints of {robot.name} will be enabled, moved by up to {REACH_RAD} rad at "
@@ -117,13 +117,13 @@ def _agreed(robot: Robot) -> bool:
             f"{len(robot.arms)} arms of {robot.name}, which must be powered, their brakes released, will be moved by\n"
             f"up to {REACH_RAD} rad at {SPEED_RAD_S} rad/s, along short lines, and be put into FREEDRIVE at times.\n"
         )
-    sys.stderr.write("Type yes to go on: ")
+    sys.stderr.write("Type yes to continue: ")
     sys.stderr.flush()
     return sys.stdin.readline().strip() == "yes"
 
 
 class _Devices:
-    """A plugin: gives the contracts each device of the robot in turn, and leaves it relaxed."""
+    """A pytest plug-in that passes each device of the robot to the contracts, and leaves it relaxed."""
 
     def __init__(self, attached: AttachedRobot) -> None:
         self._providers: Mapping[str, object] = attached.providers

@@ -1,4 +1,4 @@
-"""What every Motor promises, whoever built it."""
+"""The contract of Motor, for drivers of all vendors."""
 
 # ruff: noqa: N802, S101 - these are tests
 
@@ -16,7 +16,7 @@ __all__ = ["MotorContract"]
 class MotorContract:
     """Subclass it with a fixture ``motor``: attached, relaxed, at rest, within its limits and free to move a little.
 
-    It goes 0.12 rad at most from where it is found, at 0.2 rad/s. The fixture relaxes it after every test.
+    It moves at most 0.12 rad from its initial position, at 0.2 rad/s. The fixture relaxes it after each test.
     """
 
     def test_state_tells_what_was_measured_and_when(self, motor: Motor) -> None:
@@ -28,7 +28,7 @@ class MotorContract:
 
     def test_a_later_state_is_measured_later(self, motor: Motor) -> None:
         first = motor.state()
-        until(lambda: motor.state().measured_at > first.measured_at, "a later measurement is there")
+        until(lambda: motor.state().measured_at > first.measured_at, "a later measurement has arrived")
 
     def test_enable_holds_where_the_joint_is_and_relax_lets_go(self, motor: Motor) -> None:
         before = motor.state().position_rad
@@ -111,7 +111,7 @@ class MotorContract:
 
     def test_S04_a_velocity_that_is_not_renewed_ends_by_itself(self, motor: Motor) -> None:
         start = motor.state().position_rad
-        motor.enable()  # on a slow bus that takes longer than the set-point holds
+        motor.enable()  # on a slow bus, this takes longer than the set-point is valid
         motor.set_velocity(_inwards(motor) / 2, 0.4)
         until(lambda: motor.state().moving, "it turns")
         until(lambda: not motor.state().moving, "it has come to rest by itself")
@@ -159,7 +159,7 @@ def _inwards_sign(motor: Motor, start: float) -> float:
 
 
 def _under_way(motor: Motor) -> tuple[float, Caller[float]]:
-    """A slow move that has begun, and its goal."""
+    """Starts a slow move; returns its goal and its call."""
     motor.enable()
     start, goal = motor.state().position_rad, _goal(motor)
     mover = Caller(lambda: motor.move_to(goal, SPEED_RAD_S / 2))

@@ -1,4 +1,4 @@
-"""What every Sensor promises, whoever built it."""
+"""The contract of Sensor, for drivers of all vendors."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -11,7 +11,7 @@ __all__ = ["SensorContract"]
 
 
 class SensorContract:
-    """Subclass it with a fixture ``sensor``: attached, and within what it can measure. Nothing moves."""
+    """Subclass it with a fixture ``sensor``: attached, with a value within its range. Nothing moves."""
 
     def test_a_reading_is_what_the_sensor_says_it_measures(self, sensor: Sensor) -> None:
         _check(sensor.read(), sensor.info())

@@ -1,4 +1,4 @@
-"""What `_hil` has pytest collect: the contracts, for all devices of the robot file."""
+"""The contracts that `_hil` runs with pytest, for all devices of the robot file."""
 
 from trade_drivers.testing._arms import ArmContract
 from trade_drivers.testing._cameras import CameraContract
