@@ -95,8 +95,12 @@ def test_a_robot_may_have_a_name_that_begins_like_the_middleware() -> None:
 @pytest.mark.parametrize(
     ("text", "change", "problem"),
     [
-        (TAIL, ("[group.tail]", "[group.faults]"), 'group."faults": rosie.faults is what tells of faults; name'),
-        (TAIL, ('"tail.root"', '"faults"'), 'joint."faults": rosie.faults is what tells of faults; name the joints'),
+        (TAIL, ("[group.tail]", "[group.faults]"), 'group."faults": rosie.faults is the fault log; name'),
+        (
+            TAIL,
+            ('"tail.root"', '"faults"'),
+            'joint."faults": rosie.faults is the fault log; name the joints',
+        ),
         (LEG, ('"leg.knee"', '"bus.legs"'), 'joint."bus.legs": rosie.bus.legs is the bus itself; name the joints'),
     ],
 )

@@ -83,7 +83,7 @@ CAN_MISTAKES = [
     ('channel = "can0"', 'port = "/dev/tty"', "bus.legs: 'port' is a key of a serial bus and 'interface' one of a CAN"),
     ('channel = "can0"\n', "", "bus.legs: missing required key 'channel'; write channel = \"can0\""),
     ('interface = "socketcan"\n', "", "bus.legs: missing required key 'interface'; write interface = \"socketcan\""),
-    ('"socketcan"', '"udp_multicast"', "bus.legs.interface: 'udp_multicast' loses frames and hands everyone their own"),
+    ('"socketcan"', '"udp_multicast"', "bus.legs.interface: 'udp_multicast' loses frames and echoes a sender's own"),
     ('"socketcan"', '"socketcan:can0"', "bus.legs.interface: Expected `str` matching"),
     ('"can0"', '"can0"\nbitrate = 2000000', "bus.legs.bitrate: Expected `int` <= 1000000, but it is 2000000"),
     ("gear = 50", "gear = 0", 'joint."legs.hip".gear: Expected `float` > 0'),

@@ -1,4 +1,4 @@
-"""The robot file: which devices make up a robot, on which bus, with which limits. Pure records, no I/O."""
+"""The robot file: a robot's devices, their buses and their limits. Pure records, no I/O."""
 
 import re
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ __all__ = [
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _TWICE = re.compile(r"Cannot declare \('(\w+)', '([^']*)'\) twice")
-"""What the reader of TOML says of two tables of one name."""
+"""The TOML parser's message for two tables of one name."""
 _SERIAL_KEYS = ("port", "baud", "fast_sync")
 _CAN_KEYS = ("interface", "channel", "bitrate")
 _UR_KEYS = ("host",)
@@ -43,7 +43,7 @@ Text = Annotated[str, Meta(min_length=1)]
 
 
 class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One wire and the thread that owns it: what every kind of wire has."""
+    """One bus: the settings of all kinds of buses."""
 
     name: str
     driver: str
@@ -51,11 +51,11 @@ class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0
     """Cycles of reading and writing per second."""
     stale_after_s: Annotated[float, Meta(gt=0, le=2)] = 0.25
-    """A measured value older than this is an error, not a number."""
+    """The age from which a measurement is an error."""
     watchdog_s: Annotated[float, Meta(ge=0.1, le=2)] = 0.3
-    """The device's own watchdog: silent this long, it stops by itself. Who has none is never sent farther ahead."""
+    """The timeout of the device's own watchdog. A device without one is never commanded farther ahead than this."""
     leave: Literal["hold", "relax"] = "hold"
-    """What to do with enabled devices when the driver leaves: hold the position, or switch torque off."""
+    """What the driver does with enabled devices at shutdown: hold the position, or switch torque off."""
 
 
 class SerialBus(Bus, frozen=True, kw_only=True):
@@ -65,36 +65,36 @@ class SerialBus(Bus, frozen=True, kw_only=True):
     """Serial device; prefer the stable name under /dev/serial/by-id."""
     baud: Annotated[int, Meta(ge=9600, le=4_500_000)] = 1_000_000
     fast_sync: bool = False
-    """Read all devices with one joined answer (needs firmware that knows it)."""
+    """Read all devices with one combined answer (needs firmware support)."""
 
 
 class CanBus(Bus, frozen=True, kw_only=True):
-    """A CAN bus, named by the words of python-can."""
+    """A CAN bus, with the names of python-can."""
 
     interface: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
-    """``socketcan``, ``socketcand``, ``slcan``, ``virtual`` or another of python-can's, but ``udp_multicast``."""
+    """``socketcan``, ``socketcand``, ``slcan``, ``virtual`` or another one of python-can except ``udp_multicast``."""
     channel: Text
     """``can0`` for socketcan, ``HOST:PORT/can0`` for socketcand, the serial device for slcan."""
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
-    """Bits per second. An interface of the operating system is set up by the system, and must agree."""
+    """Bits per second. Must match the rate that the operating system sets for its own interfaces."""
 
     @property
     def port(self) -> str:
-        """Interface and channel as one text, such as ``socketcan:can0``."""
+        """Returns interface and channel as one text, such as ``socketcan:can0``."""
         return f"{self.interface}:{self.channel}"
 
 
 class UrBus(Bus, frozen=True, kw_only=True):
-    """The controller of a Universal Robots arm, reached over the network."""
+    """The controller of a Universal Robots arm, on the network."""
 
     host: Text
-    """Its name or address; the ports are fixed."""
+    """Host name or address; the ports are fixed."""
     rate_hz: Annotated[float, Meta(ge=0, le=500)] = 0.0
-    """Set-points per second; 0: as many as the controller has cycles, 500 or (CB3) 125."""
+    """Set-points per second; 0: one per cycle of the controller, 500 or (CB3) 125."""
 
     @property
     def port(self) -> str:
-        """The same as the host."""
+        """Returns the host."""
         return self.host
 
 
@@ -107,18 +107,18 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     model: str
     """Model as printed on the device: ``XL430-W250``."""
     firmware: str | None = None
-    """Version of the program in the device, as it tells it; another one is refused. Not checked if left out."""
+    """Firmware version that the device must report. Not checked if left out."""
     serial_number: Annotated[int, Meta(ge=0)] | None = None
-    """Of the device, as it tells it; another one is refused. Not checked if left out."""
+    """Serial number that the device must report. Not checked if left out."""
     reversed: bool = False
     homing_counts: int = 0
-    """What the servo's own homing offset was when it was calibrated; with another one its zero has moved: refused."""
+    """The servo's homing offset at calibration. Another one is refused, as the zero has moved."""
     offset_rad: float = 0.0
     """Joint angle when the device reads its centre, or 0 where counts have no centre."""
     counts_per_rev: Positive | None = None
-    """Counts of the encoder for one turn of its motor, for devices that cannot tell it by their model."""
+    """Encoder counts per turn of the motor, for devices whose model does not determine them."""
     gear: Positive = 1.0
-    """Turns of the motor for one turn of the joint."""
+    """Turns of the motor per turn of the joint."""
     min_rad: float
     max_rad: float
     max_speed_rad_s: Positive
@@ -126,7 +126,7 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Robot(Struct, frozen=True, kw_only=True):
-    """A robot file, read and checked."""
+    """A parsed and checked robot file."""
 
     name: str
     buses: list[SerialBus | CanBus | UrBus]
@@ -141,29 +141,29 @@ class Robot(Struct, frozen=True, kw_only=True):
     sensors: list[Sensor] = []
     drill: Drill = Drill()
     given: dict[str, list[str]] = {}
-    """By bus: the keys that its table has, so that a driver can refuse those that mean nothing to it."""
+    """The keys in each bus's table, so that a driver can refuse those it does not use."""
 
     def joints_on(self, bus: str) -> list[Joint]:
-        """The joints on one bus, in file order."""
+        """Returns the joints on one bus, in file order."""
         return [joint for joint in self.joints if joint.bus == bus]
 
     def grippers_on(self, bus: str) -> list[Gripper]:
-        """The grippers on one bus, in file order."""
+        """Returns the grippers on one bus, in file order."""
         return [gripper for gripper in self.grippers if gripper.bus == bus]
 
     def arms_on(self, bus: str) -> list[Arm]:
-        """The arms on one bus, in file order."""
+        """Returns the arms on one bus, in file order."""
         return [arm for arm in self.arms if arm.bus == bus]
 
     def coupled_to(self, joint: str) -> list[str]:
-        """The joints that are only locked together with this one, with the robot's name before them."""
+        """Returns the full names of the joints that are only locked together with this one."""
         names = dict.fromkeys(name for pair in self.coupled if joint in pair.joints for name in pair.joints)
         return [f"{self.name}.{name}" for name in names if name != joint]
 
     def members(self) -> dict[str, list[str]]:
-        """The devices of the robot, of its groups and of every part they are named after, with full names.
+        """Returns the devices of the robot, of its groups and of each prefix of their names, with full names.
 
-        A lock over one of these is a lock over all of its members, or over none.
+        A lock of one of these covers all of its members, or none.
         """
         found: dict[str, dict[str, None]] = {}
         for device in (*self.joints, *self.grippers, *self.arms):
@@ -178,14 +178,14 @@ class Robot(Struct, frozen=True, kw_only=True):
 
 
 def parse(text: str, where: str) -> Robot:
-    """Read a robot file's text.
+    """Parses the text of a robot file.
 
     Args:
         text: the TOML.
         where: the file's name, for messages.
 
     Raises:
-        ConfigurationError: names file, key, value and what would be right.
+        ConfigurationError: the text is invalid; names file, key, value and the valid values.
     """
     try:
         raw = read_toml_text(text)
@@ -241,7 +241,7 @@ def _check_name(name: str, where: str) -> None:
 
 
 def _tables(raw: Mapping[str, object], section: str, where: str) -> list[tuple[str, str, Mapping[str, object]]]:
-    """The tables of a section: its key for messages, its name and its contents."""
+    """Returns the tables of a section, each with its key for messages, its name and its contents."""
     tables = raw.get(section, {})
     if not isinstance(tables, dict):
         raise wrong(where, section, f"must be tables: [{section}.NAME]")
@@ -261,7 +261,7 @@ def _table(section: str, name: str, table: object, where: str) -> tuple[str, str
 
 
 def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> SerialBus | CanBus | UrBus:
-    """A bus of the kind its keys tell."""
+    """Returns a bus of the kind that its keys determine."""
     if any(word in table for word in _UR_KEYS):
         return record_of(key, name, table, UrBus, where)
     can = [word for word in _CAN_KEYS if word in table]
@@ -273,7 +273,7 @@ def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> Serial
         return record_of(key, name, table, SerialBus, where)
     bus = record_of(key, name, table, CanBus, where)
     if bus.interface == _LOSSY:
-        problem = f"{_LOSSY!r} loses frames and hands everyone their own, which drives cannot be told from; use another"
+        problem = f"{_LOSSY!r} loses frames and echoes a sender's own, which look like those of drives; use another"
         raise wrong(where, f"{key}.interface", problem)
     return bus
 
@@ -282,7 +282,7 @@ _Sense = TypeVar("_Sense", Camera, Sensor)
 
 
 def _sense(key: str, name: str, table: Mapping[str, object], record: type[_Sense], where: str) -> _Sense:
-    """A camera or a sensor: what its driver wants to know is for that to look at."""
+    """Returns a camera or a sensor; its driver checks the options."""
     driver = table.get("driver")
     if not isinstance(driver, str) or not driver:
         raise wrong(where, f"{key}.driver", 'must name its driver, such as driver = "snapshot"')
@@ -328,9 +328,9 @@ def _check_links(robot: Robot) -> None:
 
 
 def _check_taken(robot: Robot) -> None:
-    """Names below the robot's that its drivers take for themselves."""
+    """Checks that no device has a name that drivers use themselves."""
     devices = (*robot.joints, *robot.grippers, *robot.arms, *robot.cameras, *robot.sensors, *robot.groups)
-    taken = {"faults": "what tells of faults"}
+    taken = {"faults": "the fault log"}
     taken |= {f"bus.{bus.name}": "the bus itself" for bus in robot.buses if isinstance(bus, CanBus)}
     for device in devices:
         if (what := taken.get(device.name)) is not None:
@@ -339,7 +339,7 @@ def _check_taken(robot: Robot) -> None:
 
 
 def _check_devices(robot: Robot) -> None:
-    """There is a device, and each is on a bus there is, under an id and a name of its own."""
+    """Checks that there is a device, and that each has an existing bus, a unique id and a unique name."""
     devices = (*robot.joints, *robot.grippers, *robot.arms)
     if not (devices or robot.cameras or robot.sensors):
         problem = "missing; a robot needs at least one joint, gripper, arm, camera or sensor"

@@ -1,4 +1,4 @@
-"""From a table of the robot file to a record, and what to say when it is none. Pure."""
+"""Conversion of a table of the robot file to a record, with error messages. Pure."""
 
 import re
 from collections.abc import Mapping
@@ -28,15 +28,15 @@ _Record = TypeVar("_Record", bound=Struct)
 
 
 def wrong(where: str, key: str, problem: str) -> ConfigurationError:
-    """The error that names file and key."""
+    """Returns the error that names file and key."""
     return ConfigurationError(where=f"{where}: {key}", problem=problem)
 
 
 def record_of(key: str, name: str | None, table: Mapping[str, object], record: type[_Record], where: str) -> _Record:
-    """The table ``key`` as a record, of that name if it has one.
+    """Returns the table ``key`` as a record, with this name if it has one.
 
     Raises:
-        ConfigurationError: it is none; names key, value and what would be right.
+        ConfigurationError: the table is invalid; names key, value and the valid values.
     """
     try:
         made = msgspec.convert(dict(table) if name is None else {**table, "name": name}, record)
@@ -49,7 +49,7 @@ def record_of(key: str, name: str | None, table: Mapping[str, object], record: t
 def explain(
     bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str
 ) -> ConfigurationError:
-    """What to tell of a table that is no such record."""
+    """Returns the error for an invalid table."""
     text = str(bad)
     keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
     if missing := _MISSING.search(text):
@@ -68,7 +68,7 @@ def explain(
 
 
 def _check_finite(record: Struct, key: str, where: str) -> None:
-    """TOML knows inf and nan; no limit may be one."""
+    """Refuses inf and nan, which TOML allows."""
     for field in record.__struct_fields__:
         value = getattr(record, field)
         if isinstance(value, float) and not isfinite(value):

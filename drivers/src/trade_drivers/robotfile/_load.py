@@ -10,10 +10,10 @@ __all__ = ["load"]
 
 
 def load(path: str | PathLike[str]) -> Robot:
-    """Read and check a robot file.
+    """Reads and checks a robot file.
 
     Raises:
-        ConfigurationError: it cannot be read, or what it says is wrong; the message names file, key and remedy.
+        ConfigurationError: the file cannot be read or is invalid; the message names file, key and remedy.
     """
     where = str(path)
     try:

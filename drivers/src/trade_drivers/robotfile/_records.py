@@ -1,4 +1,4 @@
-"""What the robot file says of grippers, arms, cameras, sensors and groups. Pure records, no I/O."""
+"""Records of the robot file for grippers, arms, cameras, sensors and groups. No I/O."""
 
 from collections.abc import Mapping
 from math import isfinite
@@ -30,20 +30,20 @@ class Gripper(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Arm(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One arm of six joints: the controller it hangs on, its limits, and its named poses."""
+    """One arm of six joints: its controller, its limits, and its named poses."""
 
     name: str
     bus: str
     model: str
     """Model as printed on the device: ``UR5e``."""
     min_rad: Angles
-    """Of each joint, from the base to the tool."""
+    """Limit of each joint, from the base to the tool."""
     max_rad: Angles
     max_speed_rad_s: Positive
-    """Of every joint."""
+    """Limit of all joints."""
     max_accel_rad_s2: Positive
     max_speed_m_s: Positive
-    """Of the tool, on a straight line."""
+    """Limit of the tool, on a straight line."""
     max_accel_m_s2: Positive
     poses: dict[str, Angles] = {}
     """Joint angles in rad by name, such as ``home``."""
@@ -53,23 +53,23 @@ _Options = TypeVar("_Options", bound=Struct)
 
 
 class _Sense(Struct, frozen=True, kw_only=True):
-    """A device that only looks or measures: its driver, and what that wants to know."""
+    """A device that only observes: its driver, and the driver's options."""
 
     name: str
     driver: str
     """Entry point of the group ``trade.drivers``: ``snapshot``."""
     options: Mapping[str, object]
-    """The other keys of its table: what they may be is for the driver to say."""
+    """The other keys of its table, which the driver defines."""
     key: str
-    """Its table: ``camera.eye``."""
+    """The key of its table: ``camera.eye``."""
     where: str
-    """The file it was read from."""
+    """The file of the table."""
 
     def options_as(self, record: type[_Options]) -> _Options:
-        """The options as a record of the driver's, which should forbid unknown fields.
+        """Returns the options as a record of the driver, which should forbid unknown fields.
 
         Raises:
-            ConfigurationError: a key is missing, unknown or wrong; names file, key, value and what would be right.
+            ConfigurationError: a key is missing, unknown or wrong; names file, key, value and the valid values.
         """
         return record_of(self.key, None, self.options, record, self.where)
 
@@ -83,20 +83,20 @@ class Sensor(_Sense, frozen=True, kw_only=True):
 
 
 class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Joints that move together, in the order their values are given."""
+    """Joints that move together, in the order of all values."""
 
     name: str
     joints: Annotated[list[str], Meta(min_length=1)]
 
 
 class Coupled(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Joints that hinder each other, so that none is locked without the others."""
+    """Joints that can collide, so that none is locked without the others."""
 
     joints: Annotated[list[str], Meta(min_length=2)]
 
 
 class Drill(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How soon, in seconds, all must be at rest after each thing that `trade drill` does; None: what the rules say."""
+    """Maximum time to rest in seconds after each action of `trade drill`; None: the default of the safety rules."""
 
     caller_killed: Positive | None = None
     caller_frozen: Positive | None = None
@@ -110,7 +110,7 @@ class Drill(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 def arm_problem(arm: Arm) -> tuple[str, str] | None:
-    """The key of an arm that is wrong, and why; None if none is."""
+    """Returns the key of an arm with a wrong value, and the reason; None if there is none."""
     for key, values in (("min_rad", arm.min_rad), ("max_rad", arm.max_rad), *arm.poses.items()):
         if not all(isfinite(value) for value in values):
             return key, f"must be finite numbers, but it is {values}"

@@ -1,4 +1,4 @@
-"""A robot without some of its parts, as it is on the day when one of them is away."""
+"""Removes parts from a robot file, for example when a device is missing."""
 
 from collections.abc import Iterable
 
@@ -11,19 +11,19 @@ __all__ = ["without"]
 
 
 def without(robot: Robot, names: Iterable[str]) -> tuple[Robot, list[str]]:
-    """The robot as if some of its buses, cameras or sensors were not in its file.
+    """Returns the robot as if some of its buses, cameras or sensors were not in its file.
 
-    With a bus go its devices, and with a joint the groups that it is in: a group is whole or not there.
+    With a bus, its devices are removed, and with a joint, all groups that contain it.
 
     Args:
-        robot: what ``load`` read.
+        robot: the result of ``load``.
         names: of buses, cameras and sensors.
 
     Returns:
-        The rest, and the names of all devices and groups that are left out.
+        The rest, and the names of all removed devices and groups.
 
     Raises:
-        ConfigurationError: there is no such part, a joint that stays is coupled to one that goes, or nothing stays.
+        ConfigurationError: there is no such part, a remaining joint is coupled to a removed one, or nothing remains.
     """
     out = set(names)
     known = {each.name for each in (*robot.buses, *robot.cameras, *robot.sensors)}
