@@ -1,5 +1,5 @@
-"""One folder a vendor's protocol. Each has the same files under the same names.
+"""One folder for each vendor's protocol, with the same file names in each.
 
-``_driver`` attaches, ``_inspect`` checks, ``_axis`` keeps a joint's state, ``_cycle`` and ``_jobs`` use the bus,
-``_frames``, ``_table`` and ``_wire`` are the protocol, ``_commission`` and ``_scan`` find devices.
+``_driver`` attaches, ``_inspect`` checks, ``_axis`` has a joint's state, ``_cycle`` and ``_jobs`` use the bus,
+``_frames``, ``_table`` and ``_wire`` implement the protocol, ``_commission`` and ``_scan`` find devices.
 """

@@ -1,4 +1,4 @@
-"""One servo as the bus thread knows it: what is read of it, and what speaks against moving on."""
+"""The state of one servo on the bus thread: its measurements, and faults that forbid motion."""
 
 import struct
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from trade_drivers.vendors.dynamixel import _table as table
 __all__ = ["CYCLIC", "GRAIN", "SLOW", "DynamixelAxis", "DynamixelHealth"]
 
 CYCLIC: Final = (table.PRESENT_LOAD.address, table.PRESENT_POSITION.end - table.PRESENT_LOAD.address)
-"""Address and size of what is read of every joint in every cycle: effort, velocity, position."""
+"""Address and size of the block read from each joint in each cycle: effort, velocity, position."""
 SLOW: Final = (table.TORQUE_ENABLE.address, table.TEMPERATURE.end - table.TORQUE_ENABLE.address)
-"""Address and size of what is read of one joint at a time: everything from torque to temperature."""
+"""Address and size of the slow block, read from one joint at a time: everything from torque to temperature."""
 GRAIN: Final = Grain(
     rad=table.RAD_PER_COUNT,
     rad_s=table.RAD_S_PER_COUNT,
@@ -25,14 +25,14 @@ GRAIN: Final = Grain(
     arrived=4,
     near=20,
 )
-"""Arrived within 0.35 degrees, or 1.8 if it comes no closer."""
+"""A joint has arrived within 0.35 degrees, or within 1.8 if it makes no more progress."""
 _CYCLIC_LAYOUT: Final = struct.Struct("<hii")
 _TICK_TOLERANCE_MS: Final = 250
 _TICK_AMBIGUOUS_MS: Final = 16_000
 
 
 class DynamixelHealth(Health, frozen=True, gc=False, kw_only=True):
-    """One slow measurement."""
+    """One measurement of the slow block."""
 
     status_level: int
     watchdog: int
@@ -40,7 +40,7 @@ class DynamixelHealth(Health, frozen=True, gc=False, kw_only=True):
 
     @classmethod
     def decode(cls, data: bytes, at_ns: int) -> "DynamixelHealth":
-        """Out of the bytes of the SLOW block."""
+        """Decodes the bytes of the SLOW block."""
         at = SLOW[0]
         return cls(
             torque=table.TORQUE_ENABLE.decode(data, at) == 1,
@@ -55,7 +55,7 @@ class DynamixelHealth(Health, frozen=True, gc=False, kw_only=True):
         )
 
     def restarted_since(self, earlier: "DynamixelHealth") -> bool:
-        """Whether the device's own clock jumped: it went through a reset in between."""
+        """Returns whether the device's own clock jumped, as it does at a reset."""
         elapsed_ms = (self.at_ns - earlier.at_ns) / 1e6
         if elapsed_ms > _TICK_AMBIGUOUS_MS:
             return False
@@ -69,7 +69,7 @@ class DynamixelAxis(ServoAxis[DynamixelHealth]):
     cyclic = CYCLIC
     slow = SLOW
     homing = table.HOMING_OFFSET
-    error_remedy = "let it cool down or free it, then call enable(), which starts it anew"
+    error_remedy = "let it cool down or free it, then call enable(), which restarts it"
 
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:
         model = table.BY_MODEL_NAME[joint.model]

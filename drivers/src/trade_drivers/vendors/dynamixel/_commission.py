@@ -29,7 +29,7 @@ class DynamixelCommissioner(Commissioner):
 
 
 class DynamixelBench(ServoBench["Wire"]):
-    """An open line of them."""
+    """An open line of Dynamixel servos."""
 
     driver = "dynamixel"
     restless = (table.REALTIME_TICK.address, table.INPUT_VOLTAGE.end - table.REALTIME_TICK.address)
@@ -53,4 +53,4 @@ class DynamixelBench(ServoBench["Wire"]):
         self.write(device_id, table.BAUD, table.BAUD_CODES[to])
 
     def seal(self, device_id: int) -> None:
-        """Its EEPROM is open whenever its torque is off."""
+        """Does nothing, as the EEPROM is writable whenever torque is off."""

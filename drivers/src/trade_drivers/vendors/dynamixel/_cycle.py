@@ -1,4 +1,4 @@
-"""What Dynamixel servos are told in the cyclic exchange with all of one bus, and how."""
+"""Commands to Dynamixel servos in the cyclic exchange with a bus."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ _SIZES: Final = tuple(
 
 
 class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
-    """What happens on one bus of servos."""
+    """The exchange with the Dynamixel servos of one bus."""
 
     sizes = _SIZES
     answer_overhead = 12
@@ -50,7 +50,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         ours: dict[int, bytes] = {}
         others: dict[int, bytes] = {}
         for axis, position in positions.items():
-            if axis.ready:  # brakes at its full acceleration, however gentle the move was
+            if axis.ready:  # brakes at the joint's full acceleration, even in a slow move
                 ours[axis.id] = jobs.goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
             else:
                 others[axis.id] = table.GOAL_POSITION.encode(position)
@@ -75,7 +75,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         return table.name_of(model_number, str(model_number))
 
     def admit(self, axis: DynamixelAxis) -> None:
-        """Found enabled, its watchdog is armed; found moving, it is stopped."""
+        """Arms the watchdog of a joint that is already enabled, and stops one that moves."""
         health = axis.health
         if health is None or not health.torque or health.watchdog == table.WATCHDOG_EXPIRED:
             return

@@ -1,4 +1,4 @@
-"""Bringing a Dynamixel bus up."""
+"""The driver of a Dynamixel bus."""
 
 import logging
 from collections.abc import Callable
@@ -48,7 +48,7 @@ class DynamixelDriver(ServoDriver[DynamixelAxis, "Wire"]):
 
 
 def wire_at(port: str, baud: int, where: str, *, fast: bool = False) -> "Wire":
-    """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
+    """Returns a closed line. Raises ``ConfigurationError`` without the vendor library."""
     try:
         from trade_drivers.vendors.dynamixel._wire import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:

@@ -1,4 +1,4 @@
-"""Protocol 2.0 status packets: bytes in, packets out; no I/O and no clock.
+"""Decoding of protocol 2.0 status packets. No I/O and no clock.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0": ``FF FF FD 00 | ID | LEN16 | 55 | ERR | parameters | CRC16``.
 """
@@ -35,7 +35,7 @@ _CRC: Final = _table()
 
 
 def crc16(data: Iterable[int], crc: int = 0) -> int:
-    """CRC-16 with polynomial 0x8005, start 0, nothing reflected, as the e-Manual defines it."""
+    """Returns the CRC-16 with polynomial 0x8005, start value 0 and no reflection, as the e-Manual defines it."""
     table = _CRC
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ table[(crc >> 8) ^ byte]
@@ -43,15 +43,15 @@ def crc16(data: Iterable[int], crc: int = 0) -> int:
 
 
 def take_status(buffer: bytearray) -> bytes | None:
-    """The first whole status packet, taken out of the buffer with all noise before it; None while it is incomplete.
+    """Removes the first complete status packet, and noise before it, from the buffer; None while it is incomplete.
 
     Raises:
-        Corrupt: a packet with a wrong CRC was taken out.
+        Corrupt: a packet with a wrong CRC was removed.
     """
     while True:
         start = buffer.find(HEADER)
         if start < 0:
-            del buffer[: max(0, len(buffer) - 2)]  # half a header may stand at the end
+            del buffer[: max(0, len(buffer) - 2)]  # the end may be a partial header
             return None
         if start:
             del buffer[:start]
@@ -72,7 +72,7 @@ def take_status(buffer: bytearray) -> bytes | None:
 
 
 def unstuffed(frame: bytes) -> bytes:
-    """The packet without the bytes that were put in to keep headers out of its parameters."""
+    """Returns the packet without the stuffing bytes that keep headers out of its parameters."""
     if STUFFED not in frame[_PREFIX:-2]:
         return frame
     return frame[:_PREFIX] + frame[_PREFIX:-2].replace(STUFFED, HEADER) + frame[-2:]

@@ -1,4 +1,4 @@
-"""Looking a bus over before anything may be commanded: who is there, and set how. Moves nothing and resets nothing."""
+"""Checks of devices and their settings before anything may be commanded. Moves and resets nothing."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
@@ -22,10 +22,10 @@ _ALL_ANSWER: Final = 2
 
 
 def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> None:
-    """What the file alone can tell: speeds, and whether the bytes of a cycle fit into it.
+    """Checks the robot file: speeds, and whether a cycle is long enough for its bytes.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     check_joints(axes, where, check_ranges)
     count = len(axes)
@@ -34,13 +34,13 @@ def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> No
 
 
 def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Callable[[], int], where: str) -> float:
-    """Check one joint's device and take its first measurements.
+    """Checks one joint's device and takes its first measurements.
 
     Returns:
-        Its return delay in seconds, which only costs speed.
+        The return delay in seconds, which only reduces speed.
 
     Raises:
-        ConfigurationError: it is absent, another model, set wrongly, or not alone under its id.
+        ConfigurationError: the device is absent, another model, set wrongly, or shares its id.
     """
     key = f'{where}: joint."{axis.joint.name}"'
     try:

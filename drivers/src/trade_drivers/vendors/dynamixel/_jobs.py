@@ -1,4 +1,4 @@
-"""What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
+"""The steps of enabling, relaxing and leaving a servo: one exchange after the other."""
 
 from collections.abc import Generator
 from contextlib import suppress
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["enabling", "goal_block", "leaving", "relaxing"]
 
 _BOOT_NS: Final = 2_000_000_000
-"""How long a servo may take to start anew, and to be taken on again."""
+"""The time allowed for a servo to restart and to be accepted again."""
 _WAIT_S: Final = 0.001
 _GOAL_BLOCK: Final = (
     table.PROFILE_ACCELERATION.address,
@@ -24,7 +24,7 @@ _GOAL_BLOCK: Final = (
 
 
 def goal_block(goal: Goal) -> bytes:
-    """What goes from profile acceleration to goal position."""
+    """Returns the bytes from profile acceleration to goal position."""
     return b"".join(
         (
             table.PROFILE_ACCELERATION.encode(goal.accel),
@@ -35,17 +35,17 @@ def goal_block(goal: Goal) -> bytes:
 
 
 def relaxing(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
-    """Torque off, and its watchdog disarmed."""
-    axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
+    """Switches torque off and disarms the watchdog."""
+    axis.ready = False  # first, since a health read in between would take torque off for a fault
     yield from written(bus, job, axis, table.TORQUE_ENABLE, 0)
     yield from written(bus, job, axis, table.BUS_WATCHDOG, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
-        raise axis.faulty("told to relax, but its torque is still on")
+        raise axis.faulty("it did not relax: its torque is still on")
 
 
 def leaving(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
-    """Torque off or left on, and its watchdog disarmed where it may be."""
+    """Switches torque off or leaves it on, and disarms the watchdog where that is allowed."""
     health = yield from health_of(bus, axis)
     if relax and health.torque:
         axis.ready = False
@@ -58,7 +58,7 @@ def leaving(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelA
 
 
 def enabling(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
-    """Torque on at the measured position, with the joint's own profile and its watchdog armed; all of it read back."""
+    """Switches torque on at the measured position with the joint's profile and an armed watchdog; reads all back."""
     bus.require_answering(axis)
     health = yield from health_of(bus, axis)
     if health.error and health.torque:
@@ -83,7 +83,7 @@ def enabling(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: Dynamixel
 
 
 def _seeded(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> bytes:
-    """Its goal is where it is; tried again, it is measured again, as it may have sagged."""
+    """Sets the goal to the measured position; measures again at each retry, as the joint may have sagged."""
     register = table.PRESENT_POSITION
     answer = bus.wire.read(axis.id, register.address, register.size)
     position = register.decode(answer.data, register.address)
@@ -95,10 +95,10 @@ def _seeded(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelA
 def _restarted(
     bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis
 ) -> Generator[None, None, DynamixelHealth]:
-    """How a servo is that has shut down, once it was started anew: nothing but that, or its power, has it go on."""
+    """Restarts a servo that has shut down, and returns its health; only a restart or power cycle ends a shutdown."""
     axis.ready = False
     began_ns = bus.clock()
-    with suppress(NoAnswer):  # whether it has heard that is seen by what it says next
+    with suppress(NoAnswer):  # its next answer shows whether it restarted
         bus.wire.reboot(axis.id, job.gate)
     while True:
         bus.idle(_WAIT_S)

@@ -2,7 +2,7 @@
 
 Sources: ROBOTIS e-Manual, the models' pages, "Control Table of EEPROM Area" and "Control Table of RAM Area". All have
 the same addresses up to 147, which is all that is used here; behind that they differ: where indirect data begin on an
-X330 even depends on its firmware. What stands at 126 is a load or a current, in the model's own unit.
+X330 even depends on its firmware. Register 126 is a load or a current, in the model's own unit.
 """
 
 from enum import Enum
@@ -29,7 +29,7 @@ RAD_S2_PER_COUNT: Final = 214.577 * tau / 3600
 
 
 class Access(Enum):
-    """Who may change a register, and when."""
+    """Access to a register."""
 
     READ = "read only"
     RAM = "read and write; back to its default at power-up"
@@ -50,21 +50,21 @@ class Register(Struct, frozen=True):
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Size in bytes."""
         return int(self.kind[1])
 
     @property
     def end(self) -> int:
-        """The address behind it."""
+        """The address after the register."""
         return self.address + self.size
 
     def decode(self, data: bytes, start: int = 0) -> int:
-        """Counts, out of a block of bytes read from address ``start``; two's complement where the table says so."""
+        """Returns the counts from a block of bytes from address ``start``; two's complement if the table says so."""
         at = self.address - start
         return int.from_bytes(data[at : at + self.size], "little", signed=self.kind[0] == "i")
 
     def encode(self, counts: int) -> bytes:
-        """The bytes of a number of counts; OverflowError if they do not fit."""
+        """Returns the bytes of a number of counts; raises OverflowError if they do not fit."""
         return counts.to_bytes(self.size, "little", signed=self.kind[0] == "i")
 
 
@@ -106,12 +106,12 @@ INPUT_VOLTAGE: Final = Register(144, "u2", si_per_count=0.1, unit="V")
 TEMPERATURE: Final = Register(146, "u1", si_per_count=1.0, unit="degC")
 
 BAUD_CODES: Final = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6}
-"""What register 8 reads at each rate; 7 is 4.5 Mbaud, which the library does not know."""
+"""Values of register 8 for each rate; 7 is 4.5 Mbaud, which the library does not support."""
 POSITION_MODE: Final = 3
 CENTRE_COUNTS: Final = 2048
 TICK_WRAPS_AT: Final = 32768
 WATCHDOG_EXPIRED: Final = 255
-"""What register 98 reads after it has stopped the device; goal registers are read-only until 0 is written to it."""
+"""Value of register 98 after the watchdog has expired; goal registers are read-only until 0 is written to it."""
 
 HARDWARE_ERRORS: Final = {
     0x01: "input voltage out of range",
@@ -134,14 +134,14 @@ STATUS_ERRORS: Final = {
 
 
 class Model(Struct, frozen=True):
-    """What differs between the models this driver knows."""
+    """The properties in which the supported models differ."""
 
     name: str
     number: int
     effort: Register
-    """What stands at address 126."""
+    """The register at address 126."""
     full_effort_counts: int
-    """Counts of ``effort`` that mean full load: fractions are relative to it."""
+    """Counts of ``effort`` at full load, the reference for fractions."""
 
 
 _FULL_LOAD: Final = 1000
@@ -152,7 +152,7 @@ def _with_load(number: int, name: str) -> Model:
 
 
 def _with_current(number: int, name: str, limit: int, effort: Register = PRESENT_CURRENT) -> Model:
-    """``limit``: the greatest that its current limit, register 38, can be set to."""
+    """Returns a model whose ``limit`` is the maximum of its current limit, register 38."""
     return Model(name, number, effort, limit)
 
 
@@ -198,11 +198,11 @@ BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}
 
 
 def name_of(model_number: int, otherwise: str) -> str:
-    """What a model is called."""
+    """Returns the name of a model."""
     model = BY_MODEL_NUMBER.get(model_number)
     return model.name if model else otherwise
 
 
 def firmware(data: bytes) -> str:
-    """The version of its program, out of the bytes from address 0 on."""
+    """Returns the firmware version from the bytes from address 0."""
     return str(FIRMWARE.decode(data))

@@ -1,7 +1,7 @@
-"""The only place that touches dynamixel-sdk: its protocol handler on a port that sleeps while it waits.
+"""The only module that uses dynamixel-sdk: its protocol handler on a port that sleeps while it waits.
 
-The vendor library is untyped, polls with a full core, trusts the wall clock, stays "busy" for ever once a call raised,
-and does not look at the length of an answer. All this is mended here by overriding; what it sends is its own.
+The vendor library is untyped, polls with a full core, uses the wall clock, stays "busy" after a call has raised,
+and does not check the length of an answer. Overrides fix all this here; the bytes sent are the library's own.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -25,7 +25,7 @@ __all__ = ["Wire"]
 _ALERT: Final = 0x80
 _PING_ALL: Final = b"\xff\xff\xfd\x00\xfe\x03\x00\x01"
 _EACH_S: Final = 0.003
-"""Within which each servo answers a ping of all, the next id after the one before it."""
+"""The time slot of each servo's answer to a broadcast ping, in the order of ids."""
 _SILENT_S: Final = 0.050
 
 
@@ -33,7 +33,7 @@ class _QuietPort(PortHandler):
     """Our line as the SDK's port."""
 
     expected: int | None = None
-    """Bytes of parameters the answer must have; another length is the late answer of an earlier question."""
+    """Required size of the answer's parameters; another size is a late answer to an earlier request."""
 
     def __init__(self, line: SerialLine, path: str) -> None:
         super().__init__(path)
@@ -41,7 +41,7 @@ class _QuietPort(PortHandler):
 
     @property
     def is_using(self) -> bool:
-        """The library's "busy", which would stay for ever once a call raised; one thread uses the line anyway."""
+        """Always False: the library's "busy" stays set after a call has raised, and only one thread uses the line."""
         return False
 
     @is_using.setter
@@ -57,7 +57,7 @@ class _QuietPort(PortHandler):
         self._line.expect(packet_length)
 
     def frame(self) -> bytes | None:
-        """The next status packet of the expected length, or None if none came in time; Corrupt if it is damaged."""
+        """Returns the next status packet of the expected length, or None at the timeout; raises Corrupt if damaged."""
         while True:
             frame = take_status(self._line.received)
             if frame is None:
@@ -72,13 +72,13 @@ class _QuietPort(PortHandler):
 
 
 class _Packets(Protocol2PacketHandler):
-    """The SDK's protocol 2.0, parsing a packet in one go and never sending one with a header in its parameters."""
+    """The SDK's protocol 2.0; parses each packet at once, and never sends one with a header in its parameters."""
 
     def updateCRC(self, crc_accum: int, data_blk_ptr: Sequence[int], data_blk_size: int) -> int:  # noqa: N802
         return crc16(data_blk_ptr[:data_blk_size], crc_accum)
 
     def addStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
-        # The SDK throws the stuffed packet away and sends the bare one, which a servo misreads from its middle.
+        # The SDK discards the stuffed packet and sends the bare one, which a servo misreads.
         if HEADER in bytes(packet[7:-2]):
             raise ValueError(
                 "the parameters contain FF FF FD, which the vendor library sends wrongly; nothing was sent"
@@ -94,7 +94,7 @@ class _Packets(Protocol2PacketHandler):
 
 
 class Wire(ServoWire):
-    """One serial port and the packets on it; ``fast``: sync reads are answered by one joined packet."""
+    """One serial port and the packets on it; with ``fast``, one combined packet answers a sync read."""
 
     def __init__(self, path: str, baud: int, where: str = "bus", *, fast: bool = False) -> None:
         super().__init__(path, baud, where)
@@ -117,7 +117,7 @@ class Wire(ServoWire):
         return int(model)
 
     def anybody(self) -> bool:
-        """Whether anything comes back to a ping of everybody; returns when it is over."""
+        """Returns whether any device answers a broadcast ping, after all answers could have arrived."""
         self._settle()
         crc = crc16(_PING_ALL)
         window_s = 252 * (_EACH_S + (OVERHEAD + 3) * 10 / self._baud)
@@ -145,7 +145,7 @@ class Wire(ServoWire):
             self._require(result, device_id, error)
 
     def reboot(self, device_id: int, gate: Gate | None = None) -> None:
-        """Have one device start anew, its torque off and its RAM area at its defaults."""
+        """Restarts one device: torque off, RAM area at its defaults."""
         with self._exchange(device_id, gate):
             self._port.expected = 0
             result, error = self._packets.reboot(self._port, device_id)

@@ -1,4 +1,4 @@
-"""One servo as the bus thread knows it: what is read of it, how far ahead it is sent, what speaks against moving on."""
+"""The state of one servo on the bus thread: its measurements, its limited goal, and faults that forbid motion."""
 
 import struct
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from trade_drivers.vendors.feetech import _table as table
 __all__ = ["CYCLIC", "GRAIN", "SLOW", "FeetechAxis", "FeetechHealth"]
 
 CYCLIC: Final = (table.PRESENT_POSITION.address, table.PRESENT_LOAD.end - table.PRESENT_POSITION.address)
-"""Address and size of what is read of every joint in every cycle: position, speed, load."""
+"""Address and size of the block read from each joint in each cycle: position, speed, load."""
 SLOW: Final = (table.TORQUE.address, table.MOVING.end - table.TORQUE.address)
-"""Address and size of what is read of one joint at a time: everything from torque to the moving flag."""
+"""Address and size of the slow block, read from one joint at a time: everything from torque to the moving flag."""
 GRAIN: Final = Grain(
     rad=table.RAD_PER_COUNT,
     rad_s=table.RAD_S_PER_COUNT,
@@ -25,21 +25,21 @@ GRAIN: Final = Grain(
     arrived=4,
     near=20,
 )
-"""Arrived within 0.35 degrees, or 1.8 if it comes no closer."""
+"""A joint has arrived within 0.35 degrees, or within 1.8 if it makes no more progress."""
 
 _CYCLIC_LAYOUT: Final = struct.Struct("<HHH")
 
 
 class FeetechHealth(Health, frozen=True, gc=False, kw_only=True):
-    """One slow measurement."""
+    """One measurement of the slow block."""
 
     locked: bool
-    """What is written to EEPROM registers is not kept."""
+    """True if writes to EEPROM registers are lost at power-off."""
     position: int
 
     @classmethod
     def decode(cls, data: bytes, at_ns: int) -> "FeetechHealth":
-        """Out of the bytes of the SLOW block."""
+        """Decodes the bytes of the SLOW block."""
         at = SLOW[0]
         return cls(
             torque=table.TORQUE.decode(data, at) != 0,
@@ -56,8 +56,8 @@ class FeetechHealth(Health, frozen=True, gc=False, kw_only=True):
 class FeetechAxis(ServoAxis[FeetechHealth]):
     """One servo.
 
-    It has no watchdog. So it is never sent farther than it gets to in ``lead_s`` and the braking after that: ``aim`` is
-    where a motion takes it in the end, ``sent`` the goal it has.
+    It has no watchdog. So its goal is never farther than it can move in ``lead_s``, plus the braking: ``aim`` is the
+    end of the motion, ``sent`` the goal in the servo.
     """
 
     cyclic = CYCLIC
@@ -70,7 +70,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         super().__init__(name, bus, joint, GRAIN, coupled, model_number=number, full_effort_counts=table.FULL_LOAD)
         self._lead_s = lead_s
         self.unload = 0
-        """Which complaints have it cut its torque by itself, as it is set up."""
+        """Returns the error bits for which the servo is set to switch its torque off."""
         self.aim: Goal | None = None
         self.sent, self.sent_ns = 0, 0
         self._at_rest_ns = int((lead_s + joint.max_speed_rad_s / joint.max_accel_rad_s2) * 1e9)
@@ -92,14 +92,14 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
             bits = [text for bit, text in table.STATUS_BITS.items() if now.error & bit]
             return f"status: {', '.join(bits) or hex(now.error)}"
         if self.ready and not now.torque:
-            return "its torque went off: it lost power, or somebody else switched it off"
+            return "its torque went off: it lost power, or another program switched it off"
         return ""
 
     def step(self, aim: Goal, now_ns: int) -> Goal:
-        """What it is sent on its way there: as far as it may get before it has to be heard again.
+        """Returns the next goal on the way: as far as the servo may move until its next answer is due.
 
         Raises:
-            DeviceSilent: it was never measured.
+            DeviceSilent: the servo was never measured.
         """
         if self.sample is None:
             raise self.deaf(now_ns)
@@ -110,10 +110,10 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         return Goal(max(here - lead, min(here + lead, aim.position)), aim.accel, aim.speed)
 
     def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
-        """As every joint, but it cannot have got farther than it was sent, and rests there soon.
+        """Returns where to hold, as for any joint, but no farther than the last goal, where the servo comes to rest.
 
-        In doubt it is told nothing: without torque by now, it would switch that on. Nor is it if it is surely at rest
-        and was not heard since: whether it heard the last goal, nobody knows.
+        None for a servo in doubt: if its torque is off by now, a goal would switch it on. Also None if it must be at
+        rest and has not answered since, as it is unknown whether it received the last goal.
         """
         counts, sample = super().hold_counts(now_ns, blind_ns), self.sample
         if counts is None or sample is None or self.in_doubt:

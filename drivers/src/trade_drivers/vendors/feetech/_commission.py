@@ -31,11 +31,11 @@ class FeetechCommissioner(Commissioner):
 
 
 class FeetechBench(ServoBench["Wire"]):
-    """An open line of them."""
+    """An open line of Feetech servos."""
 
     driver = "feetech"
     restless = (table.PRESENT_POSITION.address, table.MOVING.end - table.PRESENT_POSITION.address)
-    mute = "it tells its model and nothing else; check its cable"
+    mute = "it reports its model and nothing else; check its cable"
     grain = GRAIN
     torque, position, homing = table.TORQUE, table.PRESENT_POSITION, table.HOMING_OFFSET
 
@@ -55,6 +55,6 @@ class FeetechBench(ServoBench["Wire"]):
         self.write(device_id, table.LOCK, _SHUT)
 
     def _opened(self, device_id: int, register: table.Register, value: int) -> None:
-        """A write that outlives the power."""
+        """Writes a register persistently."""
         self.write(device_id, table.LOCK, _OPEN)
         self.write(device_id, register, value)

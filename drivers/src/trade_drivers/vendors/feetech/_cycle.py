@@ -1,7 +1,7 @@
-"""What Feetech servos are told in the cyclic exchange with all of one bus, and how.
+"""Commands to Feetech servos in the cyclic exchange with a bus.
 
-They have no watchdog. So a joint on its way is sent a little ahead in every cycle, and comes to rest by itself soon
-after the cycles end: that is all a driver that dies or freezes leaves behind.
+They have no watchdog. So each cycle sends a moving joint only a little ahead, and the joint comes to rest by itself
+soon after the cycles end, for example when the driver dies or freezes.
 """
 
 from collections.abc import Mapping
@@ -23,12 +23,12 @@ _SIZES: Final = tuple(register.end - CYCLIC[0] for register in (table.PRESENT_LO
 
 
 class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
-    """What happens on one bus of servos."""
+    """The exchange with the Feetech servos of one bus."""
 
     sizes = _SIZES
     answer_overhead = 7
 
-    # --- what a servo is told
+    # --- commands
 
     def write_goals(self, goals: Mapping[FeetechAxis, Goal], gate: Gate) -> None:
         now_ns = self.clock()
@@ -45,7 +45,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         self.write_goals(goals, gate)
 
     def write_holds(self, positions: Mapping[FeetechAxis, int]) -> None:
-        # it brakes at its full acceleration, however gentle the move was
+        # brakes at the joint's full acceleration, even in a slow move
         goals = {axis: Goal(position, axis.accel_counts, axis.speed_counts) for axis, position in positions.items()}
         self._send(goals)
         for axis in positions:
@@ -72,7 +72,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         self.stop_found_moving(axis)
 
     def look_after(self, axis: FeetechAxis) -> None:
-        """Cut off by its own protection, it is switched off: else it would go on by itself once the cause is gone."""
+        """Switches off a servo stopped by its own protection, as it would continue once the cause is gone."""
         if axis.health is not None and axis.health.torque and axis.health.error & axis.unload:
             self.wire.write(axis.id, table.TORQUE.address, table.TORQUE.encode(0))
             axis.take_health(self.wire.read(axis.id, *axis.slow).data, self.clock())
@@ -82,7 +82,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         self._lead_on()
 
     def _lead_on(self) -> None:
-        """Send joints on that are on their way, as far ahead of where they were measured as they may be."""
+        """Sends moving joints their next goals, at most the allowed distance ahead of their measurements."""
         steps: dict[FeetechAxis, Goal] = {}
         now_ns = self.clock()
         for motion in dict.fromkeys(axis.motion for axis in self.devices if axis.motion is not None):
@@ -104,7 +104,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
 
 
 def _due(motion: Motion[FeetechAxis], now_ns: int) -> dict[FeetechAxis, Goal]:
-    """Where its joints are to be sent now, if that is not where they were sent last."""
+    """Returns the next goals of a motion's joints, where they differ from the last ones."""
     due: dict[FeetechAxis, Goal] = {}
     for axis in motion.devices:
         if axis.aim is None or axis.in_doubt:

@@ -1,4 +1,4 @@
-"""Bringing a Feetech bus up."""
+"""The driver of a Feetech bus."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ class FeetechDriver(ServoDriver[FeetechAxis, "Wire"]):
     models = table.BY_MODEL_NAME
     bauds = table.BAUD_CODES
     modules = ("serial",)
-    without_watchdog = "no watchdog: without its driver it goes on to the goal it has, which is never far ahead"
+    without_watchdog = "no watchdog: without its driver it continues to its last goal, which is never far ahead"
     commissioner = FeetechCommissioner
 
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> FeetechExchange:

@@ -1,4 +1,4 @@
-"""Looking a bus over before anything may be commanded: who is there, and set how. Moves nothing and resets nothing."""
+"""Checks of devices and their settings before anything may be commanded. Moves and resets nothing."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
@@ -22,10 +22,10 @@ _MOST_SPEED_COUNTS: Final = ((1 << 15) - 1) // table.STEPS_PER_SPEED
 
 
 def check_bus(robot: "Robot", bus: "SerialBus", axes: Sequence[FeetechAxis]) -> None:
-    """What the file alone can tell: speeds, keys, and whether the bytes of a cycle fit into it.
+    """Checks the robot file: speeds, keys, and whether a cycle is long enough for its bytes.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     where = robot.where
     if "fast_sync" in robot.given.get(bus.name, ()):
@@ -48,10 +48,10 @@ def _check_most(axis: FeetechAxis) -> None:
 
 
 def look_over(wire: "ServoWire", bus: "SerialBus", axis: FeetechAxis, clock_ns: Callable[[], int], where: str) -> None:
-    """Check one joint's device and take its first measurements.
+    """Checks one joint's device and takes its first measurements.
 
     Raises:
-        ConfigurationError: it is absent, another model, set wrongly, or not alone under its id.
+        ConfigurationError: the device is absent, another model, set wrongly, or shares its id.
     """
     key = f'{where}: joint."{axis.joint.name}"'
     settings = first_look(wire, bus, axis, _KEPT, clock_ns, key)

@@ -1,4 +1,4 @@
-"""What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
+"""The steps of enabling, relaxing and leaving a servo: one exchange after the other."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 __all__ = ["GOAL_BLOCK", "enabling", "goal_block", "leaving", "relaxing"]
 
 GOAL_BLOCK: Final = (table.ACCELERATION.address, table.GOAL_SPEED.end - table.ACCELERATION.address)
-"""Address and size of what is written to send a joint somewhere: never a goal without its speed."""
+"""Address and size of a command to move: a goal always with its speed."""
 
 
 def goal_block(goal: Goal) -> bytes:
-    """What goes from acceleration to goal speed."""
+    """Returns the bytes from acceleration to goal speed."""
     return b"".join(
         (
             table.ACCELERATION.encode(goal.accel),
@@ -29,26 +29,26 @@ def goal_block(goal: Goal) -> bytes:
 
 
 def relaxing(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
-    """Torque off."""
-    axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
+    """Switches torque off."""
+    axis.ready = False  # first, since a health read in between would take torque off for a fault
     yield from written(bus, job, axis, table.TORQUE, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
-        raise axis.faulty("told to relax, but its torque is still on")
+        raise axis.faulty("it did not relax: its torque is still on")
 
 
 def leaving(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
-    """Torque off or left on: there is no watchdog to be disarmed."""
+    """Switches torque off or leaves it on; there is no watchdog to disarm."""
     axis.ready = False
     if relax:
         yield from relaxing(bus, job, axis)
 
 
 def enabling(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
-    """Torque on at the measured position, with the joint's own acceleration and speed; all of it read back."""
+    """Switches torque on at the measured position with the joint's acceleration and speed; reads all back."""
     bus.require_answering(axis)
     health = yield from health_of(bus, axis)
-    if health.error and health.torque:  # off and on again is what ends an overload
+    if health.error and health.torque:  # only a switch off and on ends an overload
         axis.ready = False
         yield from written(bus, job, axis, table.TORQUE, 0)
         health = yield from health_of(bus, axis)
@@ -69,7 +69,7 @@ def enabling(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) 
 
 
 def _seeded(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> bytes:
-    """Its goal is where it is. It may switch torque on: tried again, it is measured again, as it may have sagged."""
+    """Sets the goal to the measured position, which may switch torque on; measures again at each retry."""
     asked_ns = bus.clock()
     health = axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
     block = goal_block(Goal(health.position, axis.accel_counts, axis.speed_counts))

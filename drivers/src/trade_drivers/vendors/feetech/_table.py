@@ -14,14 +14,14 @@ __all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "STATUS_BITS", "Access", "Model",
 
 RAD_PER_COUNT: Final = tau / 4096
 STEPS_PER_SPEED: Final = 10
-"""Steps/s in one count of speed here: slower is not told from standing still."""
+"""Steps/s in one count of speed; slower motion looks like rest."""
 RAD_S_PER_COUNT: Final = STEPS_PER_SPEED * RAD_PER_COUNT
 RAD_S2_PER_COUNT: Final = 100 * RAD_PER_COUNT
 MOST_ACCELERATION: Final = 254
 
 
 class Access(Enum):
-    """Who may change a register, and for how long."""
+    """Access to a register, and how long a write lasts."""
 
     READ = "read only"
     RAM = "read and write; back to its default at power-up"
@@ -40,22 +40,22 @@ class Register(Struct, frozen=True):
 
     @property
     def end(self) -> int:
-        """The address behind it."""
+        """The address after the register."""
         return self.address + self.size
 
     def signed(self, raw: int) -> int:
-        """Counts, out of the number that its bytes are."""
+        """Returns the counts of an unsigned register value."""
         if self.sign_bit is None or raw < 1 << self.sign_bit:
             return raw
         return -(raw & (1 << self.sign_bit) - 1)
 
     def decode(self, data: bytes, start: int = 0) -> int:
-        """Counts, out of a block of bytes read from address ``start``."""
+        """Returns the counts from a block of bytes read from address ``start``."""
         at = self.address - start
         return self.signed(int.from_bytes(data[at : at + self.size], "little"))
 
     def encode(self, counts: int) -> bytes:
-        """The bytes of a number of counts; OverflowError if they do not fit."""
+        """Returns the bytes of a number of counts; raises OverflowError if they do not fit."""
         if counts >= 0 and self.sign_bit is None:
             return counts.to_bytes(self.size, "little")
         if self.sign_bit is None or abs(counts) >> self.sign_bit:
@@ -77,7 +77,7 @@ MIN_ANGLE: Final = Register(9, 2, si_per_count=RAD_PER_COUNT, unit="rad", access
 MAX_ANGLE: Final = Register(11, 2, si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 PHASE: Final = Register(18, 1, access=_EEPROM)
 UNLOAD: Final = Register(19, 1, access=_EEPROM)
-"""Which of ``STATUS_BITS`` have the servo cut its torque by itself."""
+"""The ``STATUS_BITS`` for which the servo switches its torque off by itself."""
 HOMING_OFFSET: Final = Register(31, 2, si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM, sign_bit=11)
 MODE: Final = Register(33, 1, access=_EEPROM)
 
@@ -87,7 +87,7 @@ GOAL_POSITION: Final = Register(42, 2, si_per_count=RAD_PER_COUNT, unit="rad", a
 GOAL_TIME: Final = Register(44, 2, si_per_count=0.001, unit="s", access=_RAM)
 GOAL_SPEED: Final = Register(46, 2, si_per_count=RAD_PER_COUNT, unit="rad/s", access=_RAM, sign_bit=15)
 LOCK: Final = Register(55, 1, access=_RAM)
-"""1: what is written to EEPROM registers lasts until power-off only."""
+"""1: writes to EEPROM registers last only until power-off."""
 PRESENT_POSITION: Final = Register(56, 2, si_per_count=RAD_PER_COUNT, unit="rad", sign_bit=15)
 PRESENT_SPEED: Final = Register(58, 2, si_per_count=RAD_PER_COUNT, unit="rad/s", sign_bit=15)
 PRESENT_LOAD: Final = Register(60, 2, si_per_count=0.001, unit="of full duty", sign_bit=10)
@@ -98,12 +98,12 @@ STATUS: Final = Register(65, 1)
 MOVING: Final = Register(66, 1)
 
 BAUD_CODES: Final = {1_000_000: 0, 500_000: 1, 250_000: 2, 128_000: 3, 115_200: 4}
-"""What register 6 reads at each rate; of the slower ones, sources disagree."""
+"""Values of register 6 for each rate; sources disagree on the slower ones."""
 POSITION_MODE: Final = 0
 CENTRE_COUNTS: Final = 2048
 FULL_LOAD: Final = 1000
 TORQUE_ON: Final = 1
-"""128 would take the present position for the centre, and is never written."""
+"""128 would make the present position the centre; never written."""
 SPEED_IN_STEPS: Final = 0x04
 """Bit of ``PHASE``: speeds are in steps/s, not in units of 0.732 rpm."""
 FULL_TURNS: Final = 0x10
@@ -120,7 +120,7 @@ STATUS_BITS: Final = {
 
 
 class Model(Struct, frozen=True):
-    """A model this driver knows."""
+    """A supported model."""
 
     name: str
     number: int
@@ -132,11 +132,11 @@ BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}
 
 
 def name_of(model_number: int, otherwise: str) -> str:
-    """What a model is called."""
+    """Returns the name of a model."""
     model = BY_MODEL_NUMBER.get(model_number)
     return model.name if model else otherwise
 
 
 def firmware(data: bytes) -> str:
-    """The version of its program, out of the bytes from address 0 on."""
+    """Returns the firmware version from the bytes from address 0."""
     return f"{MAJOR.decode(data)}.{MINOR.decode(data)}"

@@ -1,4 +1,4 @@
-"""The only place of this folder that needs pyserial: packets of STS servos over a serial line."""
+"""The only module of this folder that needs pyserial: packets of STS servos over a serial line."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 
@@ -26,7 +26,7 @@ class Wire(ServoWire):
         super().open()
 
     def ping(self, device_id: int) -> int:
-        # the protocol's own ping tells no model, and its answer is as long as that to a write
+        # the protocol's ping returns no model, and its answer is as long as that to a write
         return MODEL_NUMBER.decode(
             self.read(device_id, MODEL_NUMBER.address, MODEL_NUMBER.size).data, MODEL_NUMBER.address
         )
@@ -63,7 +63,7 @@ class Wire(ServoWire):
             self._unsettle()
 
     def _ask(self, device_id: int, instruction: int, parameters: bytes, size: int, gate: Gate | None = None) -> Answer:
-        """One question to one device, and its answer with so many bytes of data."""
+        """Sends a request to one device, and returns its answer with a given size of data."""
         with self._exchange(device_id, gate):
             self._line.flush()
             self._send(packet(device_id, instruction, parameters))
@@ -77,7 +77,7 @@ class Wire(ServoWire):
         return Answer(status.data, bool(status.status))
 
     def _next(self, ids: Container[int], size: int) -> Status | None:
-        """The next answer that belongs to the question; None if none comes in time."""
+        """Returns the next answer to the request; None at the timeout."""
         while (status := take_status(self._line.received, ids, size, self._sent)) is None and self._line.more():
             pass
         return status

@@ -1,4 +1,4 @@
-"""One axis as the bus thread knows it: what its frames said last, and what speaks against moving on."""
+"""The state of one axis on the bus thread, from its frames, and faults that forbid motion."""
 
 from collections.abc import Callable, Sequence
 from math import isfinite
@@ -13,16 +13,16 @@ from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartb
 __all__ = ["COUNTS_PER_TURN", "MODELS", "Model", "OdriveAxis"]
 
 COUNTS_PER_TURN: Final = 1 << 16
-"""Of the motor: this driver's own, finer than any encoder; on the wire there are turns."""
+"""Counts per turn of the motor in this driver, finer than any encoder; frames contain turns."""
 
 
 class Model(NamedTuple):
     """A kind of ODrive."""
 
     line: int
-    """Product line, as it tells it itself."""
+    """Product line, as the device reports it."""
     peak_a: float
-    """The most current it gives its motor (data sheet)."""
+    """Maximum motor current (data sheet)."""
 
 
 MODELS: Final = {
@@ -39,25 +39,25 @@ class OdriveAxis(MotorAxis):
         super().__init__(name, bus, joint, grain_of(joint, rate_hz, COUNTS_PER_TURN), coupled)
         self.model = MODELS[joint.model]
         self.version: Version | None = None
-        """What it says of itself; None until it has answered."""
+        """The reported identity; None until it has answered."""
         self.identity: Version | None = None
-        """What it said when it was attached."""
+        """The identity when it was attached."""
         self.state_now: int | None = None
         self.errors = Errors(0)
         self.disarmed_by = Errors(0)
         self.result = 0
         self.health_ns = 0
-        """When it told its errors last, asked for or not."""
+        """When it last reported its errors, requested or not."""
         self.proven = False
-        """Its watchdog was seen to work."""
+        """True after its watchdog was tested."""
         self.asked_after = 0
-        """What of its health was asked last."""
+        """The last requested health value."""
         self._amperes = 0.0
         self._celsius: float | None = None
         self._volts: float | None = None
 
     def listeners(self, clock: Callable[[], int]) -> dict[Command, Callable[[bytes], None]]:
-        """Who takes which of its frames; what is cut short is not taken."""
+        """Returns the handlers of its frames, which ignore truncated frames."""
 
         def sound(take: Callable[[bytes], None]) -> Callable[[bytes], None]:
             def taken(data: bytes) -> None:
@@ -78,7 +78,7 @@ class OdriveAxis(MotorAxis):
             Command.SUPPLY: sound(self._take_supply),
         }
 
-    # --- what it says
+    # --- received frames
 
     def _take_version(self, data: bytes) -> None:
         self.version = Version.decode(data)
@@ -103,7 +103,7 @@ class OdriveAxis(MotorAxis):
         _, self._amperes = two_floats(data)
 
     def _take_temperatures(self, data: bytes) -> None:
-        known = [value for value in two_floats(data) if isfinite(value)]  # a motor need not have a thermistor
+        known = [value for value in two_floats(data) if isfinite(value)]  # not every motor has a thermistor
         self._celsius = max(known) if known else None
 
     def _take_supply(self, data: bytes) -> None:
@@ -111,14 +111,14 @@ class OdriveAxis(MotorAxis):
 
     def _judge(self) -> None:
         if self.hushed:
-            return  # what comes of it, who hushed it knows
+            return  # the watchdog test handles this itself
         if self.errors:
             self.latch(f"error: {self.errors.text}")
         elif self.ready and not self.torque:
             why = f": {self.disarmed_by.text}" if self.disarmed_by else "; has it restarted?"
             self.latch(f"its torque went off{why}")
 
-    # --- what it is
+    # --- state
 
     @property
     def torque(self) -> bool | None:
@@ -126,12 +126,12 @@ class OdriveAxis(MotorAxis):
 
     @property
     def armed(self) -> bool:
-        """It obeys its inputs."""
+        """Returns whether it follows its inputs."""
         return self.state_now == State.CLOSED_LOOP
 
     @property
     def refusal(self) -> str:
-        """Why it does not arm."""
+        """Returns why it does not arm."""
         if self.errors:
             return self.errors.text
         known = {result.value: result.name.lower().replace("_", " ") for result in Result}

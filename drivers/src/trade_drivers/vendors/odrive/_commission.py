@@ -1,4 +1,4 @@
-"""Which ODrives are on a CAN bus: heard by what they say by themselves."""
+"""Scanning a CAN bus for ODrives by the frames that they send by themselves."""
 
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ __all__ = ["OdriveCommissioner"]
 
 
 class OdriveCommissioner(CanMotorCommissioner):
-    """ODrives; one that has no node number yet is shown with the number 63."""
+    """ODrives; one without a node number is shown with the number 63."""
 
     driver = "odrive"
     ids = range(NODES + 1)

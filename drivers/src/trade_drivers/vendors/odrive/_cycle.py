@@ -1,4 +1,4 @@
-"""What ODrives are told in the cyclic exchange with all of one bus, and how."""
+"""Commands to ODrives in the cyclic exchange with a bus."""
 
 import logging
 import time
@@ -24,13 +24,13 @@ __all__ = ["OdriveExchange"]
 _log = logging.getLogger("trade")
 _HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)
 _BEATS_MISSED_NS: Final = 500_000_000
-"""Five heartbeats, as an ODrive sends them if nobody has changed that."""
+"""Five heartbeats at an ODrive's default rate."""
 
 
 class OdriveExchange(MotorExchange[OdriveAxis]):
-    """What happens on one bus of ODrives.
+    """The exchange with the ODrives of one bus.
 
-    The questions in every cycle are what feeds an axis' watchdog.
+    The requests in each cycle feed the watchdogs of the axes.
     """
 
     deaf_ns = _BEATS_MISSED_NS
@@ -40,14 +40,14 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.rival = False
-        """Somebody else commands these axes."""
+        """True if another driver commands these axes."""
         for axis in axes:
             for command, listener in axis.listeners(clock).items():
                 self.net.hear(frame_id(axis.id, command), listener)
             self._listen_for_rivals(axis)
 
     def _listen_for_rivals(self, axis: OdriveAxis) -> None:
-        """Whoever commands or asks an axis feeds its watchdog, too, and it would not notice that this driver dies."""
+        """Detects other drivers: their frames feed the watchdogs, which then miss this driver's death."""
         for command in frames.ORDERS:
             self.net.hear(frame_id(axis.id, command), self._hear_rival)
         take = axis.listeners(self.clock)[Command.ESTIMATES]
@@ -58,23 +58,23 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
             _log.error("%s: another driver commands the axes of this bus, too", self.port.path)
         self.rival = True
 
-    # --- what an axis is told
+    # --- commands
 
     def tell(self, axis: OdriveAxis, command: Command, data: bytes) -> None:
-        """One frame to it; whether it obeys, only its heartbeat says."""
+        """Sends one frame to an axis; only its heartbeat shows whether it obeys."""
         self.port.send(frame_id(axis.id, command), data)
 
     def limit(self, axis: OdriveAxis, speed: int, accel: int) -> None:
-        """How fast it goes to the positions it is sent to from now on; moves nothing."""
+        """Sets the speed and acceleration of later moves; moves nothing."""
         self.tell(axis, Command.SET_TRAJECTORY_SPEED, frames.set_trajectory_speed(speed / COUNTS_PER_TURN))
         self.tell(axis, Command.SET_TRAJECTORY_ACCEL, frames.set_trajectory_accel(accel / COUNTS_PER_TURN))
 
     def send_to(self, axis: OdriveAxis, position: int) -> None:
-        """Have it go there, and stand."""
+        """Makes the axis move to a position and hold."""
         self.tell(axis, Command.SET_POSITION, frames.set_position(position / COUNTS_PER_TURN))
 
     def write_goals(self, goals: Mapping[OdriveAxis, Goal], gate: Gate) -> None:
-        """Limits first, which move nothing; then the gate, and all joints start in one go."""
+        """Sends the limits, which move nothing; then, after the gate, starts all joints together."""
         for axis, goal in goals.items():
             self.limit(axis, goal.speed, goal.accel)
         self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
@@ -88,7 +88,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         self.port.send_all(told)
 
     def write_holds(self, positions: Mapping[OdriveAxis, int]) -> None:
-        """A trajectory to where it is, as steep as the joint may; one that has no torque yet is not told."""
+        """Sends a trajectory to the measured position at full deceleration, only to axes with torque."""
         for axis, position in positions.items():
             if axis.armed and not axis.hushed:
                 self.limit(axis, axis.speed_counts, axis.accel_counts)
@@ -107,7 +107,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     def leaving(self, job: Work[OdriveAxis], axis: OdriveAxis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
         return jobs.relaxing(self, job, axis)
 
-    # --- what it is asked
+    # --- requests
 
     def question(self, axis: OdriveAxis) -> Frame:
         return Frame(frame_id(axis.id, Command.ESTIMATES), b"")
@@ -116,9 +116,9 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         return look_over(self, axis, first=axis.identity is None)
 
     def look_after(self, axis: OdriveAxis) -> None:
-        """Ask for its errors, current, temperatures and supply by turns; one that does not obey a stop is cut off."""
+        """Requests errors, current, temperatures and supply in turn; disarms an axis that does not obey a stop."""
         axis.asked_after = (axis.asked_after + 1) % len(_HEALTH)
         self.tell(axis, _HEALTH[axis.asked_after], b"")
         if axis.halting_since_ns and self.clock() - axis.halting_since_ns > HALT_NS and axis.armed:
-            _log.error("%s: told to stop, but it is still moving; emergency stop", axis.name)
+            _log.error("%s: a stop was sent, but it is still moving; emergency stop", axis.name)
             self.tell(axis, Command.ESTOP, b"")

@@ -1,4 +1,4 @@
-"""Bringing a bus of ODrives up."""
+"""The driver of a bus of ODrives."""
 
 from typing import TYPE_CHECKING
 

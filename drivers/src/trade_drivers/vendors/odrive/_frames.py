@@ -1,7 +1,7 @@
-"""What ODrives say and are told, frame by frame: pure, no I/O.
+"""Encoding and decoding of ODrive frames. Pure, no I/O.
 
 Source: ODrive documentation, "CANSimple protocol", firmware 0.6. Numbers are little-endian; positions are in turns of
-the motor, speeds in turns a second.
+the motor, speeds in turns per second.
 """
 
 import struct
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 NODES: Final = 63
-"""Node numbers are below; this one means that there is none yet."""
+"""The value for a missing node number; valid ones are lower."""
 _TWO: Final = struct.Struct("<ff")
 _WORDS: Final = struct.Struct("<II")
 _HEARTBEAT: Final = struct.Struct("<IBBBx")
@@ -35,7 +35,7 @@ _POSITION: Final = struct.Struct("<fhh")
 
 
 class Command(IntEnum):
-    """The low five bits of an identifier. A frame that asks for something has no data."""
+    """The low five bits of an identifier. Requests have no data."""
 
     VERSION = 0x00
     HEARTBEAT = 0x01
@@ -72,9 +72,9 @@ ORDERS: Final = frozenset(
 
 
 def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
-    """Identifiers among what was heard that only who commands or asks axes sends: these nodes, or those that tell.
+    """Returns identifiers that only a driver sends, for these nodes or those that send heartbeats.
 
-    A question is one, too: it feeds the watchdog of an axis, which would not notice that its driver dies.
+    Requests are included: they feed the watchdog of an axis, which then would miss the death of its driver.
     """
     known = {*nodes, *talk.odrives}
     return {
@@ -85,14 +85,14 @@ def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
 
 
 class State(IntEnum):
-    """What an axis does; more there are, none of which this driver asks for."""
+    """Axis states, as far as this driver requests them."""
 
     IDLE = 1
     CLOSED_LOOP = 8
 
 
 class Control(IntEnum):
-    """What is controlled."""
+    """Control modes."""
 
     TORQUE = 1
     VELOCITY = 2
@@ -101,7 +101,7 @@ class Control(IntEnum):
 
 
 class Input(IntEnum):
-    """What becomes of an input on its way to the controller."""
+    """Input modes of the controller."""
 
     PASSTHROUGH = 1
     VELOCITY_RAMP = 2
@@ -109,7 +109,7 @@ class Input(IntEnum):
 
 
 class Errors(IntFlag):
-    """Of an axis: why it has disarmed, or does not arm."""
+    """Errors of an axis, which disarm it or prevent arming."""
 
     INITIALIZING = 0x1
     SYSTEM = 0x2
@@ -136,7 +136,7 @@ class Errors(IntFlag):
 
     @property
     def text(self) -> str:
-        """Their names in words; a bit without one as a number."""
+        """Returns the names of the bits; unknown bits as numbers."""
         known = [flag for flag in Errors if flag & self]
         rest = int(self) & ~sum(known)
         names = [flag.name.lower().replace("_", " ") for flag in known if flag.name]
@@ -144,7 +144,7 @@ class Errors(IntFlag):
 
 
 class Result(IntEnum):
-    """How the last change of state ended."""
+    """Results of a requested state change."""
 
     SUCCESS = 0
     BUSY = 1
@@ -157,7 +157,7 @@ class Result(IntEnum):
 
 
 class Heartbeat(NamedTuple):
-    """What an axis tells by itself."""
+    """The frame that an axis sends by itself."""
 
     errors: Errors
     state: int
@@ -166,25 +166,25 @@ class Heartbeat(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes) -> "Heartbeat":
-        """Out of eight bytes; struct.error for another number."""
+        """Decodes eight bytes; raises struct.error for another size."""
         errors, state, result, flags = _HEARTBEAT.unpack(data)
         return cls(Errors(errors), state, result, bool(flags & 1))
 
 
 class Health(NamedTuple):
-    """Active errors, and why it disarmed last."""
+    """Active errors, and the reason of the last disarming."""
 
     errors: Errors
     disarmed_by: Errors
 
     @classmethod
     def decode(cls, data: bytes) -> "Health":
-        """Out of eight bytes; struct.error for another number."""
+        """Decodes eight bytes; raises struct.error for another size."""
         return cls(*map(Errors, _WORDS.unpack(data)))
 
 
 class Version(NamedTuple):
-    """Of hardware and firmware."""
+    """Versions of hardware and firmware."""
 
     line: int
     """Product line: 4 Pro, 5 S1, 6 Micro."""
@@ -193,13 +193,13 @@ class Version(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes) -> "Version":
-        """Out of eight bytes; struct.error for another number."""
+        """Decodes eight bytes; raises struct.error for another size."""
         _, line, version, variant, *firmware, _ = struct.unpack("<8B", data)
         return cls(line, (version, variant), (firmware[0], firmware[1], firmware[2]))
 
 
 def frame_id(node: int, command: Command) -> int:
-    """The identifier of a frame to or from a node."""
+    """Returns the identifier of a frame to or from a node."""
     return node << 5 | command
 
 

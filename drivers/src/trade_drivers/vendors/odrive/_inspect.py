@@ -1,4 +1,4 @@
-"""Looking ODrives over before anything is commanded: what the file asks of them, and who answers."""
+"""Checks of ODrives before anything is commanded: the robot file, and the devices."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -21,21 +21,21 @@ __all__ = ["check_bus", "look_over"]
 _FIRMWARE: Final = (0, 6)
 _LONGEST_S: Final = 0.5
 _BEATS_HZ: Final = 10
-"""Heartbeats as an ODrive sends them if nobody has changed that."""
+"""Heartbeats per second by default."""
 _STREAM_HZ: Final = 100
-"""Likewise estimates that nobody asked for."""
+"""Unrequested estimates per second by default."""
 
 
 def check_bus(bus: "CanBus", axes: Sequence[OdriveAxis], where: str) -> None:
-    """What the file alone can tell: numbers of nodes, keys, speeds, and whether the frames of a cycle fit into it.
+    """Checks the robot file: node numbers, keys, speeds, and whether a cycle is long enough for its frames.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     check_joints(axes, where, _check_joint)
     key = f"{where}: bus.{bus.name}"
     if bus.leave != "relax":
-        problem = 'an ODrive lets go when nobody feeds its watchdog; write leave = "relax", and brake what would fall'
+        problem = 'an ODrive lets go when its watchdog is not fed; write leave = "relax", and brake what would fall'
         raise ConfigurationError(where=f"{key}.leave", problem=problem)
     if bus.watchdog_s > _LONGEST_S:
         problem = f"{bus.watchdog_s:g} is above {_LONGEST_S:g}: enable() waits once for it, to see that it works"
@@ -54,21 +54,21 @@ def _check_joint(axis: OdriveAxis) -> None:
     if not 0 <= joint.id < frames.NODES:
         raise Unfit(f"{joint.id} is no node; 0 to 62 are", ".id")
     if joint.counts_per_rev is not None:
-        raise Unfit("an ODrive tells turns, not counts; leave this key out", ".counts_per_rev")
+        raise Unfit("an ODrive reports turns, not counts; leave this key out", ".counts_per_rev")
     if joint.homing_counts:
         raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.serial_number is not None:
-        raise Unfit("an ODrive tells no serial number here; leave this key out", ".serial_number")
+        raise Unfit("an ODrive reports no serial number here; leave this key out", ".serial_number")
 
 
 def look_over(bus: "OdriveExchange", axis: OdriveAxis, *, first: bool) -> Steps:
-    """Check who an axis is and that it can be measured.
+    """Checks the identity of an axis and that it can be measured. Stops an axis that moves.
 
-    Found under torque by somebody who attaches, its watchdog is off: nobody fed it. Found moving, it is stopped.
+    An axis with torque before the driver is attached has no active watchdog, as no driver fed it.
 
     Raises:
-        Unfit: it cannot be used.
-        NoAnswer: it does not answer.
+        Unfit: the axis cannot be used.
+        NoAnswer: the axis does not answer.
     """
     axis.version, since_ns = None, bus.clock()
     yield from asked(bus, axis, [_question(axis, Command.VERSION)], lambda: axis.version is not None)
@@ -80,8 +80,8 @@ def look_over(bus: "OdriveExchange", axis: OdriveAxis, *, first: bool) -> Steps:
         bus.tell(axis, Command.SET_MODE, frames.set_mode(Control.VELOCITY, Input.VELOCITY_RAMP))
         bus.tell(axis, Command.SET_VELOCITY, frames.set_velocity(0.0))
         raise Unfit(
-            f"node {axis.id} is under torque although nobody has fed its watchdog: set axis0.config.enable_watchdog; "
-            "it was told to stand, and is left so"
+            f"node {axis.id} is under torque although its watchdog was not fed: set axis0.config.enable_watchdog; "
+            "it was stopped, and is left under torque"
         )
 
 

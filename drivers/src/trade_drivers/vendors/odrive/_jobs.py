@@ -1,4 +1,4 @@
-"""What enabling, relaxing and leaving an axis are made of: one exchange on the wire after the other."""
+"""The steps of enabling, relaxing and leaving an axis: one exchange after the other."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 __all__ = ["enabling", "relaxing"]
 
 _SLACK_NS: Final = 250_000_000
-"""How much later than its watchdog's time it may tell that it has let go: a heartbeat, and a busy host."""
+"""The delay allowed for the report that the watchdog expired: a heartbeat, and a busy host."""
 _AT_REST: Final = 2
 _WAIT_S: Final = 0.001
 
 
 def enabling(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
-    """Torque on where it was measured to be, its watchdog tried once; each change of state confirmed by its heartbeat.
+    """Switches torque on at the measured position after one test of the watchdog; heartbeats confirm each state.
 
-    An axis under torque already must be at rest: it goes on holding.
+    An axis that already has torque must be at rest, and keeps holding.
     """
     bus.require_answering(axis)
     yield from next_measurement(bus, axis)
     if axis.motion is not None and not axis.fault:
-        bus.end_motion(axis, f"{axis.name} was enabled anew")
+        bus.end_motion(axis, f"{axis.name} was enabled again")
     if axis.errors:
         yield from _clear(bus, job, axis)
     if not axis.armed and not axis.proven:
@@ -53,18 +53,18 @@ def _arm(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Step
     job.gate()
     bus.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
     since_ns = bus.clock()
-    yield from until(bus, axis, lambda: axis.armed or _told_since(axis, since_ns), "it does not answer")
+    yield from until(bus, axis, lambda: axis.armed or _reported_since(axis, since_ns), "it does not answer")
     if not axis.armed:
         raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
 
 
-def _told_since(axis: OdriveAxis, since_ns: int) -> bool:
-    """It has said, well after it was told to arm, that it has not."""
+def _reported_since(axis: OdriveAxis, since_ns: int) -> bool:
+    """Returns whether a heartbeat long enough after the arm command shows that it is not armed."""
     return axis.beat_ns - since_ns > _SLACK_NS // 2
 
 
 def _clear(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
-    """Clear its errors. Nothing else happens: that it can be armed again is another matter."""
+    """Clears its errors, without arming it."""
     job.gate()
     bus.tell(axis, Command.CLEAR_ERRORS, b"\0")
     since_ns = bus.clock()
@@ -74,7 +74,7 @@ def _clear(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> St
 
 
 def _try_watchdogs(bus: "OdriveExchange", job: Work[OdriveAxis], axes: Sequence[OdriveAxis]) -> Steps:
-    """Arm them without any torque, say nothing, and see them let go: nothing else tells whether watchdogs are on."""
+    """Tests the watchdogs, which no reading shows: arms axes without torque and waits in silence until they disarm."""
     job.gate()
     for axis in axes:
         axis.hushed = True
@@ -117,9 +117,9 @@ def _see_it_let_go(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxi
 
 
 def relaxing(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
-    """Torque off; its watchdog has nothing to watch then."""
+    """Switches torque off, which also idles the watchdog."""
     axis.ready = False
     if axis.may_hold_torque:
         job.gate()
         bus.tell(axis, Command.SET_STATE, frames.set_state(State.IDLE))
-    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")

@@ -1,4 +1,4 @@
-"""An open CAN bus, and the ODrives that are heard on it. Only who was heard is asked, and only for its version."""
+"""Scanning an open CAN bus for ODrives: requests only the version, and only from ODrives heard on it."""
 
 import struct
 import time
@@ -25,7 +25,7 @@ class OdriveBench(CanBench):
     orders = staticmethod(orders)
 
     def refuse(self) -> None:
-        """It asks nobody else."""
+        """Sends no requests to other nodes."""
 
     def anybody(self) -> bool:
         return bool(self._talk.odrives) or self._nameless() is not None
@@ -51,7 +51,7 @@ class OdriveBench(CanBench):
         )
 
     def _nameless(self) -> Found | None:
-        """One that has told its serial number instead of a node."""
+        """Returns an ODrive that reported its serial number instead of a node."""
         for data in self._talk.frames.get(frame_id(NODES, Command.ADDRESS), ()):
             if len(data) == struct.calcsize("<B6s"):
                 serial_number = int.from_bytes(data[1:], "little")
