@@ -1,4 +1,4 @@
-"""How a drive comes to belong to the cycle, at attach and ever after: advanced between frames, and never waited for."""
+"""The admission of drives to the cycle, at attach and after losses, as a state machine that never blocks."""
 
 import logging
 from typing import TYPE_CHECKING, Final
@@ -18,11 +18,11 @@ __all__ = ["Admission"]
 
 _log = logging.getLogger("trade")
 _UNHEARD_NS: Final = 2_000_000_000
-"""How long a drive that was set up is waited for before it is set up again."""
+"""The wait for a drive's frames after set-up, before it is set up again."""
 
 
 class Admission:
-    """One drive's way back. It enables nothing and moves nothing.
+    """The admission of one drive. It enables nothing and moves nothing.
 
     | stage       | what happens                           | and then                                              |
     |-------------|----------------------------------------|-------------------------------------------------------|
@@ -31,7 +31,7 @@ class Admission:
     | SET_UP      | its heartbeat and measurements awaited | HERE; AWAY, with that as its fault, if they stay away |
     | HERE        | it is measured in every cycle          |                                                       |
 
-    From everywhere it goes AWAY when it is heard to restart, and when it, or the port, is not there any more.
+    Each stage changes to AWAY when the drive restarts, or when the drive or the port is gone.
     """
 
     def __init__(self, exchange: "DriveExchange", axis: DriveAxis, bus: "CanBus") -> None:
@@ -42,7 +42,7 @@ class Admission:
         self._steps = set_up(exchange.nodes, axis, bus)
 
     def advance(self) -> None:
-        """Go on as far as it goes without waiting."""
+        """Advances as far as possible without waiting."""
         match self.axis.stage:
             case Stage.AWAY:
                 self._begin()
@@ -54,7 +54,7 @@ class Admission:
                 pass
 
     def recall(self) -> None:
-        """Take a drive back that network management has stopped, as often as it takes: nobody confirms that."""
+        """Restarts a drive that network management has stopped; repeats, since the command has no confirmation."""
         axis, now_ns = self.axis, self._exchange.clock()
         if axis.stopped and now_ns >= self._recall_at_ns:
             _log.warning("%s: network management has stopped it; it is put to pre-operational and set up", axis.name)
@@ -63,7 +63,7 @@ class Admission:
 
     def _begin(self) -> None:
         axis, exchange = self.axis, self._exchange
-        busy = exchange.worked_on(axis) and not axis.recalled  # who is asked twice answers one
+        busy = exchange.worked_on(axis) and not axis.recalled  # a drive answers only one of two requests
         if exchange.clock() >= axis.probe_at_ns and not busy:
             axis.stage, self._steps = Stage.LOOKED_OVER, set_up(exchange.nodes, axis, self._bus)
             self._look_over()
@@ -77,7 +77,7 @@ class Admission:
         except NoAnswer as silent:
             self._try_later(silent)
         except (Unfit, Refused) as unfit:
-            self.axis.fault = str(unfit)  # whatever was wrong before, this has to be mended first
+            self.axis.fault = str(unfit)  # replaces an earlier fault, as this must be fixed first
             self._try_later(unfit)
 
     def _await(self) -> None:
@@ -86,7 +86,7 @@ class Admission:
             axis.to_start = False
             self._exchange.nodes.command(axis.id, table.NMT_START)
         if not axis.unheard:
-            _log.info("%s is heard on %s", axis.name, axis.bus)
+            _log.info("%s answers on %s", axis.name, axis.bus)
             axis.welcome(now_ns)
         elif now_ns - axis.set_up_ns > max(_UNHEARD_NS, 2 * self._exchange.deaf_ns):
             problem = Unfit(f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used")

@@ -1,4 +1,4 @@
-"""One drive as the bus thread knows it: what its frames said last, and what speaks against moving on."""
+"""The state of one drive on the bus thread: its last frames, and faults that forbid motion."""
 
 from collections.abc import Sequence
 from enum import Enum, auto
@@ -22,11 +22,11 @@ _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
 _STOPPED: Final = "network management has stopped it: it answers nothing until it is taken back"
 _ACKNOWLEDGE_NS: Final = 250_000_000
-"""How long a drive may take to take a set-point."""
+"""The time allowed for a drive to accept a set-point."""
 
 
 class Stage(Enum):
-    """How far a drive is on its way into the cycle; ``Admission`` tells what happens in each."""
+    """The stages of a drive's admission to the cycle, described in ``Admission``."""
 
     AWAY = auto()
     LOOKED_OVER = auto()
@@ -40,39 +40,39 @@ class DriveAxis(MotorAxis):
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
         super().__init__(name, bus, joint, grain_of(joint, rate_hz, joint.counts_per_rev or 1.0), coupled)
         self.identity: tuple[int, ...] = ()
-        """What it said of itself when it was attached."""
+        """The identity when it was attached."""
         self.state_now: State | None = None
         self.statusword = 0
         self.mode = 0
         self.modes: frozenset[int] = frozenset()
-        """Those it can be used in."""
+        """The supported modes of operation."""
         self.entered = 0
-        """The mode it was enabled in; 0 if that is not known any more."""
+        """The mode in which it was enabled; 0 if unknown."""
         self.stream: Following | Turning | None = None
-        """In a mode without a goal: what it is sent in every cycle."""
+        """In a mode without a goal: the generator of its cyclic set-points."""
         self.velocity = 0
         self.controlword = 0
         """What was commanded last."""
         self.target = 0
         self.raised_ns = 0
-        """When its set-point was raised; 0 once it was taken."""
+        """When its set-point bit was raised; 0 after the drive acknowledged it."""
         self.stage = Stage.AWAY
-        """Only in the last one it is not ``silent``."""
+        """The admission stage; only in the last one it is not ``silent``."""
         self.set_up_ns = 0
-        """When it was last looked over and set up."""
+        """When it was last checked and set up."""
         self.answered_ns = 0
-        """When it was asked for a measurement that came while it was left out."""
+        """When a measurement that arrived while it was left out was requested."""
         self.stopped = False
-        """Network management has stopped it, so its last heartbeat said: it answers nothing until it is taken back."""
+        """True after a heartbeat in state stopped by network management: it answers nothing until restarted."""
         self.recalled = False
-        """Who works on it waits until it is taken back and set up."""
+        """True while a job waits until it is restarted and set up."""
         self.to_start = False
-        """It was started, and its heartbeat says that it is not: the frame was lost, or it went back."""
+        """True if its heartbeat contradicts the start command: the frame was lost, or it fell back."""
 
-    # --- what it says
+    # --- received frames
 
     def take_status(self, data: bytes) -> None:
-        """Its first TPDO. Only the first after a SYNC counts: what comes later is too late to be believed."""
+        """Handles TPDO1. Only the first one after a SYNC counts; later ones are not trusted."""
         asked_ns, self.asked_ns = self.asked_ns, 0
         if not asked_ns:
             return
@@ -89,7 +89,7 @@ class DriveAxis(MotorAxis):
         self._judge(asked_ns)
 
     def take_motion(self, data: bytes) -> None:
-        """Its second TPDO."""
+        """Handles TPDO2."""
         try:
             self.velocity, self.mode, error = table.MOTION.layout.unpack(data)
         except BadLength:
@@ -98,13 +98,13 @@ class DriveAxis(MotorAxis):
             self.latch(emergency_text(error))
 
     def take_emergency(self, data: bytes) -> None:
-        """An EMCY, however short; code 00xx says that an error has gone, which does not undo that it was there."""
+        """Handles an EMCY of any length; code 00xx reports the end of an error, but clears no latched fault."""
         code = int.from_bytes(data[:2], "little")
         if code & 0xFF00:
             self.latch(emergency_text(code))
 
     def take_heartbeat(self, data: bytes, now_ns: int) -> None:
-        """Its heartbeat, or that it has started anew: then what it was told before is gone."""
+        """Handles a heartbeat or a boot-up message; after a boot, earlier commands are lost."""
         state = data[0] & 0x7F if data else table.BOOT_UP
         self.stopped = state == table.STOPPED
         if state == table.BOOT_UP:
@@ -114,7 +114,7 @@ class DriveAxis(MotorAxis):
         elif self.stage is Stage.SET_UP:
             self.to_start = True
         elif not self.silent:
-            why = f"somebody has made it {table.NMT_STATES.get(state, hex(state))}"
+            why = f"network management has made it {table.NMT_STATES.get(state, hex(state))}"
             self._lose(_STOPPED if self.stopped else why, now_ns)
 
     def _lose(self, why: str, now_ns: int) -> None:
@@ -123,27 +123,27 @@ class DriveAxis(MotorAxis):
         self.forget(now_ns)
 
     def forget(self, now_ns: int) -> None:
-        """Leave it out until it was looked over again, which may be at once."""
+        """Leaves it out until it is checked again, which may be immediately."""
         super().forget(now_ns)
         self.stage, self.probe_at_ns = Stage.AWAY, now_ns
         self.controlword = self.raised_ns = 0
         self.entered, self.stream = 0, None
 
     def be_awaited(self, now_ns: int) -> None:
-        """It was set up: it is to be heard."""
+        """Starts the wait for its frames after set-up."""
         if self.ready:
             self.latch("it was away")
         self.stage, self.set_up_ns = Stage.SET_UP, now_ns
         self.entered, self.stream = 0, None
 
     def welcome(self, now_ns: int) -> None:
-        """It is heard."""
+        """Accepts it after its frames have arrived."""
         self.stage = Stage.HERE
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
         self.controlword = self.raised_ns = self.asked_ns = 0
 
     def latch(self, fault: str) -> None:
-        """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
+        """Latches a fault until it is enabled again; the first one is kept."""
         if self.fault in {"", _SOME_FAULT}:
             self.fault = fault
         self.ready = False
@@ -153,7 +153,7 @@ class DriveAxis(MotorAxis):
         if state in _FAULTS:
             self.latch(_SOME_FAULT)
         elif self.ready and state is State.QUICK_STOP:
-            self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")
+            self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch triggered it")
         elif self.ready and state is not State.ENABLED:
             self.latch("its torque went off: it lost power, or its protection switched it off")
         elif self.ready and self.raised_ns and now_ns - self.raised_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
@@ -161,35 +161,35 @@ class DriveAxis(MotorAxis):
         if self.ready and not self.statusword & machine.REMOTE:
             self.latch("it does not obey the bus (statusword bit 9); is it operated from its panel?")
 
-    # --- what it is
+    # --- state
 
     @property
     def unheard(self) -> str:
-        """What it has not sent since it was set up."""
+        """Returns the frame that it has not sent since set-up."""
         if self.beat_ns <= self.set_up_ns:
             return "no heartbeat (1017h)"
         return "" if self.answered_ns > self.set_up_ns else "no TPDO1 (1800h) after a SYNC"
 
     @property
     def acknowledged(self) -> bool:
-        """It shows that it has taken a set-point."""
+        """Returns whether it acknowledges a set-point."""
         return bool(self.statusword & machine.ACKNOWLEDGED)
 
     @property
     def can_take_goal(self) -> bool:
-        """The handshake of the last set-point is over."""
+        """Returns whether the handshake of the last set-point is over."""
         return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
 
     @property
     def turning_mode(self) -> int:
-        """The mode in which it is told speeds; profile position, where their goal is the end of the range, if none."""
+        """Returns the mode for velocities; profile position, with the end of the range as goal, if there is none."""
         for mode in (table.CYCLIC_VELOCITY, table.PROFILE_VELOCITY_MODE):
             if mode in self.modes:
                 return mode
         return table.PROFILE_POSITION
 
     def braking(self, accel: int) -> bytes:
-        """The data of the frame with its deceleration; its target velocity, if that is in there, is 0."""
+        """Returns the data of the frame with its deceleration, and target velocity 0 where that is mapped."""
         return (
             table.BRAKING.layout.pack(accel)
             if self.turning_mode == table.PROFILE_POSITION
@@ -201,12 +201,12 @@ class DriveAxis(MotorAxis):
         return None if self.state_now is None else self.state_now.torque
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
-        if self.silent:  # also if it was measured a moment ago: it is not taken on again yet
+        if self.silent:  # even with a recent measurement, as it is not admitted again yet
             raise self.absence(now_ns)
         return super().fresh(now_ns, stale_after_ns)
 
     def absence(self, now_ns: int) -> DeviceError:
-        """The error of a drive that is left out."""
+        """Returns the error for a drive that is left out."""
         return self.faulty(_STOPPED) if self.stopped else self.deaf(now_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:

@@ -1,4 +1,4 @@
-"""Who is on a CAN bus: drives with their node ids. Those are set by switches or the vendor's tool, not from here."""
+"""Scanning a CAN bus for drives, whose node ids only switches or the vendor's tool can set."""
 
 from typing import TYPE_CHECKING
 

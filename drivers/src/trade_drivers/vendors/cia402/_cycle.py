@@ -29,11 +29,11 @@ _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
 _MEASURED: Final = (Stage.SET_UP, Stage.HERE)
 _HANDSHAKE: Final = 3
-"""Cycles of a set-point in profile position: raised, acknowledged, taken back."""
+"""Cycles of a set-point in profile position: bit raised, acknowledged, lowered."""
 
 
 class DriveExchange(MotorExchange[DriveAxis]):
-    """What happens on one bus of drives."""
+    """The exchange with the drives of one bus."""
 
     again_ns = PROBE_NS
 
@@ -49,7 +49,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self._synced_ns = clock()
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         self.rival = False
-        """Somebody else sends heartbeats as this driver does."""
+        """Detects another driver by its heartbeats."""
         self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
         for axis in axes:
             self._listen_to(axis)
@@ -65,16 +65,16 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self.net.hear(table.EMERGENCY + axis.id, axis.take_emergency)
         self.net.hear(table.HEARTBEAT + axis.id, lambda data: axis.take_heartbeat(data, self.clock()))
 
-    # --- what a drive is told
+    # --- commands
 
     def command(self, axis: DriveAxis, controlword: int, target: int | None = None) -> None:
-        """A controlword, and where to go with it."""
+        """Sends a controlword with a target."""
         axis.controlword = controlword
         axis.target = axis.target if target is None else target
         self.port.send(table.COMMAND.base + axis.id, table.COMMAND.layout.pack(controlword, axis.target))
 
     def write_goals(self, goals: Mapping[DriveAxis, Goal], gate: Gate) -> None:
-        """Ramps first, which move nothing; then the gate, and all joints start in one go."""
+        """Sends the ramps, which move nothing; then, after the gate, starts all joints together."""
         for axis, goal in goals.items():
             if axis.stream is None:
                 self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
@@ -99,16 +99,16 @@ class DriveExchange(MotorExchange[DriveAxis]):
         return 1 if _all_follow(axes) else _HANDSHAKE
 
     def reached_ns(self, axes: Sequence[DriveAxis]) -> int | None:
-        """It counts from the next SYNC on, and is reached a period later."""
+        """A set-point takes effect at the next SYNC, and is reached a period later."""
         return self._synced_ns + 2 * self.period_ns if _all_follow(axes) else None
 
     def can_take_goals(self, axes: Sequence[DriveAxis]) -> bool:
         return all((axis.stream or axis.can_take_goal) and not self.worked_on(axis) for axis in axes)
 
     def write_holds(self, positions: Mapping[DriveAxis, int]) -> None:
-        """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it.
+        """Halts drives on the joint's ramp; skips those not known to be enabled, as the frame could enable them.
 
-        In a mode without a goal it is a quick stop, which is the drive's own business, too, and stands under torque.
+        In a mode without a goal, it is a quick stop, which the drive executes itself, and which keeps torque on.
         """
         for axis, position in positions.items():
             axis.raised_ns = 0
@@ -119,7 +119,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
                 self.command(axis, machine.HOLD, position)
 
     def _quick_stop(self, axis: DriveAxis) -> None:
-        """It has to be enabled anew, then; a target that is not where it was sent last would be a jump for it."""
+        """Requires a new enable(), since a target other than the last one would be a jump."""
         target = axis.stream.target if isinstance(axis.stream, Following) else None
         axis.stream, axis.ready = None, False
         if axis.state_now is State.ENABLED:
@@ -133,11 +133,11 @@ class DriveExchange(MotorExchange[DriveAxis]):
             raise axis.absence(self.clock())
 
     def recall(self, axis: DriveAxis) -> None:
-        """Take it back if network management has stopped it."""
+        """Restarts a drive that network management has stopped."""
         self.admissions[self.devices.index(axis)].recall()
 
     def mode_for(self, job: Work[DriveAxis], axis: DriveAxis) -> int:
-        """The mode of operation for what a job is going to tell this drive."""
+        """Returns the mode of operation for a job's commands to this drive."""
         match job.manner if isinstance(job, Motion) else Manner.GOALS:
             case Manner.POSITIONS if _all_follow(job.devices):
                 return table.CYCLIC_POSITION
@@ -147,7 +147,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
                 return table.PROFILE_POSITION
 
     def stream_for(self, axis: DriveAxis, mode: int, position: int) -> Following | Turning | None:
-        """What a drive at rest there is sent from now on."""
+        """Returns the set-point generator for a drive at rest at this position."""
         period_s = self.period_ns / 1e9
         match mode:
             case table.CYCLIC_POSITION:
@@ -187,12 +187,12 @@ class DriveExchange(MotorExchange[DriveAxis]):
                 axis.take_heartbeat(data, self.clock())
 
     def cycle(self) -> None:
-        """One round: stops, heartbeat, measurements, handshakes, work, motions, streams."""
+        """Runs one cycle: stops, heartbeat, measurements, handshakes, work, motions, streams."""
         super().cycle()
         self._stream()
 
     def _stream(self) -> None:
-        """Every drive in a mode without a goal gets its next set-point, also where nothing moves it."""
+        """Sends each drive in a mode without a goal its next set-point, even without a motion."""
         now_ns = self.clock()
         frames = [
             Frame(axis.stream.can_id, axis.stream.next(axis.sample, now_ns))
@@ -203,13 +203,13 @@ class DriveExchange(MotorExchange[DriveAxis]):
             self.port.send_all(frames)
 
     def _beat(self, now_ns: int) -> None:
-        """The heartbeat that the drives' own watchdogs live on."""
+        """Sends the heartbeat that feeds the drives' watchdogs."""
         if now_ns - self._beaten_ns >= self._beat_ns:
             self._beaten_ns = now_ns
             self.port.send(table.HEARTBEAT + table.OUR_NODE, bytes((table.OPERATIONAL,)))
 
     def beat_next(self) -> None:
-        """Send a heartbeat in the next cycle: a drive watches for them only once it has heard one (CiA 301, 1016h)."""
+        """Schedules a heartbeat for the next cycle: a drive monitors them only after the first one (CiA 301, 1016h)."""
         self._beaten_ns = 0
 
     def measure(self, began_ns: int) -> None:
@@ -218,19 +218,19 @@ class DriveExchange(MotorExchange[DriveAxis]):
         asked = [axis for axis in self.devices if not axis.silent]
         for axis in self.devices:
             if axis.stage in _MEASURED:
-                axis.asked_ns = began_ns  # not when it came: a frozen process would take old values for new
+                axis.asked_ns = began_ns  # not the arrival, as a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.asked_ns for axis in asked))
 
     def settle(self, now_ns: int) -> None:  # noqa: ARG002 - the same at any time
-        """A set-point that was taken is taken back, so that the next one has an edge."""
+        """Lowers the bit of an acknowledged set-point, so that the next one has an edge."""
         for axis in self.devices:
             if axis.raised_ns and axis.acknowledged and axis.state_now is State.ENABLED:
                 axis.raised_ns = 0
                 self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
 
     def admit(self) -> None:
-        """Go on with those that are not here; it never waits for them. An unhealthy process admits nobody (S06)."""
+        """Continues the admission of drives without waiting. An unhealthy process admits none (S06)."""
         if self.refusing is not None:
             return
         for admission in self.admissions:

@@ -1,4 +1,4 @@
-"""Bringing a bus of CiA 402 drives up, and handing out its motors."""
+"""The driver of a bus of CiA 402 drives."""
 
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Cia402Driver"]
 
 _FIRST_CYCLES: Final = 3
-"""As many measurements as it takes to see whether a joint moves."""
+"""The number of measurements needed to detect motion."""
 
 
 class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):

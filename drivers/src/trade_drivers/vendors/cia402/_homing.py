@@ -1,4 +1,4 @@
-"""Finding a drive's zero: only when somebody asks for it, watched like any motion."""
+"""Homing of a drive: only on request, watched like any motion."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -19,7 +19,7 @@ _LONGEST_NS: Final = 30_000_000_000
 
 
 class Homing(Motion[DriveAxis]):
-    """The drive goes and looks for its zero by itself; afterwards it has to be enabled anew, in its usual mode."""
+    """A search by the drive itself for its zero; afterwards it must be enabled again in its usual mode."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Homing(Motion[DriveAxis]):
             (table.HOMING_ACCELERATION, axis.accel_counts),
         ):
             yield from jobs.write(self._bus, self, axis, entry, value)
-        axis.ready, axis.entered = False, 0  # whatever becomes of it, it is not in its usual mode any more
+        axis.ready, axis.entered = False, 0  # whatever the outcome, it has left its usual mode
         yield from jobs.set_mode(self._bus, self, axis, table.HOMING)
         self.launch()
 
@@ -68,7 +68,7 @@ class Homing(Motion[DriveAxis]):
             self.exchange.release(self, ending)
 
     def _found(self) -> bool:
-        """It says that it has found its zero, and says so of this search."""
+        """Returns whether it reports the end of this search."""
         sample, settled_ns = self._axis.sample, self._began_ns + 2 * self.exchange.period_ns
         if sample is None or sample.at_ns <= settled_ns:
             return False

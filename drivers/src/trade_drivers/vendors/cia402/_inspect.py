@@ -1,4 +1,4 @@
-"""Looking a drive over and setting up its frames, before anything is commanded. Enables nothing, moves nothing."""
+"""Checks and frame set-up of a drive before anything is commanded. Enables and moves nothing."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 __all__ = ["check_bus", "heartbeat_ms", "motion_every", "set_up"]
 
 _QUICK_STOP: Final = 3
-"""Of 6007h: a lost heartbeat is answered with a quick stop."""
+"""Value of 6007h: quick stop after a lost heartbeat."""
 _BRAKE_AND_STAY: Final = 6
-"""Of 605Ah: brake on the quick-stop ramp, and stand under torque."""
+"""Value of 605Ah: brake on the quick-stop ramp, and hold with torque."""
 _BRAKE: Final = 1
-"""Of 605Dh: brake on the ramp of 6084h, and stand under torque."""
+"""Value of 605Dh: brake on the ramp of 6084h, and hold with torque."""
 _LARGEST: Final = 2**31 - 1
 
 
 def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
-    """What the file alone can tell: numbers of nodes, counts, speeds, and whether the frames of a cycle fit into it.
+    """Checks the robot file: node numbers, counts, speeds, and whether a cycle is long enough for its frames.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     check_joints(axes, where, _check_joint)
     check_rate(bus, where, 3)
@@ -60,18 +60,18 @@ def _check_joint(axis: DriveAxis) -> None:
 
 
 def motion_every(bus: "CanBus") -> int:
-    """How many SYNCs make a drive send its second TPDO."""
+    """Returns the number of SYNCs per second TPDO of a drive."""
     return max(1, min(240, round(bus.rate_hz / 100)))
 
 
 def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
-    """Check who a drive is, arm its watchdog and map its frames; found moving and owned by nobody, it is stopped.
+    """Checks a drive's identity, arms its watchdog and maps its frames; stops a motion that no client owns.
 
-    Some sixty requests, one at a time: yields while an answer is awaited.
+    Makes about sixty requests, one at a time; yields while it waits for answers.
 
     Raises:
-        Unfit: it cannot be used.
-        NoAnswer: it does not answer.
+        Unfit: the drive cannot be used.
+        NoAnswer: the drive does not answer.
     """
     yield from _check_identity(net, axis)
     yield from _check_abilities(net, axis)
@@ -102,7 +102,7 @@ def _check_identity(net: Net, axis: DriveAxis) -> Steps:
     try:
         name = yield from net.read_text(axis.id, table.DEVICE_NAME)
     except Refused:
-        name = axis.joint.model  # it does not say, and need not
+        name = axis.joint.model  # it reports none, which is allowed
     if name != axis.joint.model:
         raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
     yield from _check_fingerprint(net, axis, identity)
@@ -110,7 +110,7 @@ def _check_identity(net: Net, axis: DriveAxis) -> Steps:
 
 
 def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> Steps:
-    """Whether it is the very drive that the robot file names, as far as it names one."""
+    """Checks the serial number and firmware, as far as the robot file has them."""
     joint, (_, _, _, serial_number) = axis.joint, identity
     if joint.serial_number is not None and serial_number != joint.serial_number:
         raise Another("serial_number", str(joint.serial_number), str(serial_number), "drive")
@@ -119,7 +119,7 @@ def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> St
     try:
         firmware = yield from net.read_text(axis.id, table.SOFTWARE_VERSION)
     except Refused:
-        raise Unfit("it tells no firmware version (100Ah); leave this key out", ".firmware") from None
+        raise Unfit("it reports no firmware version (100Ah); leave this key out", ".firmware") from None
     if firmware != joint.firmware:
         raise Another("firmware", joint.firmware, firmware, "drive")
 
@@ -151,7 +151,7 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
 
 
 def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
-    """Nobody's motion ends; torque stays as it is."""
+    """Stops a motion that no client owns; leaves torque as it is."""
     state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
     if state is not State.ENABLED or abs((yield from net.read(axis.id, table.VELOCITY))) <= axis.grain.still_velocity:
         return
@@ -175,7 +175,7 @@ def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
 
 
 def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
-    """What its modes without a goal need. One that lacks it is used without them: they are a way, not a condition."""
+    """Sets up the optional modes without a goal; a drive that lacks something for them is used without them."""
     if (yield from _read(net, axis.id, table.QUICK_STOP_OPTION)) not in table.STANDING:
         axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
     if axis.turning_mode != table.PROFILE_POSITION:
@@ -198,12 +198,12 @@ def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
 
 
 def heartbeat_ms(bus: "CanBus") -> int:
-    """How often a drive tells that it is alive: three times as often as it has to."""
+    """Returns a drive's heartbeat interval: a third of the allowed time."""
     return max(10, round(bus.stale_after_s * 1e3 / 3))
 
 
 def _map(net: Net, node: int, pdo: Pdo, kind: int, flags: int) -> Steps:
-    """In the order that drives insist on: invalid, empty, filled, counted, valid."""
+    """Maps a PDO in the order that drives require: invalid, empty, filled, counted, valid."""
     record, mapping, cob = pdo.communication, pdo.communication + 0x200, pdo.base + node | flags
     yield from net.write(node, Entry(record, "u4", 1), cob | table.INVALID)
     yield from net.write(node, Entry(record, "u1", 2), kind)
@@ -220,7 +220,7 @@ def _disabled(record: int, node: int) -> int:
 
 
 def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
-    """A number that not every drive has."""
+    """Reads an optional object."""
     try:
         return (yield from net.read(node, entry))
     except Refused as refused:
@@ -230,7 +230,7 @@ def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
 
 
 def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:
-    """A number that not every drive has, or lets be changed; its own choice does as well."""
+    """Writes an optional object; the drive's own value is acceptable, too."""
     try:
         yield from net.write(node, entry, value)
     except Refused:

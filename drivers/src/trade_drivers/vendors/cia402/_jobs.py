@@ -1,4 +1,4 @@
-"""What enabling, relaxing, homing and leaving a drive are made of: one exchange on the wire after the other."""
+"""The steps of enabling, relaxing, homing and leaving a drive: one exchange after the other."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -21,19 +21,19 @@ __all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", 
 _WAIT_S: Final = 0.001
 _TAKEN_BACK_NS: Final = 5_000_000_000
 _AT_REST: Final = 2
-"""Measurements in a row in which it did not move."""
+"""Consecutive measurements without motion."""
 
 
 def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
-    """Torque on where it was measured to be, halted or told to stay there, with its own ramps; all of it confirmed.
+    """Switches torque on at the measured position, halted or with that as its target; confirms each step.
 
-    A drive that is enabled already must be at rest: then only its mode changes. A search for its zero ends.
+    A drive that is already enabled must be at rest: then only its mode changes. A homing ends.
     """
     if axis.stopped:
         yield from _take_back(bus, job, axis)
     yield from looking(bus, axis)
     if axis.motion is not None and not axis.fault:
-        bus.end_motion(axis, f"{axis.name} was enabled anew")
+        bus.end_motion(axis, f"{axis.name} was enabled again")
     if not axis.statusword & machine.REMOTE:
         raise axis.faulty("it does not obey the bus (statusword bit 9), as if operated from its panel")
     if axis.state_now is State.FAULT:
@@ -52,7 +52,7 @@ def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: 
 
 
 def _take_back(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-    """Out of a stop by network management, and set up like one that has come back."""
+    """Restarts a drive stopped by network management, and sets it up like one that was offline."""
     give_up_ns = bus.clock() + _TAKEN_BACK_NS
     axis.recalled = True
     try:
@@ -69,7 +69,7 @@ def _take_back(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> S
 
 
 def _begin_at_rest(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-    """No target that is left from before may move it in another mode."""
+    """Clears old targets, which could move it in another mode."""
     if axis.may_hold_torque:
         yield from until(
             bus, axis, lambda: axis.still >= _AT_REST, "its mode cannot be changed while it moves", HALT_NS
@@ -84,16 +84,16 @@ def _begin_at_rest(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) 
 
 
 def resting(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-    """End what moves it, by its drive's own ramp."""
+    """Ends its motion on the drive's own ramp."""
     job.gate()
     bus.halt([axis], "another kind of motion took over")
-    yield from until(bus, axis, lambda: axis.still >= _AT_REST, "told to halt, but it is still moving", HALT_NS)
+    yield from until(bus, axis, lambda: axis.still >= _AT_REST, "a halt was sent, but it is still moving", HALT_NS)
 
 
 def _climb(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
-    """Up to where it is enabled, a state at a time; the goal is where it is.
+    """Steps through the states to enabled, with the measured position as goal.
 
-    It ends halted, but in a mode without a goal, in which not every drive knows that.
+    The drive is then halted, except in a mode without a goal, where not all drives support halt.
     """
     while True:
         yield from until(bus, axis, lambda: machine.command_towards_enabled(axis.state_now) is not None, _stays(axis))
@@ -117,7 +117,7 @@ def _stays(axis: DriveAxis) -> str:
 
 
 def _reset(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-    """Clear the drive's own fault. Nothing else happens: that it can be enabled again is another matter."""
+    """Clears the drive's own fault, without enabling it."""
     for word in (machine.DISABLE_VOLTAGE, machine.RESET_FAULT):
         job.gate()
         bus.command(axis, word)
@@ -128,22 +128,22 @@ def _reset(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps
 
 
 def set_mode(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
-    """Another mode of operation; in it only when the drive says so itself."""
+    """Changes the mode of operation, and waits until the drive reports it."""
     yield from write(bus, job, axis, table.MODE, mode)
     yield from until(bus, axis, lambda: axis.mode == mode, f"it does not go into mode {mode} (6061h)")
 
 
 def relaxing(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-    """Torque off; its watchdog lives on."""
+    """Switches torque off; the watchdog stays armed."""
     axis.ready = False
     if axis.may_hold_torque:
         job.gate()
         bus.command(axis, machine.DISABLE_VOLTAGE)
-    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
 
 
 def leaving(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
-    """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
+    """Switches torque off, or leaves it on for a joint seen at rest, and only then disarms the watchdog."""
     if relax:
         yield from relaxing(bus, job, axis)
     elif axis.still == 0 and axis.may_hold_torque:
@@ -153,17 +153,17 @@ def leaving(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, *, rela
 
 
 def looking(bus: "DriveExchange", axis: DriveAxis) -> Steps:
-    """How it is now: what the SYNC after this one says."""
+    """Waits for the measurement of the next SYNC."""
     bus.require_answering(axis)
     yield from next_measurement(bus, axis)
 
 
 def write(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, entry: Entry, value: int) -> Steps:
-    """Change its dictionary, and hear that it did.
+    """Writes to its dictionary, with confirmation.
 
     Raises:
-        DeviceFault: it refused.
-        DeviceSilent: it did not answer, or fell silent.
+        DeviceFault: the drive refused.
+        DeviceSilent: the drive did not answer.
     """
     began_ns = bus.clock()
     bus.require_answering(axis)

@@ -1,4 +1,4 @@
-"""The state machine of a drive, as CiA 402-2 draws it: statuswords in, controlwords out. Pure."""
+"""The state machine of CiA 402-2: from statuswords to controlwords. Pure."""
 
 from enum import Enum
 from typing import Final
@@ -7,7 +7,7 @@ __all__ = ["State", "command_towards_enabled", "state_of"]
 
 
 class State(Enum):
-    """Where a drive is, by the mask and value of its statusword."""
+    """States of a drive, with mask and value of the statusword."""
 
     NOT_READY = (0x4F, 0x00)
     SWITCH_ON_DISABLED = (0x4F, 0x40)
@@ -20,14 +20,14 @@ class State(Enum):
 
     @property
     def torque(self) -> bool:
-        """Whether the motor is powered: it holds, moves or brakes."""
+        """Returns whether torque is on: the motor holds, moves or brakes."""
         return self in {State.ENABLED, State.QUICK_STOP, State.FAULT_REACTION}
 
 
 REMOTE: Final = 1 << 9
-"""Statusword: it obeys the bus."""
+"""Statusword: the drive follows the bus."""
 ACKNOWLEDGED: Final = 1 << 12
-"""Statusword in profile position: the set-point was taken; in homing: home was found."""
+"""Statusword in profile position: set-point acknowledged; in homing: home found."""
 HOMING_ERROR: Final = 1 << 13
 HOMING_STATUS: Final = 0x3400
 HOMING_DONE: Final = 0x1400
@@ -37,15 +37,15 @@ SHUTDOWN: Final = 0x0006
 SWITCH_ON: Final = 0x0007
 OPERATE: Final = 0x000F
 NEW_SET_POINT: Final = 0x0010
-"""Controlword in profile position: its rising edge starts the move; in homing: go."""
+"""Controlword in profile position: its rising edge starts the move; in homing: start."""
 AT_ONCE: Final = 0x0020
-"""Not after the move under way, but instead of it."""
+"""Replaces the current move instead of following it."""
 RESET_FAULT: Final = 0x0080
 HALT: Final = 0x0100
-"""Brake, and stand under torque."""
+"""Brake, and hold with torque."""
 HOLD: Final = OPERATE | HALT
 QUICK_STOP: Final = 0x0002
-"""Brake on the quick-stop ramp, in whatever mode: the cyclic ones know no halt."""
+"""Brake on the quick-stop ramp, in all modes, as the cyclic ones have no halt."""
 GO: Final = OPERATE | NEW_SET_POINT | AT_ONCE
 
 _PATTERNS: Final = tuple((state, *state.value) for state in State)
@@ -59,7 +59,7 @@ _UPWARDS: Final = {
 
 
 def state_of(statusword: int) -> State | None:
-    """The state of a statusword; None for a pattern the standard does not know."""
+    """Returns the state of a statusword; None for a pattern outside the standard."""
     for state, mask, value in _PATTERNS:
         if statusword & mask == value:
             return state
@@ -67,8 +67,8 @@ def state_of(statusword: int) -> State | None:
 
 
 def command_towards_enabled(state: State | None) -> int | None:
-    """The controlword that takes a drive one step nearer to being enabled, halted; None where it has to be waited for.
+    """Returns the controlword for one step towards enabled and halted; None in states to wait in.
 
-    A fault is not among them: it is reset on purpose only.
+    It never resets a fault, which needs an explicit call.
     """
     return None if state is None else _UPWARDS.get(state)

@@ -1,4 +1,4 @@
-"""A motor with what only a drive can: finding its zero."""
+"""A motor with homing, which only drives support."""
 
 from typing import Annotated
 
@@ -12,7 +12,7 @@ from trade_drivers.vendors.cia402._homing import Homing
 
 __all__ = ["Drive"]
 
-Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: where it is now is its zero")]
+Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: the zero is here")]
 Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
 
 
@@ -21,14 +21,14 @@ class Drive(BusMotor[DriveAxis, DriveExchange]):
 
     @service(effect="actuate", cancel="stop")
     def home(self, method: Method = 37, speed_rad_s: Slow | None = None) -> float:
-        """Find the zero of the joint, and return the angle measured there.
+        """Finds the zero of the joint, and returns the angle measured there.
 
-        With most methods the joint moves until it meets a switch or an index, limits() or not: nobody else knows where
-        it is. Never done by itself. The next move or enable() puts the drive back into its usual mode.
+        With most methods, the joint moves until it meets a switch or an index, regardless of limits(), since its
+        position is unknown. No driver homes a joint by itself. The next move or enable() restores the usual mode.
 
         Raises:
-            DeviceFault: it was not found, or the drive does not know the method.
-            LimitExceeded: faster than limits().
+            DeviceFault: the zero was not found, or the drive does not support the method.
+            LimitExceeded: the speed is above limits().
             MotionStopped, DeviceSilent, DeadlineExceeded: as with move_to().
         """
         axis = self._axes[0]

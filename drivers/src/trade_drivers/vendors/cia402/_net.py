@@ -1,4 +1,4 @@
-"""The nodes of one CAN bus: listeners for frames, requests to dictionaries that never hold up who makes them."""
+"""The nodes of one CAN bus: listeners for frames, and non-blocking requests to dictionaries."""
 
 import time
 from collections import deque
@@ -19,21 +19,21 @@ __all__ = ["Answer", "Net", "NoAnswer", "Refused", "emergency_text"]
 
 _ATTEMPTS: Final = 3
 _ANSWER_S: Final = 0.25
-"""Patience for one answer: drives take milliseconds, and nobody is held up, but a busy host takes its time."""
+"""Timeout of one answer: drives take milliseconds, a busy host takes longer, and nothing is blocked meanwhile."""
 _KEPT: Final = 8
-"""Frames of a server that are looked at; one of them at most is the answer."""
+"""Frames of a server that are kept; at most one of them is the answer."""
 
 _T = TypeVar("_T")
 Answer = Generator[None, None, _T]
-"""Yields until the answer is there, and returns what it says."""
+"""Yields until the answer has arrived, and returns its value."""
 
 
 class NoAnswer(Exception):
-    """A drive did not answer a request in time, or not to that one."""
+    """A drive did not answer this request in time."""
 
 
 class Refused(Exception):
-    """A drive answered that it would not."""
+    """A drive refused a request."""
 
     def __init__(self, entry: object, code: int, text: str) -> None:
         super().__init__(f"{entry}: {text}")
@@ -41,7 +41,7 @@ class Refused(Exception):
 
 
 def emergency_text(code: int) -> str:
-    """What an error code of a drive means, in short."""
+    """Returns a short text for a drive's error code."""
     known = _CODES.get(code) or EmcyError(code, 0, b"", 0.0).get_desc()
     return f"error {code:04X}h" + (f", {known.lower()}" if known else "")
 
@@ -68,17 +68,17 @@ class Net:
         self._listeners = listeners
         self._port = listeners.port
         self._answers: dict[int, deque[bytes]] = {}
-        """What came from the SDO server of a node."""
+        """Handles a frame of a node's SDO server."""
 
     def command(self, node: int, word: int) -> None:
-        """Network management: start a node, and so on. Nobody confirms it."""
+        """Sends a network management command, such as start; it has no confirmation."""
         self._port.send(table.NMT, bytes((word, node)))
 
     def read(self, node: int, entry: Entry) -> Answer[int]:
-        """A number out of a drive's dictionary.
+        """Reads a number from a drive's dictionary.
 
         Raises:
-            NoAnswer, Refused: what became of it.
+            NoAnswer, Refused: the request failed.
         """
         data = yield from self._ask(node, entry, lambda: sdo.upload(entry.index, entry.sub))
         if len(data) < entry.size:
@@ -86,12 +86,12 @@ class Net:
         return entry.decode(data)
 
     def read_text(self, node: int, index: int) -> Answer[str]:
-        """A text out of a drive's dictionary."""
+        """Reads a text from a drive's dictionary."""
         data = yield from self._ask(node, f"{index:04X}h", lambda: sdo.upload(index, 0))
         return data.rstrip(b"\0 ").decode("ascii", "replace")
 
     def write(self, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Answer[None]:
-        """A number into a drive's dictionary, more than once if need be; the gate is asked before each attempt."""
+        """Writes a number to a drive's dictionary, with retries; the gate is called before each attempt."""
 
         def download() -> Transfer:
             gate()
@@ -110,7 +110,7 @@ class Net:
         raise NoAnswer(f"{entry}: no answer within {_ATTEMPTS * _ANSWER_S * 1e3:.0f} ms")
 
     def _transfer(self, node: int, transfer: Transfer) -> Answer[bytes | None]:
-        """What came of it; None if an answer is missing."""
+        """Returns the outcome; None if an answer is missing."""
         answers = self._answers_of(node)
         request = next(transfer)
         while True:

@@ -1,4 +1,4 @@
-"""An open CAN bus, and what its nodes tell of themselves. Reads dictionaries; commands nothing."""
+"""Scanning an open CAN bus for nodes. Reads dictionaries; commands nothing."""
 
 from collections.abc import Iterable
 from itertools import islice
@@ -14,7 +14,7 @@ from trade_drivers.vendors.cia402._net import Answer, Net, NoAnswer, Refused
 __all__ = ["DriveBench"]
 
 _AT_ONCE: Final = 8
-"""Nodes asked at the same time: the queues of interfaces are short."""
+"""Number of simultaneous requests, as the queues of interfaces are short."""
 _SLICE_S: Final = 0.01
 _STOPPED: Final = "network management has stopped it, and it answers nothing; a driver that attaches takes it back"
 
@@ -35,7 +35,7 @@ class DriveBench(CanBench):
         self._known: dict[int, Found | None] = {}
 
     def anybody(self) -> bool:
-        """Asks all nodes, some at a time, so that those that are not there cost little."""
+        """Scans nodes in batches, so that absent ones cost little time."""
         left = iter(range(1, table.OUR_NODE))
         while some := list(islice(left, _AT_ONCE)):
             self._ask(some)
@@ -84,7 +84,7 @@ class DriveBench(CanBench):
         )
 
     def _text(self, node: int, index: int) -> Answer[str]:
-        """A text that need not be there."""
+        """Reads an optional text."""
         try:
             return (yield from self._net.read_text(node, index))
         except Refused:
@@ -92,4 +92,4 @@ class DriveBench(CanBench):
 
 
 def _nothing() -> None:
-    """Nothing has to be done between frames."""
+    """Does nothing between frames."""

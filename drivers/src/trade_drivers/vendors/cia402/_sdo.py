@@ -1,4 +1,4 @@
-"""Reading and writing a drive's dictionary, frame by frame: requests out, answers in (CiA 301, 7.2.4). Pure."""
+"""SDO transfers, frame by frame (CiA 301, 7.2.4). Pure."""
 
 import struct
 from collections.abc import Generator
@@ -8,19 +8,19 @@ __all__ = ["TIMED_OUT", "Aborted", "Request", "Transfer", "abort", "download", "
 
 _SIZE: Final = 8
 _EXPEDITED: Final = 4
-"""As many bytes fit into the first frame; nothing longer is written."""
+"""Maximum size in the first frame; this driver writes nothing longer."""
 _MOST_SEGMENTS: Final = 37
-"""Of a text, more is not asked for: 259 bytes, or fewer from a drive whose segments are not full."""
+"""Maximum segments of a text: 259 bytes, or fewer if the drive's segments are not full."""
 _DOWNLOAD, _UPLOAD, _SEGMENT, _ABORT = 0x20, 0x40, 0x60, 0x80
 _COMMAND: Final = 0xE0
 _TOGGLE: Final = 0x10
 _ANSWERS: Final = {_DOWNLOAD: 0x60, _UPLOAD: 0x40}
 TIMED_OUT: Final = 0x05040000
-"""Why a transfer is given up."""
+"""Abort code of a transfer."""
 
 
 class Aborted(Exception):
-    """The drive has refused; its code."""
+    """The drive aborted the transfer, with a code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -32,10 +32,10 @@ class Request(NamedTuple):
 
     data: bytes
     address: bytes
-    """The object it is about: index and sub-index."""
+    """The object: index and sub-index."""
 
     def is_answered_by(self, frame: bytes) -> bool:
-        """Whether a frame is its answer, or its refusal. If not, that comes too late for another, or is noise."""
+        """Returns whether a frame answers or aborts this request; other frames are late or noise."""
         if len(frame) != _SIZE:
             return False
         if frame[0] == _ABORT:
@@ -47,14 +47,14 @@ class Request(NamedTuple):
 
 
 Transfer = Generator[Request, bytes, bytes]
-"""Yields one request after the other, is sent the answer to each, and returns what was read."""
+"""A generator that yields requests, receives their answers, and returns the data read."""
 
 
 def upload(index: int, sub: int) -> Transfer:
-    """Read an object, at once or in segments.
+    """Reads an object, expedited or in segments.
 
     Raises:
-        Aborted: the drive would not.
+        Aborted: the drive refused.
     """
     address = _address(index, sub)
     first = yield from _ask(Request(bytes((_UPLOAD,)) + address + bytes(4), address))
@@ -72,10 +72,10 @@ def upload(index: int, sub: int) -> Transfer:
 
 
 def download(index: int, sub: int, data: bytes) -> Transfer:
-    """Write an object of one to four bytes.
+    """Writes an object of one to four bytes.
 
     Raises:
-        Aborted: the drive would not.
+        Aborted: the drive refused.
     """
     address = _address(index, sub)
     command = _DOWNLOAD | _EXPEDITED - len(data) << 2 | 3
@@ -84,7 +84,7 @@ def download(index: int, sub: int, data: bytes) -> Transfer:
 
 
 def abort(request: Request, code: int) -> bytes:
-    """The frame that gives a transfer up."""
+    """Returns the frame that aborts a transfer."""
     return bytes((_ABORT,)) + request.address + struct.pack("<I", code)
 
 

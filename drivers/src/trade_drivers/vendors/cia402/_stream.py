@@ -1,4 +1,4 @@
-"""Set-points for modes without a goal, one in every cycle: where to be, or how fast to turn. No I/O."""
+"""Generators of cyclic set-points (positions or velocities) for modes without a goal. No I/O."""
 
 from math import copysign, sqrt
 
@@ -9,7 +9,7 @@ __all__ = ["Following", "Turning", "interpolation_period"]
 
 
 class Following(Ramp):
-    """Positions, each reached one period after the SYNC that makes it count: cyclic synchronous position."""
+    """Cyclic synchronous position: each position is reached one period after the SYNC that activates it."""
 
     def __init__(self, node: int, position: int, *, speed: float, accel: float, period_s: float) -> None:
         super().__init__(position, fastest=speed, accel=accel, braking=accel / 2)
@@ -17,43 +17,43 @@ class Following(Ramp):
         self._period_s = period_s
 
     def next(self, sample: Sample, now_ns: int) -> bytes:  # noqa: ARG002 - that is the drive's own business in this mode
-        """The data of the frame for one period more."""
+        """Returns the frame data for the next period."""
         self.step(self._period_s)
         return table.FOLLOWING.layout.pack(self.target)
 
     @property
     def target(self) -> int:
-        """What the drive was sent last."""
+        """Returns the last set-point."""
         return round(self.position)
 
 
 class Turning:
-    """Speeds: cyclic synchronous velocity, or profile velocity, whose own ramps are as steep.
+    """Cyclic synchronous velocity, or profile velocity with ramps of the same steepness.
 
-    It stands until it is given an end and a speed. It slows down before the end in time for the drive to stop within
-    the range by itself, should the driver fall silent: after ``blind_s``. While nothing new is measured it takes the
-    joint to go on as it was told.
+    The velocity is 0 until it gets an end and a speed. It slows down early enough for the drive to stop within the
+    range even if the driver's frames stop, which the drive notices after ``blind_s``. Without a new measurement, it
+    assumes that the joint follows the commanded velocity.
     """
 
     def __init__(self, node: int, *, accel: int, period_s: float, blind_s: float) -> None:
         self.can_id = table.TURNING.base + node
         self.end: int | None = None
-        """Where it must not go beyond, in counts."""
+        """The end of its motion, in counts."""
         self.fastest = 0.0
-        """In counts/s, without a sign."""
+        """Speed in counts/s, without a sign."""
         self._speed = 0.0
         self._accel, self._period_s, self._blind_s = accel, period_s, blind_s
-        self._measured_ns = self._told_ns = 0
+        self._measured_ns = self._sent_ns = 0
         self._travelled = 0.0
-        """How far it must have got since it was measured, in counts."""
+        """Expected motion since the last measurement, in counts."""
 
     def next(self, sample: Sample, now_ns: int) -> bytes:
-        """The data of the frame for one period more, where that was measured last."""
+        """Returns the frame data for the next period, from the newest measurement."""
         if sample.at_ns == self._measured_ns:
-            self._travelled += self._speed * (now_ns - self._told_ns) / 1e9
+            self._travelled += self._speed * (now_ns - self._sent_ns) / 1e9
         else:
             self._travelled = self._speed * (now_ns - sample.at_ns) / 1e9
-        self._measured_ns, self._told_ns = sample.at_ns, now_ns
+        self._measured_ns, self._sent_ns = sample.at_ns, now_ns
         wanted = 0.0 if self.end is None else self._allowed(self.end - sample.position - self._travelled)
         self._speed = towards(self._speed, wanted, self._accel * self._period_s)
         return table.TURNING.layout.pack(self._accel, round(self._speed))
@@ -64,8 +64,8 @@ class Turning:
 
 
 def interpolation_period(rate_hz: float) -> tuple[int, int]:
-    """A period as object 60C2h has it: a number below 256, and the power of ten of its unit."""
-    for exponent in (-3, -4, -5, -6):  # whole milliseconds are what every drive takes
+    """Returns a period for object 60C2h: a number below 256, and a power of ten in s."""
+    for exponent in (-3, -4, -5, -6):  # all drives accept whole milliseconds
         count = 10.0**-exponent / rate_hz
         if abs(count - round(count)) < 1e-3 and round(count) < 256:
             return round(count), exponent

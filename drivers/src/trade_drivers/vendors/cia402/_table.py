@@ -1,4 +1,4 @@
-"""Objects of a drive's dictionary that this driver uses, and the frames it maps them to: data, no I/O.
+"""Objects of a drive's dictionary that this driver uses, and their frames. Data, no I/O.
 
 Sources: CiA 301 (1000h to 1FFFh, identifiers) and CiA 402-2 (6000h on).
 """
@@ -26,15 +26,15 @@ class Entry(Struct, frozen=True):
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Size in bytes."""
         return int(self.kind[1])
 
     def decode(self, data: bytes) -> int:
-        """The number that was read; drives may answer with more bytes than it has."""
+        """Decodes a number; drives may answer with extra bytes."""
         return int.from_bytes(data[: self.size], "little", signed=self.kind[0] == "i")
 
     def encode(self, value: int) -> bytes:
-        """The bytes of a number; OverflowError if they do not fit."""
+        """Returns the bytes of a number; raises OverflowError if they do not fit."""
         return value.to_bytes(self.size, "little", signed=self.kind[0] == "i")
 
     def __str__(self) -> str:
@@ -45,7 +45,7 @@ DEVICE_TYPE: Final = Entry(0x1000, "u4")
 DEVICE_NAME: Final = 0x1008
 SOFTWARE_VERSION: Final = 0x100A
 CONSUMER_HEARTBEAT: Final = Entry(0x1016, "u4", 1)
-"""Whose heartbeat it wants, ``node << 16``, and for how many milliseconds it does without."""
+"""The monitored heartbeat: ``node << 16`` plus the timeout in milliseconds."""
 PRODUCER_HEARTBEAT: Final = Entry(0x1017, "u2")
 """In milliseconds."""
 IDENTITY: Final = tuple(Entry(0x1018, "u4", sub) for sub in (1, 2, 3, 4))
@@ -73,7 +73,7 @@ HOMING_METHOD: Final = Entry(0x6098, "i1")
 HOMING_SPEEDS: Final = (Entry(0x6099, "u4", 1), Entry(0x6099, "u4", 2))
 HOMING_ACCELERATION: Final = Entry(0x609A, "u4")
 INTERPOLATION_PERIOD: Final = (Entry(0x60C2, "u1", 1), Entry(0x60C2, "i1", 2))
-"""In which a cyclic position is reached: so many times ten to the power of so many seconds."""
+"""The interpolation period of a cyclic position: a number and a power of ten in s."""
 TARGET_VELOCITY: Final = Entry(0x60FF, "i4")
 SUPPORTED_MODES: Final = Entry(0x6502, "u4")
 """Bit ``mode - 1`` for each."""
@@ -84,13 +84,13 @@ HOMING: Final = 6
 CYCLIC_POSITION: Final = 8
 CYCLIC_VELOCITY: Final = 9
 STANDING: Final = (5, 6, 7)
-"""Of 605Ah: what stands under torque after a quick stop."""
+"""Values of 605Ah that hold with torque after a quick stop."""
 DRIVE_PROFILE: Final = 402
 FULL_TORQUE: Final = 1000
-"""Counts of the torque that mean the rated one."""
+"""Counts of the rated torque."""
 
 OUR_NODE: Final = 127
-"""The node whose heartbeats the drives live on: this driver."""
+"""The node whose heartbeats the drives monitor: this driver."""
 NMT: Final = 0x000
 SYNC: Final = 0x080
 EMERGENCY: Final = 0x080
@@ -104,24 +104,24 @@ NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
 
 
 def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
-    """Identifiers among what was heard that only who commands drives sends: those with these nodes, or that tell."""
+    """Returns identifiers that only a driver sends, for these nodes or those that send heartbeats."""
     everybody = {NMT, SYNC, HEARTBEAT + OUR_NODE}
     bases = (SDO_REQUEST, *(pdo.base for pdo in (COMMAND, PROFILE, BRAKING, FOLLOWING)))
     return talk.frames.keys() & (everybody | {base + node for base in bases for node in {*nodes, *talk.canopen}})
 
 
 class Pdo(Struct, frozen=True):
-    """What one process data object carries, little-endian and without gaps."""
+    """The fields of one process data object, little-endian and without gaps."""
 
     communication: int
-    """Its record of parameters; the mapping is 200h above."""
+    """The object with its parameters; the mapping is 200h above."""
     base: int
-    """Its identifier, less the node's number."""
+    """The identifier without the node number."""
     entries: tuple[Entry, ...]
     layout: struct.Struct
 
     def mapping(self) -> list[int]:
-        """The words of the mapping record."""
+        """Returns the words of the mapping record."""
         return [entry.index << 16 | entry.sub << 8 | entry.size * 8 for entry in self.entries]
 
 
@@ -131,7 +131,7 @@ COMMAND: Final = Pdo(0x1400, 0x200, (CONTROLWORD, TARGET_POSITION), struct.Struc
 PROFILE: Final = Pdo(0x1401, 0x300, (PROFILE_VELOCITY, ACCELERATION), struct.Struct("<II"))
 BRAKING: Final = Pdo(0x1402, 0x400, (DECELERATION,), struct.Struct("<I"))
 TURNING: Final = Pdo(0x1402, 0x400, (DECELERATION, TARGET_VELOCITY), struct.Struct("<Ii"))
-"""In its place, where a drive has a velocity mode."""
+"""The replacement for drives with a velocity mode."""
 FOLLOWING: Final = Pdo(0x1403, 0x500, (TARGET_POSITION,), struct.Struct("<i"))
 UNUSED: Final = (0x1802, 0x1803)
 AT_NEXT_SYNC: Final = 1

@@ -1,4 +1,4 @@
-"""One motor as the bus thread knows it: what its frames said last, where it is told to be, what speaks against it."""
+"""The state of one motor on the bus thread: its last frames, its set-point, and faults that forbid motion."""
 
 from collections.abc import Sequence
 from math import tau
@@ -15,14 +15,14 @@ from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Sta
 __all__ = ["COUNTS_PER_RAD", "DamiaoAxis"]
 
 COUNTS_PER_RAD: Final = (1 << 16) / tau
-"""Of the motor's own shaft: this driver's counts; on the wire there are radians."""
+"""Counts per turn of the motor's shaft in this driver; frames contain radians."""
 _STILL_RAD_S: Final = 0.01
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 
 
 def grain_of(joint: Joint, rate_hz: float) -> Grain:
-    """What counts mean; nothing is finer than what the frames can say."""
+    """Returns the resolution, which is limited by that of the frames."""
     ranges = MODELS[joint.model]
     rad = 1 / (COUNTS_PER_RAD * joint.gear)
     position, velocity = 2 * ranges.position_rad / 0xFFFF, 2 * ranges.velocity_rad_s / 0xFFF
@@ -47,27 +47,27 @@ class DamiaoAxis(MotorAxis):
         self.master = joint.id + frames.MASTER
         self.status: int | None = None
         self.heard_ns = 0
-        """When it last told how it is."""
+        """When it last sent feedback."""
         self.software: int | None = None
-        """What it said when it was attached."""
+        """The software version when it was attached."""
         self.asks: Register | None = None
-        """Which of its registers it was asked for."""
-        self.told: float | None = None
-        """What it said of it."""
+        """The requested register."""
+        self.answer: float | None = None
+        """The answered value of the register."""
         self.course: Ramp | None = None
-        """Where it is told to be, in every cycle; None: nowhere."""
+        """The generator of its set-point in each cycle; None if it gets no set-points."""
         self.easing = 1.0
-        """With how much of its acceleration it ends a way."""
+        """The share of its acceleration used for braking."""
         self.stepped_ns = 0
-        """When it was told last."""
+        """When the last set-point was sent."""
         self._celsius: float | None = None
 
-    # --- what it says
+    # --- received frames
 
     def take(self, data: bytes, now_ns: int) -> None:
-        """A frame with the identifier of its answers: about a register if it was asked for one, else its feedback."""
-        if self.asks is not None and (told := frames.answer(data, self.id, self.asks)) is not None:
-            self.told, self.asks = told, None
+        """Handles an answer frame: a register if one was requested, otherwise feedback."""
+        if self.asks is not None and (answer := frames.answer(data, self.id, self.asks)) is not None:
+            self.answer, self.asks = answer, None
             self.beat_ns = now_ns
             return
         try:
@@ -95,16 +95,16 @@ class DamiaoAxis(MotorAxis):
             return
         self.course = None
 
-    # --- what it is
+    # --- state
 
     @property
     def failed(self) -> bool:
-        """It complains, and has let go."""
+        """Returns whether it reports an error, and so has switched its torque off."""
         return self.status not in {None, Status.DISABLED, Status.ENABLED}
 
     @property
     def complaint(self) -> str:
-        """What it complains of."""
+        """Returns the reported error."""
         known = {status.value: status.name.lower().replace("_", " ") for status in Status}
         return f"status {self.status:X}h: {known.get(self.status or 0, 'unknown')}"
 
@@ -121,11 +121,11 @@ class DamiaoAxis(MotorAxis):
         self.course = None
 
     def step(self, now_ns: int, period_s: float) -> bytes:
-        """Where it is to be next, and how fast at most; on the motor's own shaft."""
+        """Returns the next set-point and its maximum speed, on the motor's shaft."""
         course = self.course
         if course is None:
-            raise self.faulty("it is told nothing")
-        elapsed_s = min((now_ns - self.stepped_ns) / 1e9, 2 * period_s)  # held up, it goes on where it was
+            raise self.faulty("it has no set-point")
+        elapsed_s = min((now_ns - self.stepped_ns) / 1e9, 2 * period_s)  # after a gap, it continues where it was
         self.stepped_ns = now_ns
         if elapsed_s > 0:
             course.step(elapsed_s)

@@ -1,4 +1,4 @@
-"""Which Damiao motors are on a CAN bus: each is asked for what its numbers mean."""
+"""Scanning a CAN bus for Damiao motors, by requests for the ranges of their values."""
 
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ __all__ = ["DamiaoCommissioner"]
 
 
 class DamiaoCommissioner(CanMotorCommissioner):
-    """Damiao motors; they leave the factory with number 1 and without one of their own to answer with."""
+    """Damiao motors; factory default: id 1, and no answer id of their own."""
 
     driver = "damiao"
     ids = range(1, MASTER)

@@ -1,7 +1,7 @@
-"""What Damiao motors are told in the cyclic exchange with all of one bus, and how.
+"""Commands to Damiao motors in the cyclic exchange with a bus.
 
-A motor tells how it is only when it is told something. So one under torque is told in every cycle where to be, a step
-further on its way, and any other is asked. It has no ramps that could be relied on: they are made here.
+A motor sends feedback only in answer to a frame. So each cycle sends a motor with torque its next set-point, and any
+other motor a request. Its own ramps are unreliable, so this driver generates them.
 """
 
 import time
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 __all__ = ["DamiaoExchange"]
 
 _LAG: Final = 5
-"""Cycles by which a motor may be behind what it is told."""
+"""Cycles by which a motor may lag behind its set-point."""
 
 
 class DamiaoExchange(MotorExchange[DamiaoAxis]):
-    """What happens on one bus of Damiao motors."""
+    """The exchange with the Damiao motors of one bus."""
 
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] = time.monotonic_ns
@@ -42,25 +42,25 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     def _listener(self, axis: DamiaoAxis) -> Callable[[bytes], None]:
         return lambda data: axis.take(data, self.clock())
 
-    # --- what a motor is told
+    # --- commands
 
     def _there(self, axis: DamiaoAxis) -> Frame:
-        """Where to be next."""
+        """Returns the frame with the next set-point."""
         return Frame(frames.POSITION_VELOCITY + axis.id, axis.step(self.clock(), self.period_ns / 1e9))
 
     def refresh(self, axis: DamiaoAxis) -> Frame:
-        """A question that tells it nothing."""
+        """Returns a request without a command."""
         return Frame(frames.EVERYBODY, frames.refresh(axis.id))
 
     def stand(self, axis: DamiaoAxis) -> None:
-        """From now on it is told to be where it was measured."""
+        """Starts set-points at the measured position."""
         here = axis.fresh(self.clock(), self.stale_after_ns).position
         accel = float(axis.accel_counts)
         axis.course = Ramp(here, fastest=axis.speed_counts, accel=accel, braking=accel)
         axis.stepped_ns = self.clock()
 
     def enable(self, axis: DamiaoAxis) -> None:
-        """Torque on, with where it is before it and after it: it must not make for where it was sent last."""
+        """Switches torque on between set-points at the measured position, so that it does not move to an old one."""
         there = self._there(axis)
         self.port.send_all([there, Frame(axis.id, frames.ENABLE), there])
 
@@ -76,22 +76,22 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def _aim(self, positions: Mapping[DamiaoAxis, int], gate: Gate, aim: Callable[[Ramp, int], None]) -> None:
         gate()
-        told: list[Frame] = []
+        frames_out: list[Frame] = []
         for axis, position in positions.items():
             if axis.course is None:
                 raise axis.faulty("it was enabled, but has let go since")
             aim(axis.course, position)
-            told.append(self._there(axis))
-        self.port.send_all(told)
+            frames_out.append(self._there(axis))
+        self.port.send_all(frames_out)
 
     def reached_ns(self, axes: Sequence[DamiaoAxis]) -> int | None:  # noqa: ARG002 - the same for all
-        """A step on its way is made within the period that begins with it."""
+        """A set-point is reached within the period that begins with it."""
         return self.clock() + self.period_ns
 
     def write_holds(self, positions: Mapping[DamiaoAxis, int]) -> None:
-        """Brake as hard as the joint may; one held off its course stands where it is.
+        """Brakes at the joint's maximum deceleration; a joint held off its course stays where it is.
 
-        One under torque that this driver has not enabled lets go: what it would make of a position, nobody knows.
+        Relaxes a motor whose torque this driver did not switch on, as its reaction to a position is unknown.
         """
         for axis, position in positions.items():
             if axis.course is None:
@@ -128,7 +128,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     def leaving(self, job: Work[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
         return jobs.leaving(self, job, axis, relax=relax)
 
-    # --- what it is asked
+    # --- requests
 
     def question(self, axis: DamiaoAxis) -> Frame:
         return self.refresh(axis) if axis.course is None else self._there(axis)
@@ -137,7 +137,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         return look_over(self, axis)
 
     def watch(self) -> None:
-        """What is sent on its way step by step goes on only while its call may."""
+        """Ends motions whose call has ended, as their set-points are generated step by step."""
         super().watch()
         for motion in dict.fromkeys(axis.motion for axis in self.devices if axis.motion is not None):
             try:

@@ -1,4 +1,4 @@
-"""Bringing a bus of Damiao motors up."""
+"""The driver of a bus of Damiao motors."""
 
 from typing import TYPE_CHECKING
 

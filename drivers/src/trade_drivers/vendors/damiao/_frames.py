@@ -1,4 +1,4 @@
-"""What Damiao motors say and are told, frame by frame: pure, no I/O.
+"""Encoding and decoding of Damiao frames. Pure, no I/O.
 
 Source: the vendor's manuals of the DM-J series (control protocol, registers). Two identifiers belong to a motor: that
 it listens to (ESC_ID, register 8) and that it answers with (MST_ID, register 7).
@@ -15,30 +15,30 @@ if TYPE_CHECKING:
 __all__ = ["MODELS", "Feedback", "Ranges", "Register", "Status"]
 
 EVERYBODY: Final = 0x7FF
-"""The identifier of questions about registers; the motor is named in the data."""
+"""The identifier of register requests; the data contains the motor."""
 POSITION_VELOCITY: Final = 0x100
-"""Added to a motor's identifier: where to, and how fast at most."""
+"""Added to a motor's identifier for frames with a position and a maximum speed."""
 MASTER: Final = 0x10
-"""A motor's own identifier and this make that of its answers: what its vendor's tool sets."""
+"""Added to a motor's identifier for its answers, as the vendor's tool sets it."""
 ENABLE, DISABLE, CLEAR = (bytes(7 * (0xFF,) + (last,)) for last in (0xFC, 0xFD, 0xFB))
 _MODES: Final = (0, POSITION_VELOCITY, 0x200, 0x300)
-"""Added to a motor's identifier, by its mode of control."""
+"""Added to a motor's identifier, by control mode."""
 TICKS_PER_S: Final = 20_000
-"""Of the time after which a motor that hears nothing lets go."""
+"""Unit of the watchdog timeout, after which a motor switches its torque off."""
 _POSITION: Final = struct.Struct("<ff")
 _READ, _WRITE, _REFRESH = 0x33, 0x55, 0xCC
 _FEEDBACK: Final = 8
 FULL: Final = 1000
-"""Parts of the torque that a motor can tell."""
+"""Steps of the torque in feedback."""
 
 
-def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - nobody else has such identifiers
-    """Identifiers among what was heard that only who commands or asks motors sends."""
+def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - identifiers are unique to such drivers
+    """Returns the identifiers among the traffic that only a driver of such motors sends."""
     return talk.frames.keys() & ({EVERYBODY} | {base + motor for base in _MODES for motor in range(1, MASTER)})
 
 
 class Register(IntEnum):
-    """Those that are read or written here."""
+    """The registers that this driver uses."""
 
     TIMEOUT = 9
     CONTROL_MODE = 10
@@ -49,16 +49,16 @@ class Register(IntEnum):
 
     @property
     def is_float(self) -> bool:
-        """Else it is a whole number."""
+        """Returns whether the register is a float; otherwise it is an integer."""
         return self in {Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX}
 
 
 IN_POSITION_VELOCITY: Final = 2
-"""Of the control mode."""
+"""Value of the control mode register."""
 
 
 class Status(IntEnum):
-    """The upper half of the first byte of a feedback frame."""
+    """State or error: the upper half of the first byte of a feedback frame."""
 
     DISABLED = 0
     ENABLED = 1
@@ -72,7 +72,7 @@ class Status(IntEnum):
 
 
 class Ranges(NamedTuple):
-    """What the ends of a motor's numbers mean; it scales with its own, so they must agree."""
+    """The ranges by which a motor scales its values; the driver's must be the same."""
 
     position_rad: float
     velocity_rad_s: float
@@ -96,24 +96,24 @@ MODELS: Final = {
     "DMJH11": Ranges(12.5, 10.0, 12.0),
     "DM6248P": Ranges(12.566, 20.0, 120.0),
 }
-"""As the vendor's tool sets them."""
+"""Models with the ranges that the vendor's tool sets."""
 
 
 class Feedback(NamedTuple):
-    """What a motor answers to every command."""
+    """Feedback, the answer of a motor to each command."""
 
     status: int
     nibble: int
-    """The lower half of its own identifier."""
+    """The lower half of the motor's identifier."""
     position_rad: float
     velocity_rad_s: float
     torque_nm: float
     temperature_c: int
-    """Of its driver or its rotor, whichever is hotter."""
+    """The higher temperature of driver and rotor."""
 
     @classmethod
     def decode(cls, data: bytes, ranges: Ranges) -> "Feedback":
-        """Out of eight bytes; struct.error for another number."""
+        """Decodes eight bytes; raises struct.error for another size."""
         if len(data) != _FEEDBACK:
             raise struct.error(f"{len(data)} bytes")
         position = data[1] << 8 | data[2]
@@ -134,7 +134,7 @@ def _value(number: int, bits: int, most: float) -> float:
 
 
 def position_velocity(position_rad: float, velocity_rad_s: float) -> bytes:
-    """Where to go, and how fast at most."""
+    """Returns a frame with a position and a maximum speed."""
     return _POSITION.pack(position_rad, velocity_rad_s)
 
 
@@ -143,17 +143,17 @@ def read(motor: int, register: Register) -> bytes:
 
 
 def write(motor: int, register: Register, value: int) -> bytes:
-    """A whole number into a register, until power goes off."""
+    """Returns a frame that writes an integer to a register until power-off."""
     return bytes((motor, 0, _WRITE, register)) + struct.pack("<I", value)
 
 
 def refresh(motor: int) -> bytes:
-    """Ask for a feedback frame without telling it anything."""
+    """Returns a request for feedback without a command."""
     return bytes((motor, 0, _REFRESH, 0, 0, 0, 0, 0))
 
 
 def answer(data: bytes, motor: int, register: Register) -> float | int | None:
-    """What a frame says of a register; None if it is no answer of this motor about that."""
+    """Returns the register value in a frame; None if it is not this motor's answer about it."""
     if len(data) != _FEEDBACK or data[:2] != bytes((motor, 0)) or data[2] not in {_READ, _WRITE} or data[3] != register:
         return None
     value: tuple[float | int] = struct.unpack("<f" if register.is_float else "<I", data[4:])

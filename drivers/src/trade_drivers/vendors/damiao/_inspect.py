@@ -1,4 +1,4 @@
-"""Looking Damiao motors over before anything is commanded: what the file asks of them, and who answers."""
+"""Checks of Damiao motors before anything is commanded: the robot file, and the devices."""
 
 from collections.abc import Sequence
 from math import isclose
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 __all__ = ["check_bus", "look_over", "register", "set_register"]
 
 _WITHIN: Final = 0.98
-"""Of what a motor can say of its position, a joint may use so much: beyond, one end cannot be told from the next."""
+"""The share of a motor's position range that a joint may use, as positions at its two ends look alike."""
 
 
 def check_bus(bus: "CanBus", axes: Sequence[DamiaoAxis], where: str) -> None:
-    """What the file alone can tell: identifiers, keys, ranges, and whether the frames of a cycle fit into it.
+    """Checks the robot file: identifiers, keys, ranges, and whether a cycle is long enough for its frames.
 
     Raises:
-        ConfigurationError: names the key and what would be right.
+        ConfigurationError: a check failed; names the key and the right value.
     """
     check_joints(axes, where, _check_joint)
     check_rate(bus, where, 4)
@@ -40,63 +40,63 @@ def check_bus(bus: "CanBus", axes: Sequence[DamiaoAxis], where: str) -> None:
 def _check_joint(axis: DamiaoAxis) -> None:
     joint, ranges = axis.joint, axis.ranges
     if not 1 <= joint.id < frames.MASTER:
-        raise Unfit(f"{joint.id} is none; 1 to 15 can be told apart (it answers as that and 16)", ".id")
+        raise Unfit(f"{joint.id} is not valid; use 1 to 15 (the motor answers as its id plus 16)", ".id")
     if joint.counts_per_rev is not None:
-        raise Unfit("a Damiao motor tells radians, not counts; leave this key out", ".counts_per_rev")
+        raise Unfit("a Damiao motor reports radians, not counts; leave this key out", ".counts_per_rev")
     if joint.homing_counts:
         raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.max_speed_rad_s * joint.gear > ranges.velocity_rad_s:
         most = ranges.velocity_rad_s / joint.gear
         raise Unfit(
-            f"{joint.max_speed_rad_s:.4g} is above {most:.4g}, the most a {joint.model} tells", ".max_speed_rad_s"
+            f"{joint.max_speed_rad_s:.4g} is above {most:.4g}, the most a {joint.model} reports", ".max_speed_rad_s"
         )
     for key, value in ((".min_rad", joint.min_rad), (".max_rad", joint.max_rad)):
         if abs(axis.scale.counts(value)) * axis.grain.rad * joint.gear > _WITHIN * ranges.position_rad:
-            raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can tell", key)
+            raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can report", key)
     if joint.serial_number is not None:
-        raise Unfit("a Damiao motor tells no serial number here; leave this key out", ".serial_number")
+        raise Unfit("a Damiao motor reports no serial number here; leave this key out", ".serial_number")
 
 
 def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
-    """Check who a motor is and what its numbers mean, and arm its watchdog. Enables and moves nothing.
+    """Checks the identity and ranges of a motor, and arms its watchdog. Enables and moves nothing.
 
     Raises:
-        Unfit: it cannot be used.
-        NoAnswer: it does not answer.
+        Unfit: the motor cannot be used.
+        NoAnswer: the motor does not answer.
     """
     for number, meant in zip(
         (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX), axis.ranges, strict=True
     ):
         yield from register(bus, axis, number)
-        if axis.told is None or not isclose(axis.told, meant, rel_tol=1e-3):
+        if axis.answer is None or not isclose(axis.answer, meant, rel_tol=1e-3):
             name = number.name.replace("_MAX", "").lower()
             problem = (
-                f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to {axis.told:g}"
+                f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to {axis.answer:g}"
             )
             raise Unfit(f"{problem} (register {number:d})", ".model")
     yield from register(bus, axis, Register.SOFTWARE)
-    if axis.software not in {None, axis.told}:
-        raise Unfit(f"another motor answers as {axis.id}: its software is {axis.told}, not {axis.software}")
-    axis.software = int(axis.told or 0)
+    if axis.software not in {None, axis.answer}:
+        raise Unfit(f"another motor answers as {axis.id}: its software is {axis.answer}, not {axis.software}")
+    axis.software = int(axis.answer or 0)
     if axis.joint.firmware is not None and axis.joint.firmware != str(axis.software):
         raise Another("firmware", axis.joint.firmware, str(axis.software))
     yield from set_register(bus, axis, Register.TIMEOUT, bus.timeout)
-    if axis.told != bus.timeout:
-        raise Unfit(f"it does not keep its time-out (register 9): {axis.told}, not {bus.timeout}")
+    if axis.answer != bus.timeout:
+        raise Unfit(f"it does not keep its time-out (register 9): {axis.answer}, not {bus.timeout}")
     axis.heard_ns = 0
     yield from asked(bus, axis, [bus.refresh(axis)], lambda: axis.heard_ns > 0)
 
 
 def register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register) -> Steps:
-    """Ask for a register; its ``told`` is what it holds."""
-    axis.told, axis.asks = None, number
+    """Requests a register; ``answer`` is then its value."""
+    axis.answer, axis.asks = None, number
     question = Frame(frames.EVERYBODY, frames.read(axis.id, number))
     yield from asked(bus, axis, [question], lambda: axis.asks is None)
 
 
 def set_register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: int) -> Steps:
-    """Write a register and ask for it again."""
-    axis.told, axis.asks = None, number
+    """Writes a register and reads it back."""
+    axis.answer, axis.asks = None, number
     order = Frame(frames.EVERYBODY, frames.write(axis.id, number, value))
     yield from asked(bus, axis, [order], lambda: axis.asks is None)
     yield from register(bus, axis, number)

@@ -1,4 +1,4 @@
-"""What enabling, relaxing and leaving a motor are made of: one exchange on the wire after the other."""
+"""The steps of enabling, relaxing and leaving a motor: one exchange after the other."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -19,11 +19,11 @@ _WAIT_S: Final = 0.001
 
 
 def enabling(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
-    """Torque on where it was measured to be, in position-velocity mode; all of it confirmed."""
+    """Switches torque on at the measured position in position-velocity mode; confirms each step."""
     bus.require_answering(axis)
     yield from next_measurement(bus, axis)
     if axis.motion is not None and not axis.fault:
-        bus.end_motion(axis, f"{axis.name} was enabled anew")
+        bus.end_motion(axis, f"{axis.name} was enabled again")
     if axis.torque:
         yield from until(bus, axis, lambda: axis.still > 1, "it cannot be enabled while it moves", HALT_NS)
     if axis.failed:
@@ -41,30 +41,30 @@ def enabling(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> 
 
 
 def _set_up(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
-    """Its time-out and its mode, every time: both are gone when it has restarted, which it does not tell."""
+    """Sets timeout and mode each time: a restart, which the motor does not report, loses both."""
     job.gate()
     yield from _written(bus, axis, Register.TIMEOUT, bus.timeout)
     yield from _heard(bus, axis, register(bus, axis, Register.CONTROL_MODE))
-    if axis.told == frames.IN_POSITION_VELOCITY:
+    if axis.answer == frames.IN_POSITION_VELOCITY:
         return
-    if axis.torque:  # it would go to where it was sent in that mode, ever so long ago
+    if axis.torque:  # it would move to its last set-point in that mode, however old
         yield from relaxing(bus, job, axis)
     job.gate()
     yield from _written(bus, axis, Register.CONTROL_MODE, frames.IN_POSITION_VELOCITY)
 
 
 def relaxing(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
-    """Torque off; its watchdog has nothing to watch then."""
+    """Switches torque off, which also idles the watchdog."""
     axis.ready = False
     job.gate()
     axis.course = None
     if axis.may_hold_torque:
         bus.port.send(axis.id, frames.DISABLE)
-    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
 
 
 def leaving(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
-    """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
+    """Switches torque off, or leaves it on for a joint seen at rest, and only then disarms the watchdog."""
     if relax:
         yield from relaxing(bus, job, axis)
         return
@@ -75,14 +75,14 @@ def leaving(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis, *, r
 
 
 def _written(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: int) -> Steps:
-    """A register, read back; raises ``DeviceFault`` if it does not hold it."""
+    """Writes a register and reads it back; raises ``DeviceFault`` if the value was not kept."""
     yield from _heard(bus, axis, set_register(bus, axis, number, value))
-    if axis.told != value:
-        raise axis.faulty(f"it does not keep register {number:d}: {axis.told}, not {value}")
+    if axis.answer != value:
+        raise axis.faulty(f"it does not keep register {number:d}: {axis.answer}, not {value}")
 
 
 def _heard(bus: "DamiaoExchange", axis: DamiaoAxis, asking: Steps) -> Steps:
-    """Raises ``DeviceSilent`` if it does not answer."""
+    """Runs a register exchange; raises ``DeviceSilent`` if the motor does not answer."""
     try:
         for _ in asking:
             bus.idle(_WAIT_S)

@@ -1,4 +1,4 @@
-"""An open CAN bus, and the Damiao motors that answer on it. Registers are read; nothing is enabled or written."""
+"""Scanning an open CAN bus for Damiao motors. Reads registers; enables and writes nothing."""
 
 import time
 from collections.abc import Callable
@@ -21,7 +21,7 @@ _SHARED: Final = (
     "plug in the next"
 )
 
-_Told = TypeVar("_Told")
+_Value = TypeVar("_Value")
 
 
 class _Silent(Exception):
@@ -58,42 +58,42 @@ class DamiaoBench(CanBench):
             status = self._status(device_id)
         except _Silent:
             return self.found(device_id, problem="it answers now and then; check its cable and the terminations")
-        told = Ranges(position, *rest)
-        names = [name for name, ranges in MODELS.items() if all(map(_alike, ranges, told))]
+        reported = Ranges(position, *rest)
+        names = [name for name, ranges in MODELS.items() if all(map(_alike, ranges, reported))]
         return self.found(
             device_id,
             " or ".join(names),
             firmware=f"{software:g}",
             torque=status == Status.ENABLED,
-            problem="" if names else f"its numbers (registers 21 to 23) go to {told}, which is no model known here",
+            problem="" if names else f"its numbers (registers 21 to 23) go to {reported}, which is no model known here",
         )
 
     def _register(self, motor: int, number: Register) -> list[tuple[int, float]]:
-        """The identifiers that answers came with, and what they say. Raises ``_Silent``."""
+        """Returns the identifiers and values of all answers. Raises ``_Silent``."""
 
-        def told(frame: Frame) -> tuple[int, float] | None:
+        def decode(frame: Frame) -> tuple[int, float] | None:
             value = frames.answer(frame.data, motor, number) if frame.id != frames.EVERYBODY else None
             return None if value is None else (frame.id, value)
 
-        return self._asked(frames.read(motor, number), told)
+        return self._asked(frames.read(motor, number), decode)
 
     def _status(self, motor: int) -> int:
-        def told(frame: Frame) -> int | None:
+        def decode(frame: Frame) -> int | None:
             if frame.id != motor + MASTER or len(frame.data) != len(frames.ENABLE):
                 return None
             return Feedback.decode(frame.data, Ranges(0, 0, 0)).status
 
-        return self._asked(frames.refresh(motor), told)[0]
+        return self._asked(frames.refresh(motor), decode)[0]
 
-    def _asked(self, question: bytes, told: Callable[[Frame], _Told | None]) -> list[_Told]:
-        """What comes back, and a moment later, in case there are two of them. Raises ``_Silent``."""
-        answers: list[_Told] = []
+    def _asked(self, question: bytes, decode: Callable[[Frame], _Value | None]) -> list[_Value]:
+        """Returns the answers, including a second one if there are two motors. Raises ``_Silent``."""
+        answers: list[_Value] = []
         for _ in range(_ATTEMPTS):
             self._port.send(frames.EVERYBODY, question)
             until = time.monotonic() + _ANSWER_S
             while (left_s := until - time.monotonic()) > 0:
                 frame = self._port.receive(left_s)
-                if frame is not None and (answer := told(frame)) is not None:
+                if frame is not None and (answer := decode(frame)) is not None:
                     answers.append(answer)
                     until = min(until, time.monotonic() + _WHOLE_SECOND_ANSWER_S)
             if answers:
@@ -101,5 +101,5 @@ class DamiaoBench(CanBench):
         raise _Silent
 
 
-def _alike(meant: float, told: float) -> bool:
-    return isclose(meant, told, rel_tol=1e-3)
+def _alike(meant: float, reported: float) -> bool:
+    return isclose(meant, reported, rel_tol=1e-3)
