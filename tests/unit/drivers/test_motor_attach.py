@@ -66,7 +66,7 @@ def test_an_odrive_is_refused_for_what_the_file_says(odrives: MotorRig, change: 
         (('model = "DM4310"', 'model = "DM4310"\nserial_number = 7'), "no serial number here"),
         (("id = 2", "id = 16"), "1 to 15"),
         (("max_rad = 1.0", "max_rad = 12.4"), "farther from its zero"),
-        (("max_speed_rad_s = 2.0", "max_speed_rad_s = 31.0"), "the most a DM4310 tells"),
+        (("max_speed_rad_s = 2.0", "max_speed_rad_s = 31.0"), "the most a DM4310 reports"),
         (("watchdog_s = 0.4", "watchdog_s = 0.4\nbitrate = 10000"), "at most"),
     ],
 )

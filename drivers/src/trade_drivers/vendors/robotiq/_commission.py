@@ -1,4 +1,4 @@
-"""Finding 2F-85 grippers on a line; their ids and rates are set by the vendor's tool alone."""
+"""Scanning a line for 2F-85 grippers, whose ids and rates only the vendor's tool can set."""
 
 from typing import TYPE_CHECKING, NoReturn
 
@@ -29,7 +29,7 @@ class RobotiqCommissioner(Commissioner):
 
 
 class RobotiqBench(Bench):
-    """An open line of them."""
+    """An open line of 2F-85 grippers."""
 
     def __init__(self, wire: "Wire", port: str, baud: int) -> None:
         self._wire, self._port, self._baud = wire, port, baud
@@ -41,7 +41,7 @@ class RobotiqBench(Bench):
         try:
             status = table.Status.decode(self._wire.read(device_id), 0)
         except NoAnswer:
-            self._wire.settled_at = 0.0  # an answer that comes now is not taken for that of the next id
+            self._wire.settled_at = 0.0  # a late answer must not be taken for that of the next id
             return None
         except Refused:
             return self._found(device_id, "", "it is a Modbus device, but no 2F-85")
@@ -62,7 +62,7 @@ class RobotiqBench(Bench):
         self._cannot(device_id, "the baud rate of a 2F-85 is set by the vendor's tool alone (Robotiq User Interface)")
 
     def seal(self, device_id: int) -> None:
-        """Nothing was opened."""
+        """Does nothing, as this bench unlocks no registers."""
 
     def _cannot(self, device_id: int, problem: str) -> NoReturn:
         raise ConfigurationError(where=f"{self._port}, id {device_id}", problem=problem)

@@ -20,11 +20,11 @@ __all__ = ["Exchange"]
 
 _log = logging.getLogger("trade")
 _TAKEN_NS: Final = 15_000_000
-"""So long after a write the status may still be that of before: the device takes it over 200 times a second."""
+"""The time after a write in which the status may be outdated, as the device updates it 200 times a second."""
 
 
 class Exchange(BusCycle[Hand]):
-    """What happens on one bus of grippers. ``stop`` is for any thread, too."""
+    """The exchange with the grippers of one bus. Any thread may also call ``stop``."""
 
     def __init__(
         self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] = time.monotonic_ns
@@ -37,15 +37,15 @@ class Exchange(BusCycle[Hand]):
     # --- from any thread
 
     def stop(self, hands: Sequence[Hand], reason: str = "", *, grip: bool = False) -> StopTicket[Hand]:
-        """Void what was admitted for these grippers, and have them stand before anything else happens on the bus.
+        """Voids all permits for these grippers, and stops their fingers before anything else happens on the bus.
 
-        With ``grip``, those at rest are left as they are, pressing on what they hold.
+        With ``grip``, grippers at rest are left as they are, pressing on what they hold.
         """
         reason = reason or self.why(hands)
         return self.order_stop(hands, reason, lambda: self._halt(hands, reason, grip=grip))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so
-        """Stop what moves; what is held stays held."""
+        """Stops moving grippers; held objects stay held."""
         self.stop(self.hands, "its driver is leaving", grip=True).wait(alive)
 
     # --- from the bus thread
@@ -59,16 +59,16 @@ class Exchange(BusCycle[Hand]):
         self._watch()
 
     def halt_all(self, reason: str) -> None:
-        """End every motion; what is held stays held."""
+        """Ends all motions; held objects stay held."""
         self._halt(self.hands, reason, grip=True)
 
     def end_motion(self, hand: Hand, reason: str) -> None:
-        """End the motion of a gripper that is about to be reset."""
+        """Ends the motion of a gripper before its reset."""
         if hand.motion is not None:
             self._forget(hand.motion, MotionStopped(device=hand.name, reason=reason))
 
     def take_over(self, motion: Motion) -> None:
-        """A motion's bytes are about to leave: the one it replaces has ended."""
+        """Ends the previous motion immediately before the bytes of its replacement are sent."""
         hand = motion.hand
         if hand.motion not in {None, motion}:
             self.end_motion(hand, "another move took over")
@@ -76,7 +76,7 @@ class Exchange(BusCycle[Hand]):
         hand.tell_moving()
 
     def release(self, motion: Motion, error: TradeError | None) -> None:
-        """A motion has ended: well, or with an error and its fingers stopped."""
+        """Completes a motion: successfully, or with an error and stopped fingers."""
         try:
             if error is not None and motion.hand.motion is motion:
                 self._stand(motion.hand)
@@ -93,24 +93,24 @@ class Exchange(BusCycle[Hand]):
             hand.halting_since_ns = 0
 
     def admit(self, hand: Hand) -> None:
-        """Take a gripper on that was looked over, or is back: found moving and owned by nobody, it is stopped."""
+        """Accepts a checked gripper, and stops a motion that no client owns."""
         if hand.sample is not None and hand.sample.under_way and hand.motion is None:
             self._stand(hand)
 
     # --- exchanges
 
     def read(self, hand: Hand) -> None:
-        """Measure; raises ``NoAnswer``."""
-        asked_ns = self.clock()  # not when it came: a frozen process would take old values for new
+        """Measures; raises ``NoAnswer``."""
+        asked_ns = self.clock()  # not the arrival, as a frozen process would take old values for new
         self._exchanged(hand, lambda: hand.take(self.wire.read(hand.id), asked_ns))
 
     def write(self, hand: Hand, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> None:
-        """Write, and measure in the same exchange; raises ``NoAnswer``."""
+        """Writes and measures in one exchange; raises ``NoAnswer``."""
         asked_ns = self.clock()
         self._exchanged(hand, lambda: hand.take(self.wire.write(hand.id, values, gate, wait=wait), asked_ns))
 
     def probe(self, hand: Hand) -> None:
-        """Whether it answers, and nothing late is on its way; raises ``NoAnswer``."""
+        """Checks that it answers and that no late answer is pending; raises ``NoAnswer``."""
         self._exchanged(hand, lambda: self.wire.probe(hand.id))
         hand.doubted = False
 
@@ -157,7 +157,7 @@ class Exchange(BusCycle[Hand]):
         told = sample is not None and (sample.activating or (sample.going and sample.activated))
         seen = sample is not None and sample.at_ns > hand.held_ns + _TAKEN_NS
         if told and seen and now_ns - hand.halting_since_ns <= HALT_NS:
-            self._stand(hand)  # the stop was not heard
+            self._stand(hand)  # the stop was not received
 
     def _halt(self, hands: Iterable[Hand], reason: str, *, grip: bool) -> None:
         for hand in hands:
@@ -170,7 +170,7 @@ class Exchange(BusCycle[Hand]):
                 self.end_motion(hand, reason)
 
     def _stand(self, hand: Hand) -> None:
-        """Write the stop, and watch until it is at rest; whether it was heard is seen later."""
+        """Writes the stop, and watches until it is at rest; later measurements show whether it was received."""
         values = hand.halt_registers()
         now_ns = self.clock()
         hand.still, hand.held_ns = 0, now_ns

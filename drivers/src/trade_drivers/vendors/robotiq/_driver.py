@@ -1,4 +1,4 @@
-"""Bringing a bus with grippers up, and handing them out."""
+"""The driver of a bus of grippers."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
@@ -27,14 +27,14 @@ _BITS_A_READ: Final = (8 + 11) * 10 + 35
 """Request, answer, and the gap of three and a half characters before it."""
 
 _MEANINGLESS: Final = {
-    "watchdog_s": "a 2F-85 has no watchdog: left alone, it ends the move it was told; leave this key out",
+    "watchdog_s": "a 2F-85 has no watchdog: left alone, it completes its last move; leave this key out",
     "fast_sync": "a 2F-85 has no joined answers: each is read by itself; leave this key out",
 }
-"""Keys of a serial bus that no gripper keeps, and why."""
+"""Keys of a serial bus that grippers do not support, and why."""
 
 
 class AttachedGrippers(ThreadedBus[Exchange]):
-    """A bus with its grippers, and the thread that owns it."""
+    """A bus with its grippers and its owner thread."""
 
     def __init__(self, thread: BusThread[Exchange]) -> None:
         super().__init__(thread)
@@ -55,7 +55,7 @@ class RobotiqDriver(Driver):
 
     modules = ("pymodbus", "serial")
     devices = (robotfile.Gripper,)
-    without_watchdog = "no watchdog: without its driver it ends the stroke it was told"
+    without_watchdog = "no watchdog: without its driver it completes its last stroke"
     commissioner = RobotiqCommissioner
 
     def check(self, robot: Robot, bus: Bus) -> None:
@@ -75,10 +75,10 @@ def _serial(robot: Robot, bus: Bus) -> SerialBus:
 
 
 def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
-    """Open the port and look every gripper over, without a thread: ``cycle()`` is the caller's to call.
+    """Opens the port and checks each gripper without a thread; the caller must call ``cycle()``.
 
     Raises:
-        ConfigurationError: the port cannot be had, or a gripper is absent, another device, or set wrongly.
+        ConfigurationError: the port cannot be opened, or a gripper is absent, another device, or set wrongly.
     """
     _check(robot, bus)
     hands = [Hand(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
@@ -95,7 +95,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
 
 
 def _check(robot: Robot, bus: SerialBus) -> None:
-    """What the file alone can tell: models, limits, and whether the bytes of a cycle fit into it."""
+    """Checks the robot file: models, limits, and whether a cycle is long enough for its bytes."""
     where, grippers = f"{robot.where}: bus.{bus.name}", robot.grippers_on(bus.name)
     for gripper in grippers:
         key = f'{robot.where}: gripper."{gripper.name}"'
@@ -128,13 +128,13 @@ def _check(robot: Robot, bus: SerialBus) -> None:
 
 
 def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> None:
-    """Take a gripper's first measurements; nothing is written."""
+    """Takes a gripper's first measurements; writes nothing."""
     key = f'{where}: gripper."{hand.gripper.name}"'
     for _ in range(_ATTEMPTS):
         try:
             exchange.probe(hand)
             exchange.read(hand)
-            exchange.read(hand)  # whether it moves shows in two
+            exchange.read(hand)  # two measurements show motion
         except NoAnswer:
             continue
         except Refused as refused:
@@ -151,7 +151,7 @@ def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> No
 
 
 def wire_at(port: str, baud: int, where: str) -> "Wire":
-    """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
+    """Returns a closed line. Raises ``ConfigurationError`` without the vendor library."""
     try:
         from trade_drivers.vendors.robotiq._wire import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:

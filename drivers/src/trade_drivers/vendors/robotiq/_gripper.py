@@ -1,4 +1,4 @@
-"""A 2F-85 as a Gripper: it checks, hands over to the bus thread, waits, and never touches the port."""
+"""A 2F-85 as a Gripper. It checks arguments, queues a job for the bus thread, and waits for it."""
 
 from trade import Resource
 from trade.errors import DeviceSilent

@@ -1,4 +1,4 @@
-"""One gripper as the bus thread knows it: what was read last, how it is, what is under way."""
+"""The state of one gripper on the bus thread: its measurement, its faults and its motion."""
 
 import time
 from typing import TYPE_CHECKING, Final, Literal
@@ -31,16 +31,16 @@ class Hand(BusDevice[Status]):
         self.id = gripper.id
         self.model = table.BY_MODEL_NAME[gripper.model]
         self.force_counts = 0
-        """The force it was last told."""
+        """The last commanded force."""
         self.fault = ""
-        """Why it refuses to move, reported by the gripper or found by this driver: kept until somebody clears it."""
+        """Why it refuses to move, from the gripper or from this driver; latched until a client clears it."""
         self.motion: Motion | None = None
         self._holding: Literal["", "outside", "inside"] = ""
         self._held_at = 0
         self._speed_m_s = 0.0
 
     def take(self, registers: list[int], at_ns: int) -> Status:
-        """Note a measurement that was asked for at this time."""
+        """Stores a measurement that was requested at this time."""
         before, now = self.sample, Status.decode(registers, at_ns)
         unmoved = before is not None and before.position == now.position
         self.still = self.still + 1 if unmoved and not now.under_way else 0
@@ -61,20 +61,20 @@ class Hand(BusDevice[Status]):
             self._holding = ""
 
     def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
-        """Seen at rest, now, with nothing of ours under way; it may be pressing on something."""
+        """Returns whether it is measured at rest without a commanded motion; it may be pressing on an object."""
         known = self.sample is not None and not self.doubted and not self.silent
         return known and self.motion is None and self.still > 0 and self.age_ns(now_ns) <= stale_after_ns
 
     def standing(self, now_ns: int, stale_after_ns: int) -> bool:
-        """At rest, and not told to go anywhere either."""
+        """Returns whether it is at rest and has no goal."""
         told = self.sample is not None and self.sample.going and self.sample.activated
         return self.at_rest(now_ns, stale_after_ns) and not told
 
     def halt_registers(self) -> tuple[int, int, int]:
-        """What stops it.
+        """Returns the command that stops it.
 
-        Without its activation it stands, whatever state it is in. It keeps it where that is sure to be there: to write
-        it to a gripper that has lost it would move the fingers.
+        Without activation, a gripper stops in each state. The command keeps the activation only if it is certain, as
+        writing it to a gripper that has lost it would move the fingers.
         """
         sample = self.sample
         if sample is None or self.doubted or self.silent or not sample.activated:
@@ -82,17 +82,17 @@ class Hand(BusDevice[Status]):
         return table.command(sample.echo, 0, self.force_counts, go=False)
 
     def tell_moving(self) -> None:
-        """Let the resource know whether it moves: as last measured or commanded."""
+        """Sets ``resource.moving`` from the last measurement or command."""
         under_way = self.motion is not None or self.halting_since_ns > 0
         if under_way or not (self.silent or self.doubted):
             self.resource.moving = under_way or self.still == 0
 
     def check_usable(self, now_ns: int, stale_after_ns: int) -> Status:
-        """The newest measurement, if the fingers may be commanded.
+        """Returns the newest measurement if the fingers may be commanded.
 
         Raises:
-            DeviceSilent: it does not answer.
-            DeviceFault: it has a fault, or is not activated.
+            DeviceSilent: the gripper does not answer.
+            DeviceFault: the gripper has a fault, or is not activated.
         """
         sample = self.fresh(now_ns, stale_after_ns)
         if self.fault:
@@ -102,7 +102,7 @@ class Hand(BusDevice[Status]):
         return sample
 
     def inactive(self, fault: str = _NOT_ACTIVATED) -> DeviceFault:
-        """The error of a gripper without activation."""
+        """Returns the error for a gripper without activation."""
         remedy = "call activate(): it moves the fingers all the way, and what they hold falls"
         return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
@@ -110,10 +110,10 @@ class Hand(BusDevice[Status]):
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=_REMEDY)
 
     def state(self, now_ns: int, stale_after_ns: int) -> GripperState:
-        """What was last measured.
+        """Returns the newest measurement.
 
         Raises:
-            DeviceSilent: it is too old.
+            DeviceSilent: the measurement is too old.
         """
         sample = self.fresh(now_ns, stale_after_ns)
         age_s = (now_ns - sample.at_ns) / 1e9

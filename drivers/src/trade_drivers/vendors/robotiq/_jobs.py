@@ -1,4 +1,4 @@
-"""What services ask of the bus thread: activation, moves, stops, and the clearing of faults."""
+"""Jobs of services for the bus thread: activation, moves, stops, and clearing faults."""
 
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final
@@ -33,11 +33,11 @@ class GripperCommand(Command[Hand, "Exchange"]):
         return self.devices[0]
 
     def tell(self, values: Sequence[int], *, out: Gate | None = None) -> Steps:
-        """Write the command registers, within the retry budget.
+        """Writes the command registers, within the retry budget.
 
         Args:
-            values: the three of them.
-            out: called when the first bytes are about to leave.
+            values: the values of the three registers.
+            out: called immediately before the first bytes are sent.
         """
 
         def gate() -> None:
@@ -48,12 +48,12 @@ class GripperCommand(Command[Hand, "Exchange"]):
         yield from _try(self, lambda: self.exchange.write(self.hand, values, gate))
 
     def look(self) -> Generator[None, None, Status]:
-        """Read how the gripper is, now."""
+        """Reads the gripper's state now."""
         yield from _try(self, lambda: self.exchange.read(self.hand))
         return self.hand.fresh(self.exchange.clock(), self.exchange.stale_after_ns)
 
     def resetting(self) -> Steps:
-        """Take the activation away, and its faults with it; nothing moves."""
+        """Clears the activation and the faults; nothing moves."""
         exchange, hand = self.exchange, self.hand
         self.gate()
         exchange.end_motion(hand, f"{self.service} was called")
@@ -66,7 +66,7 @@ class GripperCommand(Command[Hand, "Exchange"]):
 
 
 class ClearFault(GripperCommand):
-    """Reset the device: nothing moves."""
+    """Resets the device; nothing moves."""
 
     def steps(self) -> Steps:
         _require_answering(self)
@@ -74,7 +74,7 @@ class ClearFault(GripperCommand):
 
 
 class Motion(GripperCommand):
-    """What sets the fingers moving, and is watched until something ends it."""
+    """A command that moves the fingers, and is watched until it ends."""
 
     def __init__(self, exchange: "Exchange", hands: Sequence[Hand], terms: Terms) -> None:
         super().__init__(exchange, hands, terms)
@@ -84,7 +84,7 @@ class Motion(GripperCommand):
         self._patience_s = 0.0
 
     def launching(self, values: Sequence[int], patience_s: float) -> Steps:
-        """Write what sets the fingers moving; from the first byte on somebody looks after them."""
+        """Writes the command that moves the fingers, and starts to watch them with its first byte."""
         try:
             yield from self.tell(values, out=lambda: self.exchange.take_over(self))
         except TradeError as problem:
@@ -95,10 +95,10 @@ class Motion(GripperCommand):
         self._began_ns = self._watched_ns = self.exchange.clock()
 
     def done_stepping(self) -> None:
-        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+        """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
 
     def watch(self, now_ns: int) -> None:
-        """Look at the newest measurement; end it if it is over or must not go on."""
+        """Checks the newest measurement, and ends the motion if it is over or must not continue."""
         if not self._began_ns:
             return
         ending = self._trouble(now_ns)
@@ -112,11 +112,11 @@ class Motion(GripperCommand):
             self.exchange.release(self, ending)
 
     def arrived(self, sample: Status) -> bool:
-        """Whether it is over."""
+        """Returns whether it is over."""
         raise NotImplementedError
 
     def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
-        """What keeps it from coming to an end."""
+        """Returns the error that prevents its end."""
         elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
         self._watched_ns = now_ns
         self._waiting_s = self._waiting_s + elapsed_s if sample.position == self._position else 0.0
@@ -139,7 +139,7 @@ class Motion(GripperCommand):
 
 
 class Activate(Motion):
-    """The fingers find their stops."""
+    """Moves the fingers to find their end stops."""
 
     def steps(self) -> Steps:
         _require_answering(self)
@@ -164,7 +164,7 @@ class Activate(Motion):
 
 
 class Move(Motion):
-    """The fingers go to a width, or until they meet something."""
+    """Moves the fingers to a width, or until they meet an object."""
 
     def __init__(
         self, exchange: "Exchange", hands: Sequence[Hand], registers: tuple[int, int, int], terms: Terms
@@ -185,7 +185,7 @@ class Move(Motion):
         return taken and sample.contact != Contact.MOVING and self.hand.still > 0 and not self._elsewhere(sample)
 
     def _elsewhere(self, sample: Status) -> bool:
-        """It says that it is where it should be, and it is not."""
+        """Returns whether it reports its goal as reached although it is elsewhere."""
         short = abs(sample.position - self.hand.model.expected(self._goal))
         return sample.contact == Contact.ARRIVED and short > _NEAR_COUNTS
 
@@ -203,7 +203,7 @@ def _require_answering(job: GripperCommand) -> None:
 
 
 def _try(job: GripperCommand, act: Callable[[], None]) -> Steps:
-    """One exchange within the retry budget; a probe before each retry keeps late answers from being taken for new."""
+    """Runs one exchange within the retry budget; a probe before each retry discards late answers."""
     waited_s = 0.0
     for attempt in range(_ATTEMPTS):
         try:
@@ -212,7 +212,7 @@ def _try(job: GripperCommand, act: Callable[[], None]) -> Steps:
                 yield
             act()
         except DeadlineExceeded as late:
-            if attempt:  # it went out before, and nobody heard what became of it
+            if attempt:  # an earlier attempt was sent, and its outcome is unknown
                 raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
             raise
         except NoAnswer as silent:

@@ -1,4 +1,4 @@
-"""Registers of the 2F-85 as data, and what its counts mean in SI units.
+"""Registers of the 2F-85 as data, with their conversion to SI units.
 
 Sources: Robotiq "2F-85 & 2F-140 Instruction Manual", chapter 4 (registers, faults); product sheet (stroke,
 speed, force).
@@ -17,7 +17,7 @@ STATUS: Final = 0x07D0
 COUNT: Final = 3
 
 BAUDS: Final = (9_600, 19_200, 38_400, 57_600, 115_200)
-"""Rates it can be set to by the vendor's tool."""
+"""Baud rates that the vendor's tool can set."""
 
 _ACTIVATE: Final = 0x01
 _GO: Final = 0x08
@@ -27,14 +27,14 @@ _ACTIVE: Final = 3
 _UNUSED: Final = 2
 
 RESET: Final = (0, 0, 0)
-"""Clears faults, stops everything, and takes the activation away."""
+"""Clears faults and activation, and stops everything."""
 ACTIVATE: Final = (_ACTIVATE << 8, 0, 0)
-"""Right after a reset: the fingers move all the way. Later: they stand."""
+"""Directly after a reset, the fingers move through their whole range; later, they stop."""
 
 AMPERE_PER_COUNT: Final = 0.01
 
 _PASSING: Final = frozenset({0x00, 0x05, 0x07, 0x09})
-"""No faults of the gripper: waits for its activation, or was not asked anything for a second."""
+"""Codes that are not faults: waiting for activation, or no request for a second."""
 _FAULTS: Final = {
     0x08: "it is too hot; let it cool down",
     0x0A: "its supply voltage is too low",
@@ -47,7 +47,7 @@ _FAULTS: Final = {
 
 
 class Contact:
-    """What gOBJ says while the fingers are told to go."""
+    """Values of gOBJ while the fingers have a goal."""
 
     MOVING: Final = 0
     OPENING: Final = 1
@@ -56,13 +56,13 @@ class Contact:
 
 
 class Model(Struct, frozen=True):
-    """What differs between grippers of this kind."""
+    """The properties in which such grippers differ."""
 
     name: str
     stroke_m: float
     open_counts: int
     closed_counts: int
-    """What it reads where its fingers meet their stops; a gripper differs from the next by a count or two."""
+    """Positions at the end stops; grippers differ by a count or two."""
     speeds_m_s: tuple[float, float]
     forces_n: tuple[float, float]
     """At requests of 0 and of 255."""
@@ -73,24 +73,24 @@ class Model(Struct, frozen=True):
         return self.stroke_m / (self.closed_counts - self.open_counts)
 
     def width_m(self, counts: float) -> float:
-        """Between the fingers, 0 to the stroke."""
+        """Returns the distance between the fingers, 0 to the stroke."""
         return min(self.stroke_m, max(0.0, (self.closed_counts - counts) * self.m_per_count))
 
     def counts(self, width_m: float) -> int:
-        """The position to ask for. At its ends the whole range is asked for, which takes the fingers to their stops."""
+        """Returns the position to request; the full range at its ends, which moves the fingers to their stops."""
         counts = round(self.closed_counts - width_m / self.m_per_count)
         return 0 if counts <= self.open_counts else 255 if counts >= self.closed_counts else counts
 
     def expected(self, request: int) -> int:
-        """Where the fingers are when a request is fulfilled."""
+        """Returns the position of the fingers after a request."""
         return min(self.closed_counts, max(self.open_counts, request))
 
     def speed_counts(self, speed_m_s: float) -> int:
-        """The speed to ask for: not faster than this."""
+        """Returns the speed to request, rounded down."""
         return _scaled(speed_m_s, self.speeds_m_s)
 
     def force_counts(self, force_n: float) -> int:
-        """The force to ask for: not more than this."""
+        """Returns the force to request, rounded down."""
         return _scaled(force_n, self.forces_n)
 
 
@@ -104,28 +104,28 @@ BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
 
 
 class Status(Struct, frozen=True, gc=False):
-    """The three status registers, taken apart."""
+    """The decoded status registers."""
 
     activating: bool
     activated: bool
     going: bool
-    """It is told to go to its goal, or to go on pressing there."""
+    """True if it has a goal: it moves there, or keeps pressing there."""
     contact: int
-    """See ``Contact``; means nothing unless it is going."""
+    """See ``Contact``; only valid with a goal."""
     fault: int
     echo: int
-    """The position request this status belongs to."""
+    """The position request that this status answers."""
     position: int
     current: int
     reset: bool
-    """Neither activated nor about to be."""
+    """True if it is neither activated nor activating."""
     plausible: bool
-    """What a 2F-85 never sends is not in it."""
+    """Returns False for values that a 2F-85 never sends."""
     at_ns: int
 
     @classmethod
     def decode(cls, registers: list[int], at_ns: int) -> "Status":
-        """Out of the registers."""
+        """Decodes the registers."""
         first, second, third = registers
         bits, state = first >> 8, first >> 12 & 3
         asked = bool(bits & _ACTIVATE)
@@ -145,15 +145,15 @@ class Status(Struct, frozen=True, gc=False):
 
     @property
     def under_way(self) -> bool:
-        """By its own account the fingers move."""
+        """Returns whether it reports motion."""
         return self.activating or (self.activated and self.going and self.contact == Contact.MOVING)
 
 
 def command(position: int, speed: int, force: int, *, go: bool = True) -> tuple[int, int, int]:
-    """What to write to an activated gripper; without ``go`` its fingers stand where they are."""
+    """Returns the registers for an activated gripper; without ``go``, its fingers stop."""
     return (_ACTIVATE | (_GO if go else 0)) << 8, position, speed << 8 | force
 
 
 def fault_text(fault: int) -> str:
-    """What a fault number means; empty if it is no fault of the gripper."""
+    """Returns the text of a fault code; empty if it is not a fault."""
     return "" if fault in _PASSING else _FAULTS.get(fault, f"fault {fault:#04x}, which the manual does not know")

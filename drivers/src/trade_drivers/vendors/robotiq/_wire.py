@@ -1,7 +1,7 @@
-"""The only place that touches pymodbus: its synchronous client on a port that sleeps while it waits.
+"""The only module that uses pymodbus: its synchronous client on a port that sleeps while it waits.
 
-The library polls, waits the full time for what came damaged, and takes a late answer for that of the next question.
-Mended by overriding how it sends and receives; what it sends, and what it makes of an answer, is its own.
+The library polls, waits the full timeout after damaged answers, and takes late answers for those of the next request.
+Overrides of its sending and receiving fix that; the encoding and decoding are the library's own.
 """
 
 import errno
@@ -24,20 +24,20 @@ __all__ = ["Wire"]
 _READ_WRITE: Final = 23
 _EXCEPTION: Final = 0x80
 _OVERHEAD: Final = 5
-"""Bytes of an answer beyond its registers."""
+"""Bytes of an answer in addition to its registers."""
 _EXCEPTION_SIZE: Final = 5
 _CLEAN_S: Final = 1.0
 _LONGEST_DRAIN_S: Final = 0.120
-"""Silence from the third failure in a row on."""
+"""The pause from the third consecutive failure."""
 _OFTEN: Final = 2
 _PROBES: Final = ((3, 1), (4, 1), (3, 2), (4, 2))
-"""Function and number of registers: a late answer to one of them is no answer to the next."""
+"""Functions and register counts, alternating so that a late answer does not match the next request."""
 
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it reports every time-out as an error; ours are counted
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it reports each timeout as an error; this driver counts them
 
 
 class _QuietClient(ModbusSerialClient):
-    """The library's client on our line; it sleeps until the answer to its question has come."""
+    """The library's client on our line; it sleeps until the answer arrives."""
 
     def __init__(self, line: SerialLine, path: str, baud: int) -> None:
         super().__init__(path, baudrate=baud, timeout=LONGEST_WAIT_S, retries=0)
@@ -46,11 +46,11 @@ class _QuietClient(ModbusSerialClient):
         self._size = 0
 
     def connect(self) -> bool:
-        """The line is opened and closed by its owner."""
+        """Does nothing, as the owner opens and closes the line."""
         return self._line.is_open
 
     def expect(self, device_id: int, function: int, registers: int) -> None:
-        """What the answer to the next request looks like; anything else that comes is not it."""
+        """Sets the form of the next answer; anything else is ignored."""
         self._head = bytes((device_id, function, 2 * registers))
         self._size = _OVERHEAD + 2 * registers
 
@@ -63,7 +63,7 @@ class _QuietClient(ModbusSerialClient):
         return sent
 
     def recv(self, size: int | None) -> bytes:  # noqa: ARG002
-        """The answer, freed of all that is not it; empty if it does not come in time."""
+        """Returns the answer without other bytes; empty if it does not arrive in time."""
         while (frame := self._take()) is None:
             if not self._line.more():
                 return b""
@@ -83,7 +83,7 @@ class _QuietClient(ModbusSerialClient):
 
 
 class Wire(SerialWire):
-    """One serial port and the requests on it. All but a stop may wait until the line is settled."""
+    """One serial port and the requests on it. All requests but stops may wait until the line is settled."""
 
     def __init__(self, path: str, baud: int, where: str = "bus") -> None:
         super().__init__(path, baud, where)
@@ -93,26 +93,26 @@ class Wire(SerialWire):
         self._failures = 0
 
     def read(self, device_id: int) -> list[int]:
-        """The status registers. For a second after a failure, by the other function that reads them."""
+        """Reads the status registers; for a second after a failure, with the other function for that."""
         self._settle()
         recently = time.monotonic() - self._failed_at < _CLEAN_S
         function = 3 if recently and self._failures % 2 else 4
         return self._ask(device_id, function, table.COUNT, lambda: self._reading(device_id, function, table.COUNT))
 
     def probe(self, device_id: int) -> None:
-        """Hear from a device in a way that no late answer to an earlier question can be taken for."""
+        """Sends a request whose answer differs from all late answers to earlier requests."""
         self._settle()
         function, count = _PROBES[self._failures % len(_PROBES)]
         self._ask(device_id, function, count, lambda: self._reading(device_id, function, count))
 
     def write(self, device_id: int, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> list[int]:
-        """Write the command registers and read the status registers, in one exchange (function 23).
+        """Writes the command registers and reads the status registers in one exchange (function 23).
 
         Args:
-            device_id: whose.
-            values: three registers.
-            gate: asked right before the bytes go out.
-            wait: False for a stop: it does not keep silent after a failure.
+            device_id: of the gripper.
+            values: of the three registers.
+            gate: called immediately before the bytes are sent.
+            wait: False for a stop, which does not pause after a failure.
         """
         if wait:
             self._settle()

@@ -1,4 +1,4 @@
-"""Network cameras that hand out their newest picture over HTTP: the driver ``snapshot``."""
+"""Network cameras that serve their newest picture over HTTP: the driver ``snapshot``."""
 
 from trade_drivers.vendors.snapshot._driver import SnapshotDriver
 

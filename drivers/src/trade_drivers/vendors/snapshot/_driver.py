@@ -1,4 +1,4 @@
-"""The driver of network cameras that hand out pictures, and the camera itself."""
+"""The driver of network cameras with pictures over HTTP, and the camera itself."""
 
 import socket
 import time
@@ -21,15 +21,15 @@ _REMEDY: Final = "ask again, or look at the camera's own page"
 
 
 class Options(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the robot file says of such a camera."""
+    """The options of such a camera in the robot file."""
 
     url: str
-    """Where its newest picture is: ``http://192.168.0.20/snapshot.jpg``."""
+    """URL of the newest picture: ``http://192.168.0.20/snapshot.jpg``."""
     width_px: Annotated[int, Meta(ge=1)] | None = None
-    """How wide its pictures must be; whatever they are by default."""
+    """Required width of its pictures; any width by default."""
     height_px: Annotated[int, Meta(ge=1)] | None = None
     timeout_s: Annotated[float, Meta(gt=0, le=10)] = 1.0
-    """How long a picture may take."""
+    """Timeout of a picture."""
 
 
 class SnapshotDriver(SenseDriver):
@@ -62,24 +62,24 @@ class SnapshotDriver(SenseDriver):
 
 
 class SnapshotCamera(Camera):
-    """One such camera. It keeps nothing open between pictures, so there is nothing to lose."""
+    """One such camera. It keeps no connection between pictures."""
 
     def __init__(self, name: str, url: str, place: Place, shown: Picture, timeout_s: float) -> None:
         self._name, self._url, self._place, self._timeout_s = name, url, place, timeout_s
         self._shown = shown
 
     def image(self) -> Image:
-        """Ask for a picture. The camera does not tell when it was captured: its time is that of the question.
+        """Requests a picture. As the camera does not report the time of capture, its time is that of the request.
 
         Raises:
-            DeviceSilent: no picture came in time.
-            DeviceFault: an HTTP error, no picture, or one of another size than when it was attached.
+            DeviceSilent: no picture arrived in time.
+            DeviceFault: an HTTP error, no picture, or one of another size than at attach.
         """
         asked_ns = time.monotonic_ns()
         shown, data = _look(self._place, self._name, self._url, self._patience_s())
         if shown != self._shown:
             fault = f"its pictures were {_text(self._shown)} when it was attached and are {_text(shown)} now"
-            raise DeviceFault(device=self._name, bus=self._url, fault=fault, remedy="attach it anew")
+            raise DeviceFault(device=self._name, bus=self._url, fault=fault, remedy="attach it again")
         return Image(
             name=self._name,
             data=data,
@@ -97,7 +97,7 @@ class SnapshotCamera(Camera):
         )
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing, as no connection is open."""
 
     def _patience_s(self) -> float:
         call = current_call()

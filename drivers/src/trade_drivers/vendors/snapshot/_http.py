@@ -1,4 +1,4 @@
-"""One question by HTTP/1.0 and its answer, within a time. `http.client` bounds each wait, but not their sum."""
+"""One HTTP/1.0 request with a total timeout; `http.client` limits each wait, but not their sum."""
 
 import socket
 import time
@@ -13,7 +13,7 @@ _END: Final = b"\r\n\r\n"
 
 
 class Place(NamedTuple):
-    """Where a picture is."""
+    """The address of a picture."""
 
     host: str
     port: int
@@ -21,7 +21,7 @@ class Place(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a server said."""
+    """The answer of a server."""
 
     status: int
     reason: str
@@ -29,7 +29,7 @@ class Answer(NamedTuple):
 
 
 def place_of(url: str) -> Place:
-    """The parts of an address; ValueError if it is none that can be asked."""
+    """Returns the parts of a URL; raises ValueError for an unsupported one."""
     parts = urlsplit(url)
     if parts.scheme != "http" or not parts.hostname or parts.username:
         raise ValueError(f"{url!r} is not like http://192.168.0.20/snapshot.jpg (no https, no user)")
@@ -40,11 +40,11 @@ def place_of(url: str) -> Place:
 
 
 def ask(place: Place, within_s: float) -> Answer:
-    """Ask for what is there.
+    """Sends a GET request and returns the answer.
 
     Raises:
-        OSError: nobody answers, or not all of it came in time.
-        ValueError: what came is no HTTP, or too much.
+        OSError: the server does not answer, or not completely in time.
+        ValueError: the answer is not HTTP, or too large.
     """
     deadline = time.monotonic() + within_s
     with socket.create_connection((place.host, place.port), within_s) as link:
@@ -63,10 +63,10 @@ def ask(place: Place, within_s: float) -> Answer:
 
 
 def parse_answer(got: bytes) -> Answer | None:
-    """The answer, if it says how long it is and all of that is there.
+    """Returns the answer if it states its length and is complete.
 
     Raises:
-        ValueError: it is no HTTP.
+        ValueError: the answer is not HTTP.
     """
     head, end, body = got.partition(_END)
     if not end:
@@ -76,7 +76,7 @@ def parse_answer(got: bytes) -> Answer | None:
 
 
 def _ended(got: bytes) -> Answer:
-    """What came until the server hung up; that is the end of an answer that does not say how long it is."""
+    """Returns an answer that the end of the connection completes, as it does not state its length."""
     head, end, body = got.partition(_END)
     if not end or _length(head) is not None:
         raise ConnectionResetError("it hung up in the middle of its answer")

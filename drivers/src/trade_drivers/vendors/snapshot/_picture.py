@@ -1,4 +1,4 @@
-"""What a PNG or JPEG file says of itself. Pure: bytes in, values out."""
+"""Format and size of PNG and JPEG files. Pure."""
 
 from typing import Final, Literal, NamedTuple
 
@@ -9,7 +9,7 @@ _PNG_END: Final = b"IEND\xaeB`\x82"
 _JPEG: Final = b"\xff\xd8\xff"
 _JPEG_END: Final = b"\xff\xd9"
 _JPEG_TRAIL: Final = 64
-"""Some cameras fill up behind the end."""
+"""Padding that some cameras append."""
 _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of a frame header (ITU T.81, table B.1); the three that are left out are other tables."""
 
@@ -23,10 +23,10 @@ class Picture(NamedTuple):
 
 
 def picture(data: bytes) -> Picture:
-    """Format and size of a whole picture.
+    """Returns format and size of a complete picture.
 
     Raises:
-        ValueError: it is neither PNG nor JPEG, or not all of it is there.
+        ValueError: it is neither PNG nor JPEG, or incomplete.
     """
     if data.startswith(_PNG) and data[12:16] == b"IHDR":
         if not data.endswith(_PNG_END):
@@ -40,7 +40,7 @@ def picture(data: bytes) -> Picture:
 
 
 def _jpeg(data: bytes) -> Picture:
-    """Go from segment to segment until the one that has the size."""
+    """Searches the segments for the one with the size."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
