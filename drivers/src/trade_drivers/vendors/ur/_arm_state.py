@@ -1,4 +1,4 @@
-"""One arm as the bus thread knows it: what was measured last, how it is, what is under way."""
+"""The state of one arm on the bus thread: its measurement, its safety state and its motion."""
 
 import time
 from typing import TYPE_CHECKING, Final
@@ -35,7 +35,7 @@ _SAFETY: Final[dict[int, Safety]] = {
 }
 _STILL_RAD_S: Final = 0.005
 _STILL: Final = 3
-"""Measurements in a row without motion: it is at rest."""
+"""Consecutive measurements without motion that mean rest."""
 
 
 class ArmStatus(BusDevice[Sample]):
@@ -48,29 +48,29 @@ class ArmStatus(BusDevice[Sample]):
         self.motion: Motion | None = None
 
     def take(self, sample: Sample) -> None:
-        """Note a measurement."""
+        """Stores a measurement."""
         self.still = self.still + 1 if max(abs(speed) for speed in sample.speeds) < _STILL_RAD_S else 0
         self.sample, self.silent = sample, False
 
     def tell_moving(self) -> None:
-        """Let the resource know whether it moves: as last measured or commanded."""
+        """Sets ``resource.moving`` from the last measurement or command."""
         self.resource.moving = self.motion is not None or self.halting_since_ns > 0 or self.still == 0
 
     def ended_since(self, since_ns: int) -> bool:
-        """A measurement made later shows that no program runs on the controller."""
+        """Returns whether a later measurement shows that no program runs on the controller."""
         sample = self.sample
         return sample is not None and sample.at_ns > since_ns and not sample.robot_status & _PROGRAM
 
     def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
-        """Seen at rest, now, with nothing of ours under way."""
+        """Returns whether it is measured at rest without a commanded motion."""
         return self.motion is None and self.still >= _STILL and self.age_ns(now_ns) <= stale_after_ns
 
     def check_usable(self, now_ns: int, stale_after_ns: int) -> Sample:
-        """The newest measurement, if the arm may be commanded.
+        """Returns the newest measurement if the arm may be commanded.
 
         Raises:
-            DeviceSilent: its controller sends nothing new.
-            DeviceFault: it is stopped, without power, or on its brakes.
+            DeviceSilent: the controller sends nothing new.
+            DeviceFault: the arm is stopped by its safety system, without power, or on its brakes.
         """
         sample = self.fresh(now_ns, stale_after_ns)
         if self.fault:
@@ -79,22 +79,22 @@ class ArmStatus(BusDevice[Sample]):
 
     @property
     def safety(self) -> Safety:
-        """What its safety system says."""
+        """Returns the state of its safety system."""
         return "fault" if self.sample is None else _SAFETY.get(self.sample.safety_mode, "fault")
 
     @property
     def enabled(self) -> bool:
-        """Its brakes are off."""
+        """Returns whether its brakes are released."""
         return self.sample is not None and self.sample.robot_mode == RUNNING
 
     @property
     def powered(self) -> bool:
-        """It has power."""
+        """Returns whether it has power."""
         return self.sample is not None and bool(self.sample.robot_status & _POWERED)
 
     @property
     def fault(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride] - nothing latches it
-        """Why it cannot be moved; empty if it can."""
+        """Returns why it cannot be moved; empty if it can."""
         if self.safety not in {"normal", "reduced"}:
             return f"its safety system says: {self.safety}"
         if not self.powered:
@@ -103,7 +103,7 @@ class ArmStatus(BusDevice[Sample]):
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """Returns the remedy for the fault."""
         if self.safety == "protective stop":
             return "remove the cause, then call unlock_protective_stop()"
         if self.safety not in {"normal", "reduced"}:
@@ -113,14 +113,14 @@ class ArmStatus(BusDevice[Sample]):
         return "try again, or look at the controller's log" if self.enabled else "call release_brakes()"
 
     def faulty(self, fault: str = "") -> DeviceFault:
-        """The error of an arm that does not do what it was told; by default for the reason it has."""
+        """Returns the error of an arm that does not follow a command; by default with its current fault."""
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=self.remedy)
 
     def state(self, now_ns: int, stale_after_ns: int, *, freedrive: bool) -> ArmState:
-        """What was last measured.
+        """Returns the newest measurement.
 
         Raises:
-            DeviceSilent: it is too old.
+            DeviceSilent: the measurement is too old.
         """
         sample = self.fresh(now_ns, stale_after_ns)
         age_s = (now_ns - sample.at_ns) / 1e9

@@ -1,4 +1,4 @@
-"""A child process as the driver sees it: started, spoken to, and killed when it is of no more use."""
+"""The driver's handle of a child process: start, messages, and end."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ _END_S: Final = 5.0
 
 
 class Child:
-    """One process that speaks to a controller through the vendor's library.
+    """One process that communicates with a controller through the vendor's library.
 
     Args:
         role: ``control`` or ``states``.
@@ -27,39 +27,39 @@ class Child:
                 [sys.executable, "-m", f"trade_drivers.vendors.ur._{role}_child", str(theirs.fileno()), host],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # the library's own words, from threads of its own
+                stdout=subprocess.DEVNULL,  # output of the library's own threads
                 stderr=subprocess.DEVNULL,
             )
         self._channel: Channel[Report] = Channel(ours, Report)
         self._numbers = 0
         self._answers: dict[int, Done] = {}
         self.ready = False
-        """It has said that it takes orders."""
+        """True after it has reported that it accepts orders."""
         self.problem = ""
-        """Why it ended, if it said so."""
+        """The reported reason of its end."""
         self.running = False
-        """As it last said: a move it began is under way."""
+        """True while it reports a running move."""
         self.pulses = 0
-        """How often it has said so."""
+        """Number of those reports."""
         self.samples: list[Sample] = []
-        """What it measured, since they were last taken."""
+        """Measurements that have not been taken yet."""
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Returns the process id."""
         return self._process.pid
 
     def number(self) -> int:
-        """For the next order that is to be answered."""
+        """Returns the number for the next order with an answer."""
         self._numbers += 1
         return self._numbers
 
     def send(self, order: Order) -> None:
-        """Tell it something; raises ``Gone``."""
+        """Sends it a message; raises ``Gone``."""
         self._channel.send(order)
 
     def listen(self) -> None:
-        """Take in what it has said; raises ``Gone``, with why if it said so."""
+        """Processes its messages; raises ``Gone``, with the reason if it reported one."""
         try:
             self._take_in()
         except Gone as gone:
@@ -81,18 +81,18 @@ class Child:
                     self.ready = True
 
     def answer(self, number: int) -> Done | None:
-        """What became of an order, once it is known."""
+        """Returns the outcome of an order, once it is known."""
         return self._answers.pop(number, None)
 
     def end(self, patience_s: float) -> None:
-        """Let it end by itself, which stops what it set moving; kill it if it does not."""
+        """Requests its end, which stops its motion; kills it if it does not end."""
         self._channel.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)
         self.kill()
 
     def kill(self) -> None:
-        """End it at once; more than once is fine."""
+        """Kills it. Idempotent."""
         self._process.kill()
         self._channel.close()
         self._process.wait(_END_S)

@@ -1,18 +1,18 @@
-"""How old a measurement is, although it says so by another clock. Arithmetic only."""
+"""Conversion of time stamps of another clock to ours. Arithmetic only."""
 
 from typing import Final
 
 __all__ = ["Age"]
 
 _DRIFT: Final = 0.001
-"""So much faster than ours the other clock may seem, before measurements seem to grow old by it."""
+"""The maximum rate difference of the clocks that does not make measurements appear older."""
 
 
 class Age:
-    """Tells by our clock when things were measured that carry a time of another one.
+    """Estimates the offset of another clock from the time stamps of its measurements.
 
-    What came with the least delay so far counts as measured when it came. A delay that lasts is forgotten at the pace
-    that the clocks may differ by: one of a second after a quarter of an hour.
+    The message with the least delay so far counts as measured on arrival. A lasting delay is forgotten at the maximum
+    rate difference of the clocks: one of a second after a quarter of an hour.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class Age:
         self._at_ns = 0
 
     def measured_ns(self, at_ns: int, theirs_ns: int) -> int:
-        """When something was measured that came at ``at_ns`` by our clock, and says ``theirs_ns``."""
+        """Returns when a message was measured by our clock: it arrived at ``at_ns``, stamped ``theirs_ns``."""
         delay_ns = at_ns - theirs_ns
         if self._least_ns is None:
             self._least_ns = delay_ns

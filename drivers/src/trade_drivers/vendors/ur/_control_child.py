@@ -1,7 +1,7 @@
 """The child process that commands: the only one that imports ``rtde_control``.
 
-The library holds the interpreter's lock while it waits, and takes a lost connection up again by itself. So this process
-ends when the connection, or whoever started it, is gone, and an alarm of the system ends it when it is stuck.
+The library holds the interpreter's lock while it waits, and restores a lost connection by itself. So this process ends
+when the connection or its parent process is gone, and a system alarm ends it when it is stuck.
 """
 
 import os
@@ -30,7 +30,7 @@ from trade_drivers.vendors.ur._messages import (
 )
 
 _QUIET_S: Final = 0.15
-"""So long without a word, whoever started it is held up: what it set moving stops."""
+"""The time without a message after which the driver counts as interrupted, and motion stops."""
 _IDLE_S: Final = 60.0
 _STUCK_S: Final = 1.0
 _TAKING_S: Final = 8.0
@@ -41,7 +41,7 @@ _END_RAD_S2: Final = 10.0
 
 
 class Child:
-    """Obeys until there is a reason to end."""
+    """Executes orders until there is a reason to end."""
 
     def __init__(self, host: str, channel: "Channel[Order]") -> None:
         import rtde_control  # noqa: PLC0415 - here and nowhere else  # pyright: ignore[reportMissingTypeStubs]
@@ -55,7 +55,7 @@ class Child:
         self._angles: list[float] = []
 
     def run(self) -> None:
-        """Until the driver is gone or silent, or the connection is lost."""
+        """Runs until the driver is gone or silent, or the connection is lost."""
         self._channel.send(Hello())
         while True:
             order = self._channel.receive(_IDLE_S if self._robot is None else _QUIET_S)
@@ -72,7 +72,7 @@ class Child:
                 signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def halt(self) -> None:
-        """End what moves, and the script with it."""
+        """Ends the motion and the script."""
         if self._robot is not None and self._robot.isConnected():
             if self._streaming:
                 self._robot.servoStop(_END_RAD_S2)
@@ -99,7 +99,7 @@ class Child:
         self._channel.send(Pulse(running))
 
     def _carry_out(self, order: Order) -> str:
-        """Do it; what went wrong, or nothing."""
+        """Executes an order; returns the problem, or an empty text."""
         if isinstance(order, Take):
             return self._take(order)
         if self._robot is None:
@@ -152,7 +152,7 @@ class Child:
 
 
 def main() -> None:
-    """Serve the socket whose number is the first argument, for the controller at the second."""
+    """Serves the socket whose number is the first argument, for the controller at the second."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     child = Child(sys.argv[2], Channel(socket.socket(fileno=int(sys.argv[1])), Order))
@@ -160,7 +160,7 @@ def main() -> None:
         child.run()
     signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
     child.halt()
-    os._exit(0)  # the library's own way out takes half a second, and may reconnect
+    os._exit(0)  # the library's own shutdown takes half a second, and may reconnect
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What happens between the driver and one controller, cycle by cycle: stops, measurements, work, the watchdog."""
+"""The cyclic exchange with one controller: stops, measurements, work, the watchdog."""
 
 import logging
 import threading
@@ -24,44 +24,44 @@ __all__ = ["Exchange"]
 _log = logging.getLogger("trade")
 _BEAT_NS: Final = 20_000_000
 _STOPPED_NS: Final = 200_000_000
-"""Who does not answer a stop for so long is killed; then the robot's watchdog stops it (S10)."""
+"""A child that does not answer a stop within this time is killed; then the robot's watchdog stops it (S10)."""
 _ANSWER_NS: Final = 1_000_000_000
 _TAKEN_NS: Final = 10_000_000_000
 _ASK_S: Final = 1.0
 _SHOWN_NS: Final = 100_000_000
-"""So long after the script has begun every measurement shows it."""
+"""The time after the start of the script until each measurement shows it."""
 _SERVO_NS: Final = 50_000_000
-"""So late a set-point of a stream is none any more."""
+"""The delay after which a set-point of a stream is void."""
 
 
 class Exchange(BusCycle[ArmStatus]):
-    """What happens with one controller. ``stop`` is for any thread, too."""
+    """The exchange with one controller. Any thread may also call ``stop``."""
 
     def __init__(self, link: Link, bus: UrBus, limb: ArmStatus, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(bus, [limb], clock)
         self.link = link
         self.limb = limb
         self.taken = False
-        """The control script runs, as far as is known."""
+        """True while the control script runs, as far as known."""
         self._taken_ns = 0
         self._watchdog_hz = 1 / bus.watchdog_s
         self._beaten_ns = 0
         self._halt_number = 0
         self._halted_ns = 0
         self._ending = False
-        """Once the stop is answered, the process that commands is replaced: its program has been ended."""
+        """True if the process that commands must be replaced after the stop, as its program was ended."""
         self._telling: threading.Thread | None = None
-        """The dashboard is being told to end the program."""
+        """The thread that makes the dashboard end the program."""
 
     # --- from any thread
 
     def stop(self, reason: str = "") -> StopTicket[ArmStatus]:
-        """Void what was admitted, and have the arm stand before anything else happens."""
+        """Voids all permits, and stops the arm before anything else happens."""
         reason = reason or self.why([self.limb])
         return self.order_stop([self.limb], reason, lambda: self._stop(reason))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so
-        """Stop what moves; the arm holds, and its program ends."""
+        """Stops the arm, which holds, and ends its program."""
         if self.limb.motion is not None or self.limb.still == 0:
             self.stop("its driver is leaving").wait(alive)
 
@@ -75,10 +75,10 @@ class Exchange(BusCycle[ArmStatus]):
         self._watch()
 
     def listen(self) -> None:
-        """Take in what the child processes have said.
+        """Processes the messages of the child processes.
 
         Raises:
-            PortLost: the one that reads has lost the controller.
+            PortLost: the reading process has lost the controller.
         """
         states, control = self.link.states, self.link.control
         if states is None or control is None:
@@ -97,12 +97,12 @@ class Exchange(BusCycle[ArmStatus]):
             self.drop_control(f"its control connection was lost: {gone}")
 
     def halt_all(self, reason: str) -> None:
-        """End every motion; the process that commands keeps its control until it is not fed any more."""
+        """Ends all motions; the process that commands keeps control until its watchdog is no longer fed."""
         self._brake()
         self.end_motion(reason)
 
     def take_over(self, motion: "Motion") -> None:
-        """A motion is about to begin: the one it replaces has ended."""
+        """Ends the previous motion immediately before its replacement starts."""
         if self.limb.motion not in {None, motion}:
             self.end_motion("another move took over")
         self.limb.motion, self.limb.still, self.limb.halting_since_ns = motion, 0, 0
@@ -110,12 +110,12 @@ class Exchange(BusCycle[ArmStatus]):
         self.limb.tell_moving()
 
     def end_motion(self, reason: str) -> None:
-        """Tell whoever waits for the motion under way that it was stopped."""
+        """Ends the current motion, whose caller gets ``MotionStopped``."""
         if self.limb.motion is not None:
             self._forget(self.limb.motion, MotionStopped(device=self.limb.name, reason=reason))
 
     def release(self, motion: "Motion", error: TradeError | None) -> None:
-        """A motion has ended: well, or with an error; a stream that has ended is braked in both cases."""
+        """Completes a motion, with or without an error; brakes an ended stream in both cases."""
         if self.limb.motion is motion and (error is not None or motion.streams):
             self._brake()
         self._forget(motion, error)
@@ -132,9 +132,9 @@ class Exchange(BusCycle[ArmStatus]):
         self.taken = self._ending = False
 
     def drop_control(self, why: str) -> None:
-        """End the process that commands, and start one that knows of nothing; the robot's watchdog stops what moves.
+        """Replaces the process that commands by a fresh one; the robot's watchdog stops its motion.
 
-        A program that a safeguard stop holds up would go on by itself, so the dashboard is told to end it, too.
+        A program paused by a safeguard stop would resume by itself, so the dashboard ends it, too.
         """
         if self.taken:
             _log.warning("%s: %s; its watchdog stops it", self.limb.name, why)
@@ -148,7 +148,7 @@ class Exchange(BusCycle[ArmStatus]):
     # --- orders
 
     def taking_control(self, job: "ArmCommand") -> Steps:
-        """Have the control script run; what runs on the controller is stopped by that."""
+        """Starts the control script, which stops any other program on the controller."""
         if self.taken:
             return
         until_ns = self.clock() + _TAKEN_NS
@@ -168,7 +168,7 @@ class Exchange(BusCycle[ArmStatus]):
         self._feed()
 
     def making_way(self) -> Steps:
-        """End what moves it, and wait until it stands."""
+        """Ends the motion, and waits until the arm is at rest."""
         if self.limb.motion is None and not self.limb.halting_since_ns:
             return
         self._brake()
@@ -176,15 +176,15 @@ class Exchange(BusCycle[ArmStatus]):
         until_ns = self.clock() + HALT_NS
         while self.limb.halting_since_ns:
             if self.clock() > until_ns:
-                raise self.limb.faulty("told to stop, but it is still moving")
+                raise self.limb.faulty("a stop was sent, but it is still moving")
             yield
 
     def carrying_out(self, job: "ArmCommand", make: Callable[[int], Order]) -> Generator[None, None, Done]:
-        """Give an order that is answered at once.
+        """Sends an order with an immediate answer.
 
         Raises:
-            DeviceFault: it was refused, or not answered; then the process that commands is replaced.
-            DeadlineExceeded: it came too late, and was not carried out.
+            DeviceFault: the order was refused, or not answered; then the process that commands is replaced.
+            DeadlineExceeded: the order arrived too late, and did not run.
         """
         done = yield from self._answered(job, make, self.clock() + _ANSWER_NS)
         if done.late:
@@ -195,7 +195,7 @@ class Exchange(BusCycle[ArmStatus]):
         return done
 
     def scaling(self, job: "ArmCommand", fraction: float, expires_ns: int) -> Steps:
-        """Set the speed slider, which needs no control."""
+        """Sets the speed slider, which needs no control."""
         states = self.link.states
         if states is None:
             raise self.limb.deaf(self.clock())
@@ -212,7 +212,7 @@ class Exchange(BusCycle[ArmStatus]):
             raise self.limb.faulty(f"the speed slider was not set: {done.problem}")
 
     def stream(self, positions: list[float]) -> None:
-        """Send one set-point of a stream."""
+        """Sends one set-point of a stream."""
         self._tell(self._control, Servo(expires_ns=self.clock() + _SERVO_NS, positions=positions))
 
     @property
@@ -228,7 +228,7 @@ class Exchange(BusCycle[ArmStatus]):
         self._tell(control, make(number))
         while (done := control.answer(number)) is None:
             if control is not self.link.control:
-                job.gate()  # a stop is why
+                job.gate()  # raises if a stop is the cause
                 raise self.limb.faulty("the process that commands it has ended")
             if self.clock() > until_ns:
                 self.drop_control("the process that commands it is stuck")
@@ -242,7 +242,7 @@ class Exchange(BusCycle[ArmStatus]):
         except Gone as gone:
             if child is self.link.control:
                 self.drop_control(f"the process that commands it is gone: {gone}")
-            raise self.limb.faulty(f"it could not be told: {gone}") from None
+            raise self.limb.faulty(f"the command could not be sent: {gone}") from None
 
     # --- parts of a cycle
 
@@ -256,7 +256,7 @@ class Exchange(BusCycle[ArmStatus]):
                 self.drop_control(f"the process that commands it is gone: {gone}")
 
     def _step_jobs(self) -> None:
-        """Go on with the jobs, one step of each; they wait for answers, so more would be idle."""
+        """Runs one step of each job; more would only wait for answers."""
         while self._inbox:
             self._working.append(self._inbox.popleft())
         for job in tuple(self._working[:1]):
@@ -290,7 +290,7 @@ class Exchange(BusCycle[ArmStatus]):
             self.link.renew_control()
 
     def _stop(self, reason: str) -> None:
-        """The part of a stop that goes through the child; the other part is the dashboard's (S10)."""
+        """Sends the stop to the child; the dashboard gets it separately (S10)."""
         self._brake()
         self._ending = self.taken
         if not self.taken:

@@ -1,4 +1,4 @@
-"""The dashboard server of a controller: one connection a question, each with a deadline. Plain sockets, no library."""
+"""A client of a controller's dashboard server: one connection per request, with a deadline, on plain sockets."""
 
 import socket
 import struct
@@ -20,18 +20,18 @@ _LONGEST: Final = 4096
 _HEAD: Final = struct.Struct(">HB")
 _INPUTS: Final = ord("I")
 _REGISTER: Final = b"input_int_register_0"
-"""It tells the control script of ur-rtde what to do."""
+"""The register with the commands for the control script of ur-rtde."""
 
 
 class DashboardError(Exception):
-    """The controller is not there, does not answer in time, or is none."""
+    """The controller is absent, does not answer in time, or is another device."""
 
 
 def ask(host: str, line: str, timeout_s: float) -> str:
-    """What the dashboard answers to a line.
+    """Sends a line to the dashboard, and returns its answer.
 
     Raises:
-        DashboardError: nothing in time.
+        DashboardError: no answer in time.
     """
     until = time.monotonic() + timeout_s
     try:
@@ -45,22 +45,22 @@ def ask(host: str, line: str, timeout_s: float) -> str:
 
 
 def tell(host: str, line: str, timeout_s: float) -> threading.Thread:
-    """Say a line to the dashboard, on a thread of its own that ends in time; nobody hears the answer."""
+    """Sends a line to the dashboard on a thread with a timeout; ignores the answer."""
 
     def say() -> None:
         with suppress(DashboardError):
             ask(host, line, timeout_s)
 
-    saying = threading.Thread(target=say, name=f"telling {host}", daemon=True)
+    saying = threading.Thread(target=say, name=f"telling {host}", daemon=True)  # plain: telling
     saying.start()
     return saying
 
 
 def probe(host: str, timeout_s: float) -> None:
-    """See that all ports of the controller answer, so that the library, which waits for ever, need not find out.
+    """Checks that all ports of the controller answer, because the library waits without a timeout.
 
     Raises:
-        DashboardError: one does not.
+        DashboardError: a port does not answer.
     """
     ask(host, "robotmode", timeout_s)
     until = time.monotonic() + timeout_s
@@ -79,9 +79,9 @@ def probe(host: str, timeout_s: float) -> None:
 
 
 def commanded(host: str, timeout_s: float) -> bool:
-    """Whether another program has control of its arm: a controller gives each register to one client.
+    """Returns whether another program has control of the arm, as a controller gives each register to one client.
 
-    Nothing is written. If nobody has the register it is taken, until the connection ends with this question.
+    Writes nothing. If no client has the register, this connection takes it until the request is over.
 
     Raises:
         DashboardError: no answer in time.

@@ -1,4 +1,4 @@
-"""Bringing a controller's arm up, and handing it out."""
+"""The driver of a controller and its arm."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -33,14 +33,14 @@ _CYCLES_HZ: Final = {
     "UR10e": 500.0,
     "UR16e": 500.0,
 }
-"""Models of the CB3 and of the e-Series, and how many cycles a second their controllers have."""
+"""Models of the CB3 and of the e-Series, with the cycles per second of their controllers."""
 _ASK_S: Final = 1.0
 _LET_GO_S: Final = 2.0
 _AGAIN_S: Final = 0.1
 
 
 class AttachedController(ThreadedBus[Exchange]):
-    """A controller with its arm, and the thread that owns it."""
+    """A controller with its arm and its owner thread."""
 
     def __init__(self, thread: BusThread[Exchange], link: Link, lock: HostLock) -> None:
         super().__init__(thread)
@@ -74,7 +74,7 @@ class UrDriver(Driver):
         self._limb_of(robot, bus, bus.name)
 
     def _limb_of(self, robot: Robot, bus: Bus, port: str) -> tuple[ArmStatus, UrBus]:
-        """What the file alone can tell is checked."""
+        """Checks the robot file."""
         if not isinstance(bus, UrBus):
             _wrong(f"{robot.where}: bus.{bus.name}", 'driver ur needs a controller: host = "192.168.0.10"')
         if missing := self.missing():
@@ -129,7 +129,7 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> ArmStatus:
 
 
 def _refuse_company(port: str, where: str) -> None:
-    """One that another program has control of is left alone. A process that was killed keeps that for a moment."""
+    """Refuses an arm that another program controls; a killed process keeps control for a short time."""
     until = time.monotonic() + _LET_GO_S
     while commanded(port, _ASK_S):
         if time.monotonic() > until:
@@ -138,14 +138,14 @@ def _refuse_company(port: str, where: str) -> None:
 
 
 def _look_over(limb: ArmStatus, where: str) -> None:
-    """See that it is the arm of the robot file; nothing is commanded."""
+    """Checks that it is the arm of the robot file; commands nothing."""
     answer = ask(limb.bus, "get robot model", _ASK_S)
     if answer.rstrip("e").upper() != limb.arm.model.rstrip("e").upper():
         _wrong(f"{where}.model", f"the controller at {limb.bus} has a {answer}, not a {limb.arm.model}")
 
 
 def _stop_if_moving(exchange: Exchange) -> None:
-    """Found moving and owned by nobody, it is stopped (S18)."""
+    """Stops a motion that no client owns (S18)."""
     if exchange.limb.still == 0:
         ask(exchange.limb.bus, "stop", _ASK_S)
 

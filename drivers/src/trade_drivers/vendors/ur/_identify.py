@@ -1,4 +1,4 @@
-"""Asking a controller which arm hangs on it. Nothing but questions."""
+"""Identification of a controller's arm, by queries only."""
 
 import re
 from typing import Final
@@ -12,14 +12,14 @@ __all__ = ["identify"]
 _ASK_S: Final = 2.0
 _VERSION: Final = re.compile(r"(\d+)\.\d+(?:\.\d+)*")
 _E_SERIES: Final = 5
-"""Their software begins with it; that of the CB3 with 3."""
+"""First digit of the e-Series' software version; the CB3's is 3."""
 
 
 def identify(host: str) -> Found:
-    """The arm behind a controller: its model, the version of its software, its serial number.
+    """Returns a controller's arm: model, software version, serial number.
 
     Raises:
-        ConfigurationError: nobody is there, or it is no controller.
+        ConfigurationError: nothing answers, or it is not a controller.
     """
     try:
         model = ask(host, "get robot model", _ASK_S)

@@ -1,4 +1,4 @@
-"""What services ask of the bus thread: moves, set-points, freedrive, the speed slider."""
+"""Jobs of services for the bus thread: moves, set-points, freedrive, the speed slider."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 __all__ = ["ArmCommand", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion", "Move", "Scaling", "SetPoint"]
 
 _NEAR: Final = 0.01
-"""rad or m: closer to its goal, a move has arrived."""
+"""Distance in rad or m within which a move has arrived."""
 _OUTSIDE_RAD: Final = 0.02
-"""So far outside its range a joint may be measured, where nothing was told to leave it."""
+"""The distance in rad that a joint may be measured outside its range without a command to leave it."""
 _STUCK_NS: Final = 1_000_000_000
-"""A move that is under way changes what is measured in that time."""
+"""The time within which a running move must change the measurement."""
 _FOREVER_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
@@ -35,7 +35,7 @@ class ArmCommand(Command[ArmStatus, "Exchange"]):
         self.limb = exchange.limb
 
     def usable(self) -> Sample:
-        """The newest measurement of an arm that may be commanded; raises as ``ArmStatus.check_usable``."""
+        """Returns the newest measurement of an arm that may be commanded; raises as ``ArmStatus.check_usable``."""
         return self.limb.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
 
 
@@ -52,7 +52,7 @@ class Scaling(ArmCommand):
 
 
 class EndFreedrive(ArmCommand):
-    """The arm holds itself again."""
+    """Ends freedrive: the arm holds itself again."""
 
     def steps(self) -> Steps:
         if isinstance(self.limb.motion, Freedrive):
@@ -61,19 +61,19 @@ class EndFreedrive(ArmCommand):
 
 
 class Motion(ArmCommand):
-    """What sets the arm moving, and is watched until something ends it."""
+    """A command that moves the arm, and is watched until it ends."""
 
     streams = False
-    """It is a stream of set-points, which has to be ended also when it ends well."""
+    """True for a stream of set-points, which must also be ended after success."""
     attended_ns = 0
-    """When it was last looked after, by the lasting clock."""
+    """When it was last checked, by the lasting clock."""
 
     def watch(self, now_ns: int) -> None:
-        """Look at the newest measurement; end it if it is over or must not go on."""
+        """Checks the newest measurement, and ends the motion if it is over or must not continue."""
         raise NotImplementedError
 
     def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
-        """Why it may not go on: a driver that was held up, silence, a fault, or the end of its call."""
+        """Returns why the motion must end: an interrupted driver, no answer, a fault, or the call's deadline."""
         attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
         if held_up := self.exchange.held_up(attended_ns):
             return self.limb.faulty(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
@@ -86,7 +86,7 @@ class Motion(ArmCommand):
         return None
 
     def astray(self, sample: Sample) -> LimitExceeded | None:
-        """A joint is outside its range and goes on outwards. (From outside it may come back.)"""
+        """Returns the error for a joint outside its range that moves further out. (It may move back inside.)"""
         arm = self.limb.arm
         spans = zip(self.limb.joints, sample.positions, sample.speeds, arm.min_rad, arm.max_rad, strict=True)
         for name, angle, speed, low, high in spans:
@@ -95,10 +95,10 @@ class Motion(ArmCommand):
         return None
 
     def done_stepping(self) -> None:
-        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+        """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
 
     def beginning(self) -> Steps:
-        """Have control, and the arm at rest."""
+        """Takes control, and waits until the arm is at rest."""
         self.usable()
         self.gate()
         yield from self.exchange.taking_control(self)
@@ -107,7 +107,7 @@ class Motion(ArmCommand):
 
 
 class Freedrive(Motion):
-    """It can be moved by hand, until somebody ends it; whoever asked is let go at once."""
+    """Freedrive: the arm can be moved by hand until a client ends it; the service returns immediately."""
 
     def steps(self) -> Steps:
         yield from self.beginning()
@@ -142,17 +142,17 @@ class Move(Motion):
         self.goal = list(goal)
         self.speed = speed
         self._pulses = -1
-        """How many words there were of its process when it began."""
+        """Number of its process's reports when it began."""
         self._place: list[float] = []
         self._moved_ns = 0
 
     def order(self, number: int) -> MoveJoints | MoveLine:
-        """What is sent."""
+        """Returns the order to send."""
         accel = self.limb.arm.max_accel_rad_s2
         return MoveJoints(number=number, expires_ns=self.expires_ns, positions=self.goal, speed=self.speed, accel=accel)
 
     def off(self, sample: Sample) -> float:
-        """How far it is from its goal."""
+        """Returns the distance to its goal."""
         return max(abs(a - b) for a, b in zip(sample.positions, self.goal, strict=True))
 
     def steps(self) -> Steps:
@@ -180,7 +180,7 @@ class Move(Motion):
             self.exchange.release(self, ending)
 
     def _stuck(self, sample: Sample) -> TradeError | None:
-        """What is measured does not change at all: it is blocked, held up, or what is told is old."""
+        """Returns the fault for measurements without any change: the arm is blocked or paused, or values are old."""
         if sample.positions != self._place or not self._moved_ns:
             self._place, self._moved_ns = sample.positions, sample.at_ns
         return self.limb.faulty("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
@@ -222,10 +222,10 @@ class LineMove(Move):
 
 
 class SetPoint(Motion):
-    """Angles that hold for a short while only; not renewed in time, the arm stops.
+    """Angles that are valid for a short time; if they are not renewed, the arm stops.
 
-    Each renewal is a set-point of its own, admitted anew, that takes over from the one before, and goes on from where
-    the stream has got to.
+    Each renewal is a set-point of its own, with its own permit, which replaces the previous one and continues from the
+    current position of the stream.
     """
 
     streams = True
@@ -257,12 +257,12 @@ class SetPoint(Motion):
             self._until_ns = self.exchange.clock() + self._valid_ns  # control had to be taken first
         self.gate()
         self.exchange.take_over(self)
-        self.expires_ns = self._until_ns  # on its way, it lasts as long as it was said to
+        self.expires_ns = self._until_ns  # once sent, it is valid for its own time
         self._send(self.exchange.clock())
         self.finish()
 
     def watch(self, now_ns: int) -> None:
-        """What would keep it from being sent ends it, too: its time, a stop, a lock, a fault, silence."""
+        """Ends the set-point for each reason that would prevent sending it: expiry, stop, lock, fault, no answer."""
         try:
             self._send(now_ns)
         except TradeError as ending:
@@ -279,7 +279,7 @@ class SetPoint(Motion):
 
 
 class Follow(Motion):
-    """A trajectory: in every cycle what is due goes out, and every joint is compared with where it should be."""
+    """A trajectory: each cycle sends the set-point due, and compares each joint with it."""
 
     streams = True
 
@@ -291,19 +291,19 @@ class Follow(Motion):
     ) -> None:
         super().__init__(exchange, terms)
         self._plan = plan
-        self._told_ns = 0
+        self._sent_ns = 0
 
     def steps(self) -> Steps:
         yield from self.beginning()
         self._compare(self.usable(), "start", self._plan.tolerances.start_rad)
         self.gate()
         self.exchange.take_over(self)
-        self.expires_ns = _FOREVER_NS  # it began in time: how long it may take is another matter
-        self._told_ns = self.exchange.clock()
-        self._plan.course.ready(self._told_ns)
+        self.expires_ns = _FOREVER_NS  # it started in time; its duration is checked separately
+        self._sent_ns = self.exchange.clock()
+        self._plan.course.ready(self._sent_ns)
 
     def watch(self, now_ns: int) -> None:
-        if not self._told_ns:
+        if not self._sent_ns:
             return
         try:
             self.gate()
@@ -315,8 +315,8 @@ class Follow(Motion):
     def _go_on(self, now_ns: int) -> None:
         if (ending := self.trouble(now_ns, self.until_ns)) is not None:
             raise ending
-        if now_ns - self._told_ns > _HELD_UP_NS:
-            raise MotionStopped(device=self.limb.name, reason="its bus was held up: nothing told it where to go")
+        if now_ns - self._sent_ns > _HELD_UP_NS:
+            raise MotionStopped(device=self.limb.name, reason="its bus was held up: it got no set-points")
         course, tolerances, sample = self._plan.course, self._plan.tolerances, self.usable()
         if course.failed is not None:
             raise MotionStopped(device=self.limb.name, reason=f"its group could not go on: {course.failed}")
@@ -331,7 +331,7 @@ class Follow(Motion):
         if late_s > tolerances.goal_time_s:
             raise self.limb.faulty("it does not come to rest at the end of its trajectory")
         self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
-        self._told_ns = now_ns
+        self._sent_ns = now_ns
 
     def _compare(self, sample: Sample, what: str, tolerance_rad: float) -> None:
         elapsed_s = self._plan.course.elapsed_s(sample.at_ns)

@@ -1,4 +1,4 @@
-"""The poses that a tool passes on its straight way, as the controller has it. Pure arithmetic.
+"""The poses of a tool along a straight line, as the controller interpolates it. Pure arithmetic.
 
 A pose is x, y, z in m and a rotation vector in rad; on the way the tool turns about one axis, at an even rate.
 """
@@ -16,7 +16,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 def poses_on(start: Sequence[float], goal: Sequence[float]) -> list[list[float]]:
-    """Poses from one to another, 5 cm and 0.2 rad apart at most; the last is the goal."""
+    """Returns poses from start to goal, at most 5 cm and 0.2 rad apart; the last is the goal."""
     first = _quaternion(start[3:])
     turn = _vector(_product(_quaternion(goal[3:]), _inverse(first)))
     count = max(1, ceil(dist(start[:3], goal[:3]) / _EVERY_M), ceil(hypot(*turn) / _EVERY_RAD))

@@ -1,4 +1,4 @@
-"""How a controller is reached: through two child processes, one that reads and one that commands."""
+"""The connection to a controller: two child processes, one that reads and one that commands."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ from trade_drivers.vendors.ur._messages import Gone
 __all__ = ["Link"]
 
 _FIRST_S: Final = 10.0
-"""A process that reads has to import the library first, on a machine that may be busy."""
+"""Startup time of a reading process, which imports the library on a possibly busy machine."""
 _LOOK_S: Final = 0.01
 _END_S: Final = 1.0
 
@@ -31,11 +31,11 @@ class Link:
         self._ending: threading.Thread | None = None
 
     def open(self) -> None:
-        """Go on with having its states read, without waiting for anything; nothing is commanded, and no script runs.
+        """Advances the connection of the reading process without waiting; commands nothing and runs no script.
 
         Raises:
-            PortOpening: they are not there yet.
-            PortLost: it does not answer, and is asked anew the next time.
+            PortOpening: no states have arrived yet.
+            PortLost: the controller does not answer; the next call tries again.
         """
         if self._ending is not None and self._ending.is_alive():
             raise PortOpening("the process that commanded it has not ended yet")
@@ -56,7 +56,7 @@ class Link:
         raise PortOpening("its states are not read yet")
 
     def wait_open(self) -> None:
-        """The same until it has come to an end; raises ``PortLost``."""
+        """Waits for the connection; raises ``PortLost``."""
         while True:
             try:
                 return self.open()
@@ -64,13 +64,13 @@ class Link:
                 time.sleep(_LOOK_S)
 
     def renew_control(self) -> None:
-        """Replace the process that commands by one that has no control."""
+        """Replaces the process that commands by one without control."""
         if self.control is not None:
             self.control.kill()
             self.control = Child("control", self.path)
 
     def close(self) -> None:
-        """Have both end; the one that commands stops what it moves, and is not waited for. More than once is fine."""
+        """Ends both processes without waiting for the one that commands, which stops its motion. Idempotent."""
         states, self.states = self.states, None
         control, self.control = self.control, None
         if control is not None:
@@ -80,6 +80,6 @@ class Link:
             states.kill()
 
     def wait_closed(self) -> None:
-        """Until both have ended."""
+        """Waits until both have ended."""
         if self._ending is not None:
             self._ending.join()

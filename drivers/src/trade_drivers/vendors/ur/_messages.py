@@ -1,4 +1,4 @@
-"""What the driver and its child processes say to each other: frames over a pair of sockets, whole or not at all."""
+"""Messages between the driver and its child processes, as whole frames over a pair of sockets."""
 
 import socket
 from collections.abc import Iterator
@@ -34,18 +34,18 @@ Message = TypeVar("Message")
 
 
 class Gone(Exception):
-    """The other end is gone, or does not read."""
+    """The other end is gone or does not read."""
 
 
 class _Order(Struct, frozen=True, kw_only=True, tag=True, array_like=True):
     number: int = 0
-    """Given back in the answer; 0: there is none."""
+    """Number returned in the answer; 0 for orders without one."""
     expires_ns: int = 0
-    """By CLOCK_MONOTONIC, which is one for all processes; later it is not carried out. 0: it does not expire."""
+    """Expiry by CLOCK_MONOTONIC, which all processes share; 0: it does not expire."""
 
 
 class Beat(_Order, frozen=True):
-    """The driver is well: feed the robot's watchdog."""
+    """The driver is healthy: feed the robot's watchdog."""
 
 
 class Take(_Order, frozen=True):
@@ -53,11 +53,11 @@ class Take(_Order, frozen=True):
 
     watchdog_hz: float
     step_s: float
-    """From one set-point of a stream to the next."""
+    """Time between two set-points of a stream."""
 
 
 class MoveJoints(_Order, frozen=True):
-    """Begin a move in joint space: rad, rad/s, rad/s^2."""
+    """Start a move in joint space: rad, rad/s, rad/s^2."""
 
     positions: list[float]
     speed: float
@@ -65,7 +65,7 @@ class MoveJoints(_Order, frozen=True):
 
 
 class MoveLine(_Order, frozen=True):
-    """Begin a move in a line: a pose, m/s, m/s^2."""
+    """Start a move in a line: a pose, m/s, m/s^2."""
 
     pose: list[float]
     speed: float
@@ -79,20 +79,20 @@ class Servo(_Order, frozen=True):
 
 
 class Solve(_Order, frozen=True):
-    """Ask for the angles that bring the tool to a pose, those next to given ones; nothing moves."""
+    """Compute the angles for a pose of the tool, next to given ones; nothing moves."""
 
     pose: list[float]
     near: list[float]
 
 
 class Halt(_Order, frozen=True):
-    """End whatever it does: a move, a stream, freedrive; braking in rad/s^2."""
+    """End a move, a stream or freedrive; braking in rad/s^2."""
 
     decel: float
 
 
 class Free(_Order, frozen=True):
-    """Let the arm be moved by hand."""
+    """Start freedrive."""
 
 
 class Scale(_Order, frozen=True):
@@ -106,31 +106,31 @@ class Hello(Struct, frozen=True, tag=True, array_like=True):
 
 
 class Failed(Struct, frozen=True, tag=True, array_like=True):
-    """Why it ends."""
+    """Reason of the child's end."""
 
     problem: str
 
 
 class Done(Struct, frozen=True, tag=True, array_like=True):
-    """An order was carried out, or why it was not."""
+    """The outcome of an order: success, or the problem."""
 
     number: int
     problem: str = ""
     late: bool = False
-    """It had expired, so it was not."""
+    """True if the order had expired and did not run."""
     angles: list[float] = []
-    """What ``Solve`` found; empty: there are none."""
+    """The angles of ``Solve``; empty if there are none."""
 
 
 class Pulse(Struct, frozen=True, tag=True, array_like=True):
     """The answer to a beat."""
 
     running: bool
-    """A move it began is under way."""
+    """True while a move runs."""
 
 
 class Sample(Struct, frozen=True, tag=True, array_like=True):
-    """One measurement of the controller, as it arrived."""
+    """One measurement of the controller."""
 
     at_ns: int
     positions: list[float]
@@ -160,14 +160,14 @@ class Channel(Generic[Message]):
         self._decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(kind)  # pyright: ignore[reportArgumentType]
 
     def send(self, message: Struct) -> None:
-        """Say something, or raise ``Gone``; it never waits."""
+        """Sends a message, or raises ``Gone``; never waits."""
         try:
             self.end.send(self._encoder.encode(message), socket.MSG_DONTWAIT)
         except OSError as problem:
             raise Gone(str(problem)) from None
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next word, or None when there was none for so long; raises ``Gone``."""
+        """Returns the next message, or None at the timeout; raises ``Gone``."""
         self.end.settimeout(timeout_s)
         try:
             data = self.end.recv(_LONGEST)
@@ -180,15 +180,15 @@ class Channel(Generic[Message]):
         return self._decoder.decode(data)
 
     def waiting(self) -> Iterator[Message]:
-        """What has come, without waiting; raises ``Gone`` after the last."""
+        """Yields received messages without waiting; raises ``Gone`` after the last."""
         while (message := self.receive(0.0)) is not None:
             yield message
 
     def close(self) -> None:
-        """Let go of it; more than once is fine."""
+        """Closes the socket. Idempotent."""
         self.end.close()
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
-    """The two ends: what is sent arrives in one piece, and the end of one is noticed by the other."""
+    """Returns the two ends, which preserve message boundaries and detect the other's end."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -7,12 +7,12 @@ __all__ = ["SetpointFilter"]
 
 
 class SetpointFilter:
-    """Where several joints are told to be, cycle by cycle.
+    """Generates the set-points of several joints, cycle by cycle.
 
     Args:
-        positions: where they are, in rad.
-        speed: the greatest, in rad/s.
-        accel: the greatest, in rad/s^2.
+        positions: the current positions, in rad.
+        speed: the maximum, in rad/s.
+        accel: the maximum, in rad/s^2.
     """
 
     def __init__(self, positions: Sequence[float], speed: float, accel: float) -> None:
@@ -21,7 +21,7 @@ class SetpointFilter:
         self._speed, self._accel = speed, accel
 
     def step(self, targets: Sequence[float], dt: float) -> list[float]:
-        """Where to be a time ``dt`` in s later: each joint goes for its target so that it can stop there."""
+        """Returns the set-points ``dt`` s later: each joint approaches its target so that it can stop there."""
         most = self._accel * dt
         for joint, target in enumerate(targets):
             way = target - self.positions[joint]
@@ -29,7 +29,7 @@ class SetpointFilter:
             if abs(way) <= most * dt and abs(speed) <= most:
                 self.positions[joint], self.speeds[joint] = target, 0.0
                 continue
-            # half a step is travelled before any braking shows
+            # half a step passes before braking takes effect
             braked = max(0.0, sqrt(most * most / 4 + 2 * self._accel * abs(way)) - most / 2)
             wanted = copysign(min(self._speed, braked, abs(way) / dt), way)
             speed += max(-most, min(most, wanted - speed))

@@ -1,7 +1,7 @@
 """The child process that reads: it sends every new measurement, and sets the speed slider.
 
-The library tells old values as if they were new, and its constructor waits for ever for a server that is silent. So a
-value is as old as the controller's own time stamp says, the ports are probed first, and nobody waits for this process.
+The library returns old values as if they were new, and its constructor waits without a timeout. So the controller's
+time stamp determines a value's age, the ports are probed first, and the driver does not wait for this process.
 """
 
 import os
@@ -19,7 +19,7 @@ from trade_drivers.vendors.ur._messages import Channel, Done, Failed, Gone, Hell
 RATE_HZ: Final = 125.0
 _PROBE_S: Final = 1.0
 _PROBED_S: Final = 5.0
-"""The alarm while three ports are probed one after the other."""
+"""Timeout of probing three ports one after the other."""
 _STUCK_S: Final = 3.0
 _FIELDS: Final = [
     *("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "robot_mode", "safety_mode"),
@@ -28,7 +28,7 @@ _FIELDS: Final = [
 
 
 class Child:
-    """Reads until the connection, or whoever started it, is gone."""
+    """Reads until the connection or the parent process is gone."""
 
     def __init__(self, host: str, channel: "Channel[Order]") -> None:
         import rtde_io  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
@@ -44,7 +44,7 @@ class Child:
         self._age = Age()
 
     def run(self) -> None:
-        """A measurement whenever there is a new one; orders in between."""
+        """Sends each new measurement, and executes orders in between."""
         self._channel.send(Hello())
         while self._robot.isConnected():
             signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
@@ -56,7 +56,7 @@ class Child:
 
     def _measure(self) -> None:
         robot = self._robot
-        at_ns = time.monotonic_ns()  # before it is read: what comes between makes it older, not younger
+        at_ns = time.monotonic_ns()  # before the read, so that a delay makes the value older, not newer
         clock = robot.getTimestamp()
         if clock == self._clock:
             return
@@ -83,7 +83,7 @@ class Child:
 
 
 def main() -> None:
-    """Serve the socket whose number is the first argument, for the controller at the second."""
+    """Serves the socket whose number is the first argument, for the controller at the second."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     host, channel = sys.argv[2], Channel[Order](socket.socket(fileno=int(sys.argv[1])), Order)

@@ -1,4 +1,4 @@
-"""A Universal Robots arm as an Arm: it checks, hands over to the bus thread, and waits."""
+"""A Universal Robots arm as an Arm. It checks arguments, queues a job for the bus thread, and waits for it."""
 
 import threading
 from collections.abc import Callable
@@ -111,7 +111,7 @@ class UrArm(Arm):
         return self.state().positions_rad
 
     def stop(self) -> None:
-        ticket = self._exchange.stop()  # first: from here on nothing that was admitted before goes out
+        ticket = self._exchange.stop()  # first, so that earlier commands are void from here on
         problem: DashboardError | None = None
         try:
             ask(self._limb.bus, "stop", _STOP_S)
@@ -145,13 +145,13 @@ class UrArm(Arm):
     # --- parts
 
     def _at_once(self) -> tuple[int, None]:
-        """As ``at_once``; but a plain Python call may wait until a process has started and taken control."""
+        """Like ``at_once``, but a plain Python call may wait until a process has started and taken control."""
         clock = self._exchange.clock
         expires_ns, ends = expiry(clock)
         return expires_ns if ends else clock() + _TAKING_NS, None
 
     def _span(self) -> tuple[int, int | None]:
-        """As ``span``, likewise."""
+        """Like ``span``, with the same exception."""
         expires_ns, until_ns = span(self._exchange.clock)
         return self._at_once() if until_ns is None else (expires_ns, until_ns)
 
@@ -180,7 +180,7 @@ class UrArm(Arm):
         return self.state()
 
     def _switch(self, line: str, expected: str, reached: Callable[[], bool]) -> None:
-        """Ask the dashboard for something, and wait until the controller shows it."""
+        """Sends a dashboard command, and waits until the controller shows its effect."""
         clock, service = self._exchange.clock, f"{self._name}.{line.replace(' ', '_')}"
         _, until_ns = span(clock)
         until_ns = until_ns or clock() + _SWITCH_NS
