@@ -1,7 +1,7 @@
 """Simulated devices that speak the real bytes, on pseudo-terminals, with a byte log and scripted faults.
 
 `SimProcess` simulates a whole robot file in a process of its own; `trade_hil_sim.dynamixel` has the devices for use in
-one's own process. `read_log`, `motion_writes` and their kin say what a bus has seen.
+one's own process. `read_log`, `motion_writes` and similar functions query what a bus has seen.
 """
 
 from trade_hil_sim.control._client import SimControl

@@ -1,4 +1,4 @@
-"""``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until told to stop; ``--do`` strikes them."""
+"""``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until a signal ends it; ``--do`` injects a fault."""
 
 import argparse
 import gc
@@ -31,20 +31,20 @@ Give such a port to any client in place of a real one. The control socket takes 
   {{"do": "mute", "ids": [1]}}   {{"do": "unplug", "bus": "neck"}}   {{"do": "state"}}
 SIGTERM, SIGINT, the end of --parent or (with --stdin) the end of standard input end the simulator.
 
-With --do, one that runs is struck; for instance
+With --do, send a fault to a running simulator; for instance
   trade-hil-sim --do /tmp/trade-sim-x/_control jam ids=1,2 bus=neck
   trade-hil-sim --do /tmp/trade-sim-x/_control heal
-The exit code is 0 if it was done, 1 if the simulator refused it or is not there, 2 if the words are wrong. There is, in
-brackets what it takes besides bus=NAME:
+The exit code is 0 if it was carried out, 1 if the simulator refused it or does not run, 2 if the arguments are wrong.
+Faults and orders, with their keys besides bus=NAME in brackets:
 {listing()}
-docs/simulators.md says more of each.
+docs/simulators.md describes each.
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the simulator; return its exit status: 0 after a signal, 2 if it could not start.
 
-    With ``--do`` strike one that runs: 0 if it was done, 1 if not, 2 if the words are wrong.
+    With ``--do``, send a fault to a running simulator: 0 if it was carried out, 1 if not, 2 if the arguments are wrong.
     """
     options = _parser().parse_args(argv)
     if options.do is not None:
@@ -63,7 +63,7 @@ def _strike(options: argparse.Namespace) -> int:
     control, *words = options.do
     try:
         if options.robot is not None or options.fresh or not words:
-            raise SimulationError("--do takes the control socket of a simulator that runs, and what to do to it")
+            raise SimulationError("--do takes the control socket of a running simulator, and a fault")
         command = command_of(words)
     except SimulationError as problem:
         return _failed(problem, 2)
@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         "--do",
         nargs="+",
         metavar=("CONTROL", "FAULT"),
-        help="strike the simulator that has this control socket: a fault and its KEY=VALUE, listed below",
+        help="send a fault and its KEY=VALUE, listed below, to the simulator with this control socket",
     )
     parser.add_argument("--parent", type=int, metavar="PID", help="end when this process ends")
     parser.add_argument("--stdin", action="store_true", help="end when standard input ends")
@@ -135,7 +135,7 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
         control=str(control.path),
     )
     gc.collect()
-    gc.freeze()  # a later collection of all that was loaded would hold every device up for as long as a deadline
+    gc.freeze()  # a later garbage collection of everything loaded would delay every device by as much as a deadline
     sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
     sys.stdout.flush()
     stop.wait(options.parent, sys.stdin.fileno() if options.stdin else None)
@@ -151,7 +151,7 @@ def _directory(wanted: Path | None, stack: ExitStack) -> Path:
 
 
 class _Stop:
-    """Waits for a reason to end: a signal, the parent's end, the end of standard input."""
+    """Waits until it must end: on a signal, the parent's end, or the end of standard input."""
 
     def __init__(self) -> None:
         self._bell, self._rope = os.pipe()
@@ -164,7 +164,7 @@ class _Stop:
             os.write(self._rope, b"!")
 
     def wait(self, parent: int | None, stdin: int | None) -> None:
-        """Return when there is a reason to end."""
+        """Return when the simulator must end."""
         with ExitStack() as stack:
             watched = [self._bell]
             if parent is not None:
@@ -184,7 +184,7 @@ class _Stop:
                     return
 
     def close(self) -> None:
-        """Let go of signals and pipe."""
+        """Restore the signal handlers and close the pipe."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
         os.close(self._bell)

@@ -1,4 +1,4 @@
-"""What a simulated bus is reached through, and who reaches it: the seam between the wire and its clients."""
+"""The interface between a simulated wire and its clients: adapters, and the clients that they serve."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -9,30 +9,30 @@ __all__ = ["Adapter", "Client", "Tenant"]
 
 
 class Client(Protocol):
-    """Who is on the bus through an adapter."""
+    """A client that reaches the bus through an adapter."""
 
     name: str
     overrun: int
     """Frames lost in a row because it does not read."""
 
     def tell_frame(self, frame: Frame, wall_s: float) -> bool:
-        """A frame was on the bus, at `wall_s` seconds since the epoch; False if it is lost."""
+        """Deliver a frame that was on the bus at `wall_s` seconds since the epoch; False if it is lost."""
         ...
 
     def tell_error(self, bits: int, wall_s: float) -> bool:
-        """An error was, of these classes (linux/can/error.h)."""
+        """Deliver an error of these classes (linux/can/error.h)."""
         ...
 
 
 class Tenant(Protocol):
-    """Who hears what clients do. Called from the thread that calls `Adapter.serve`."""
+    """Receives what clients do. Called from the thread that calls `Adapter.serve`."""
 
     def joined(self, client: Client) -> None:
-        """A client may send from now on, and is to be told frames."""
+        """A client may send from now on, and receives frames."""
         ...
 
     def left(self, client: Client) -> None:
-        """A client that had joined is gone."""
+        """A client that had joined has disconnected."""
         ...
 
     def said(self, client: Client, frame: Frame, t: float) -> None:
@@ -40,19 +40,19 @@ class Tenant(Protocol):
         ...
 
     def misunderstood(self, client: Client, text: str) -> None:
-        """A client said what makes no sense."""
+        """A client sent something invalid."""
         ...
 
 
 class Adapter(Protocol):
-    """Brings clients to the bus."""
+    """Connects clients to the bus."""
 
     channel: str
     """The interface clients open."""
 
     @property
     def port(self) -> str:
-        """What a client is given: ``INTERFACE:CHANNEL``, in python-can's words."""
+        """What a client opens: ``INTERFACE:CHANNEL``, as python-can writes it."""
         ...
 
     @property
@@ -61,15 +61,15 @@ class Adapter(Protocol):
         ...
 
     def open(self) -> None:
-        """Let clients come; raises SimulationError if there is no such interface."""
+        """Accept clients; raises SimulationError if there is no such interface."""
         ...
 
     def plug_in(self) -> None:
-        """Let them come again."""
+        """Accept clients again."""
         ...
 
     def unplug(self) -> None:
-        """Hang up on everybody."""
+        """Disconnect all clients."""
         ...
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ from ._wire import Station, Wire
 __all__ = ["CanBus"]
 
 ANSWER_S: Final = 5.0
-"""How long the bus's thread may take over an order."""
+"""How long the bus's thread may take to carry out an order."""
 MOST_DATA: Final = 8
 BUS_ERROR: Final = 0x88
 """A protocol violation and a bus error (linux/can/error.h)."""
@@ -84,11 +84,11 @@ class CanBus(BusThread):
         self._wire.attach(station)
         return station
 
-    # what anybody uses
+    # for any thread
 
     @property
     def port(self) -> str:
-        """What a client is given: ``socketcand:127.0.0.1:29536/can0``, or ``socketcan:vcan0``; known from `open` on."""
+        """What a client opens: ``socketcand:127.0.0.1:29536/can0``, or ``socketcan:vcan0``; known from `open` on."""
         return self._adapter.port
 
     @property
@@ -98,7 +98,7 @@ class CanBus(BusThread):
 
     @property
     def devices(self) -> Sequence[Device]:
-        """The devices; take care, the bus's own thread uses them, too."""
+        """The devices. The bus's own thread uses them, too."""
         return tuple(self._devices)
 
     def state(self) -> BusState:
@@ -106,11 +106,11 @@ class CanBus(BusThread):
         return self._in_thread(self._state)
 
     def do(self, command: faults.Command) -> None:
-        """Carry out one fault or order; raises `SimulationError` for what is not here."""
+        """Carry out one fault or order; raises `SimulationError` if the bus lacks the device."""
         self._in_thread(lambda: self._do(command))
 
     def load(self) -> tuple[float, float]:
-        """How long frames have held the wire, in all, and the time, both in seconds: two of these make a load."""
+        """The total time that frames held the wire, and the time now, both in seconds: two samples give the load."""
         return self._in_thread(lambda: (self._wire.busy_s, time.monotonic()))
 
     # the thread
@@ -132,7 +132,7 @@ class CanBus(BusThread):
         return min(60.0, max(0.0, min(due, self._wire.next_due()) - time.monotonic()))
 
     def _pass_time(self, now: float) -> None:
-        """Let happen what is due on the wire and in devices, in order and at its own time."""
+        """Run what is due on the wire and in devices, in order, each at its own time."""
         while True:
             device = min(self._devices, key=_DUE, default=None)
             own, wire = inf if device is None else device.due, self._wire.next_due()
@@ -221,7 +221,7 @@ class CanBus(BusThread):
         return [device for device in self._devices if ids is None or device.device_id in ids]
 
     def _post(self, station: Station, frame: Frame, t: float) -> None:
-        """Send a frame as the faults in force leave it."""
+        """Send a frame after the active faults were applied."""
         name, ids = self._struck(station, frame)
         if ids is None:
             self._wire.send(station, frame, t)
@@ -230,7 +230,7 @@ class CanBus(BusThread):
                 self._wire.send(station, replace(frame, data=data[:MOST_DATA]), t + late_s)
 
     def _struck(self, station: Station, frame: Frame) -> tuple[str, tuple[int, ...] | None]:
-        """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
+        """A frame's name, and the device whose faults affect it; only faults that name a client's frame affect it."""
         if self._faults.empty:
             return "", None
         name, node = self.label(frame)

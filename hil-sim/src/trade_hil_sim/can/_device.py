@@ -1,4 +1,4 @@
-"""What sits on a CAN bus: what the bus asks of a device, and what devices that move a joint have in common."""
+"""Devices on a CAN bus: the interface that the bus requires, and a base class for devices that move a joint."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Send = Callable[[Frame, float], None]
 
 
 class Device(Protocol):
-    """What sits on the bus. Everything is called from the bus's thread, with the time in seconds (monotonic)."""
+    """A device on the bus. The bus's thread makes all calls, with the time in seconds (monotonic)."""
 
     @property
     def device_id(self) -> int:
@@ -40,11 +40,11 @@ class Device(Protocol):
         ...
 
     def advance(self, t: float) -> None:
-        """Do what is due by itself by time `t`; `due` is later afterwards."""
+        """Run everything that is due by time `t`; `due` is later afterwards."""
         ...
 
     def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
         ...
 
     def heal(self, t: float) -> None:
@@ -69,7 +69,7 @@ class JointDevice(JointModel):
     """
 
     counts_per_unit: float = 1000
-    """In the log and in orders, where the device itself has no counts."""
+    """Resolution in the log and in orders, where the device itself has no counts."""
 
     def __init__(
         self, device_id: int, shaft: Shaft, *, joint: str, model: str, rad_per_unit: float, offset_rad: float
@@ -96,16 +96,16 @@ class JointDevice(JointModel):
 
     @abstractmethod
     def _place(self, position: float, t: float) -> None:
-        """Turn the shaft by hand, to a position as the device tells it."""
+        """Turn the shaft by hand, to a position as the device reports it."""
 
     @abstractmethod
     def _restart(self, t: float) -> None:
-        """Begin again, as after a loss of power."""
+        """Restart, as after a loss of power."""
 
     # where it is
 
     def _position(self, t: float) -> float:
-        """Where the shaft is, as the device tells it."""
+        """Where the shaft is, as the device reports it."""
         return self._shaft.position(t)
 
     def counts(self, t: float) -> int:
@@ -125,7 +125,7 @@ class JointDevice(JointModel):
     # faults
 
     def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it cannot have."""
+        """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
         super().do(command, t)
         self._plan(t)
 
@@ -148,7 +148,7 @@ class JointDevice(JointModel):
         self._plan(t)
 
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
-        """Let the measured position stand still, or show the truth again."""
+        """Freeze the measured position, or show the truth again."""
         self._frozen = (self._position(t), 0.0) if on else None
 
     def brown_out(self, t: float) -> None:

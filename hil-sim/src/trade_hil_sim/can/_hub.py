@@ -1,4 +1,4 @@
-"""The adapter: a TCP port that talks to clients as socketcand does. It knows text and sockets, but no wire."""
+"""The adapter: a TCP port that speaks to clients as socketcand does. It handles text and sockets, not the wire."""
 
 import socket
 import time
@@ -19,13 +19,13 @@ LOOPBACK: Final = "127.0.0.1"
 SETTLE_S: Final = 0.05
 """A client expects the last word of the greeting alone in its segment: frames wait this long, or for its first."""
 SEND_BUFFER: Final = 32_768
-"""Bytes the system may keep for a client: a driver that lay frozen wakes to little that is old."""
+"""Bytes that the system buffers for a client: small, so that a driver that was frozen finds few old frames."""
 MOST_UNSENT: Final = 65_536
-"""Bytes kept for a client that does not read; what comes on top is lost, as in a full receive buffer."""
+"""Bytes kept for a client that does not read; later ones are lost, as in a full receive buffer."""
 
 
 class HubClient:
-    """One connection. It is opened, then put in raw mode, then it sends and is told frames."""
+    """One connection. It is opened, then put in raw mode, then it sends and receives frames."""
 
     def __init__(self, connection: socket.socket, number: int) -> None:
         self.name = f"client{number}"
@@ -52,11 +52,11 @@ class HubClient:
         return True
 
     def tell_frame(self, frame: Frame, wall_s: float) -> bool:
-        """Queue what it is told of a frame; False if it is lost."""
+        """Queue a frame for the client; False if it is lost."""
         return self.tell(frame_text(frame, wall_s))
 
     def tell_error(self, bits: int, wall_s: float) -> bool:
-        """Queue what it is told of an error."""
+        """Queue an error for the client."""
         return self.tell(error_text(bits, wall_s))
 
     def flush(self) -> None:
@@ -94,22 +94,22 @@ class Hub:
 
     @property
     def port(self) -> str:
-        """What a client is given: ``socketcand:127.0.0.1:29536/can0``."""
+        """What a client opens: ``socketcand:127.0.0.1:29536/can0``."""
         return f"socketcand:{LOOPBACK}:{self.tcp_port}/{self.channel}"
 
     @property
     def plugged(self) -> bool:
-        """Whether anybody can connect."""
+        """Whether clients can connect."""
         return self._listener is not None
 
     @property
     def clients(self) -> Iterable[HubClient]:
-        """Those in raw mode."""
+        """Clients in raw mode."""
         return tuple(client for client in self._clients if client.raw)
 
     def open(self) -> None:
         """Take a port and listen on it."""
-        # bound but never listening, it keeps the number ours while the adapter is unplugged
+        # bound but never listening, it reserves the port number while the adapter is unplugged
         self._holder = _bound(0)
         self.plug_in()
 
@@ -120,7 +120,7 @@ class Hub:
             self._listener.listen()
 
     def unplug(self) -> None:
-        """Refuse connections and hang up on everybody."""
+        """Refuse connections and disconnect all clients."""
         listener, self._listener = self._listener, None
         if listener is not None:
             listener.close()
@@ -128,7 +128,7 @@ class Hub:
             self._drop(client)
 
     def close(self) -> None:
-        """Unplug and let go of the port."""
+        """Unplug and free the port."""
         self.unplug()
         if self._holder is not None:
             self._holder.close()

@@ -1,4 +1,4 @@
-"""A SocketCAN interface as adapter: whoever opens a virtual interface of the system is on the simulated bus."""
+"""A SocketCAN interface as adapter: programs that open a virtual interface of the system join the simulated bus."""
 
 import socket
 import struct
@@ -27,13 +27,13 @@ EXTENDED_MASK: Final = 0x1FFF_FFFF
 
 
 class Interface:
-    """All programs that have opened one interface, as one client: the system does not tell them apart.
+    """All programs that have opened one interface, as one client: the system does not distinguish them.
 
-    Only a ``vcan`` will do: simulated drives have no business on a wire.
+    The interface must be a ``vcan``: simulated drives must not reach a real wire.
 
     Args:
         channel: the interface's name.
-        tenant: hears what is sent on it.
+        tenant: receives what is sent on it.
     """
 
     def __init__(self, channel: str, tenant: Tenant) -> None:
@@ -44,7 +44,7 @@ class Interface:
 
     @property
     def port(self) -> str:
-        """What a client is given: ``socketcan:vcan0``."""
+        """What a client opens: ``socketcan:vcan0``."""
         return f"socketcan:{self.channel}"
 
     @property
@@ -53,7 +53,7 @@ class Interface:
         return self._socket is not None
 
     def open(self) -> None:
-        """Join the interface; raises SimulationError if it is not there, or not virtual."""
+        """Join the interface; raises SimulationError if it does not exist or is not virtual."""
         where = Path("/sys/class/net") / self.channel
         if not where.exists():
             raise SimulationError(f"there is no interface {self.channel}; `ip link add {self.channel} type vcan`")
@@ -68,14 +68,14 @@ class Interface:
             self._tenant.joined(self)
 
     def unplug(self) -> None:
-        """Take the devices off it; whoever has it open hears nothing more."""
+        """Disconnect the devices; programs that have the interface open receive nothing more."""
         gone, self._socket = self._socket, None
         if gone is not None:
             gone.close()
             self._tenant.left(self)
 
     def close(self) -> None:
-        """Take them off."""
+        """Disconnect the devices."""
         self.unplug()
 
     def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
@@ -96,7 +96,7 @@ class Interface:
             except BlockingIOError:
                 return
             except OSError as bad:
-                if bad.errno != ENETDOWN:  # down it may come up again; anything else: it is gone
+                if bad.errno != ENETDOWN:  # an interface that is down may come up again; any other error: it is gone
                     self.unplug()
                 return
             head, length, payload = LAYOUT.unpack(data)
@@ -121,7 +121,7 @@ class Interface:
         return bool(sent)
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Do nothing: frames are sent at once, not queued."""
 
 
 def _joined(channel: str) -> socket.socket:

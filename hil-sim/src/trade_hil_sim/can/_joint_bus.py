@@ -22,7 +22,7 @@ __all__ = ["JointBus"]
 
 
 class JointBus(CanBus):
-    """Devices that move a joint each."""
+    """Devices that each move one joint."""
 
     kind: ClassVar[str]
     """What they are, for messages: ``ODrives``."""
@@ -30,7 +30,7 @@ class JointBus(CanBus):
     @classmethod
     @abstractmethod
     def device_for(cls, joint: "Joint", record: "CanRecord", t: float) -> Device:
-        """The device of a joint, at its zero or as near as its limits allow; raises SimulationError: it cannot be."""
+        """The device of a joint, as near to its zero as its limits allow; raises SimulationError if it is invalid."""
 
     @classmethod
     def from_robot(
@@ -48,13 +48,13 @@ class JointBus(CanBus):
         Args:
             bus: the bus's record.
             joints: the joints on it.
-            port: not used; clients are given `port` instead.
+            port: not used; clients open the property `port` instead.
             log: where to record.
-            paced: take as long as the real wire.
-            interface: a ``vcan`` of the system to sit on.
+            paced: take the time of the real wire.
+            interface: a ``vcan`` of the system to use.
 
         Raises:
-            SimulationError: an id or a model there cannot be, or a key that is missing.
+            SimulationError: an id or a model that is not possible, or a missing key.
         """
         from trade_drivers.robotfile import CanBus as CanRecord  # noqa: PLC0415 - a robot file has been read
 

@@ -12,7 +12,7 @@ __all__ = ["GREETING", "OK", "Reader", "error_text", "frame_text", "parse_send",
 GREETING: Final = b"< hi >"
 OK: Final = b"< ok >"
 LONGEST: Final = 256
-"""No command is longer; what goes on without an end is thrown away."""
+"""The greatest length of a command; longer ones are discarded."""
 COMMAND: Final = re.compile(rb"<([^<>]*)>")
 ERROR_FLAG: Final = 0x20000000
 STANDARD_DIGITS: Final = 3
@@ -26,7 +26,7 @@ class Reader:
         self._held = b""
 
     def feed(self, data: bytes) -> list[list[str]]:
-        """The commands that are now complete, each as its words; what stands between commands is ignored."""
+        """The commands that are now complete, each as its words; text between commands is ignored."""
         self._held += data
         commands, end = list[list[str]](), 0
         for match in COMMAND.finditer(self._held):
@@ -59,7 +59,7 @@ def parse_send(words: list[str]) -> Frame:
 
 
 def frame_text(frame: Frame, wall_s: float) -> bytes:
-    """What a client is told of a frame at `wall_s` seconds since the epoch; there is no word for a remote one."""
+    """The text for a frame at `wall_s` seconds since the epoch; remote frames have none."""
     if frame.remote:
         return b""
     name = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
@@ -67,10 +67,10 @@ def frame_text(frame: Frame, wall_s: float) -> bytes:
 
 
 def error_text(bits: int, wall_s: float) -> bytes:
-    """What a client is told of an error on the bus: the classes of linux/can/error.h."""
+    """The text for an error on the bus: the classes of linux/can/error.h."""
     return f"< error {ERROR_FLAG | bits:08X} {wall_s:.6f} >".encode()
 
 
 def refusal(reason: str) -> bytes:
-    """What a client is told when it cannot have what it asks."""
+    """The text that refuses a client's request."""
     return f"< error {reason} >".encode()

@@ -1,6 +1,6 @@
 """The wire of a CAN bus: one frame at a time, the lowest id first, as long as its bits last. Pure: time is an argument.
 
-Wire time follows real time but is not lengthened by it: a simulator that comes late lets pass, in order and with their
+Wire time follows real time but is not lengthened by it: a simulator that runs late delivers, in order and with their
 own times, the frames that a real wire would have carried meanwhile.
 """
 
@@ -19,7 +19,7 @@ PER_ERROR: Final = 8
 """What a destroyed frame adds to its sender's error counter; one that gets through takes 1 off (ISO 11898-1)."""
 BUS_OFF: Final = 256
 UNHEARD: Final = 10
-"""How many frames a sender keeps while nobody acknowledges them: the usual length of a transmit queue on Linux."""
+"""How many unacknowledged frames a sender keeps: the usual length of a transmit queue on Linux."""
 
 
 class _Waiting(NamedTuple):
@@ -32,7 +32,7 @@ class Station:
     """A controller on the bus: a client's or a device's. Frames of one station leave in the order they were sent.
 
     Args:
-        name: who it is, for the log.
+        name: for the log.
         device_id: of a device.
         deliver: gets every frame of the others, with its time in seconds.
     """
@@ -41,7 +41,7 @@ class Station:
         self.name, self.device_id, self.deliver = name, device_id, deliver
         self.connected = True
         self.off = False
-        """Bus-off: it has made too many errors, and neither sends nor hears."""
+        """Bus-off: after too many errors it neither sends nor receives."""
         self.errors = 0
         """Transmit error counter."""
         self.queue: list[_Waiting] = []
@@ -52,19 +52,19 @@ class Station:
         return self.connected and not self.off
 
     def fall_silent(self) -> None:
-        """Forget what was to be sent."""
+        """Discard queued frames."""
         self.queue.clear()
 
 
 class Referee(Protocol):
-    """Who decides what happens to frames, and hears what did."""
+    """Decides what happens to frames, and is notified of what did."""
 
     def corrupts(self, sender: Station, frame: Frame) -> bool:
         """Whether this frame is destroyed on its way."""
         ...
 
     def passed(self, sender: Station, frame: Frame, t: float) -> None:
-        """A frame got through; called before anybody hears it."""
+        """A frame got through; called before any station receives it."""
         ...
 
     def destroyed(self, sender: Station, frame: Frame, t: float) -> None:
@@ -72,7 +72,7 @@ class Referee(Protocol):
         ...
 
     def lost(self, sender: Station, frame: Frame, t: float) -> None:
-        """A frame was not taken: nobody acknowledges, and the sender's queue is full."""
+        """A frame was rejected: none are acknowledged, and the sender's queue is full."""
         ...
 
 
@@ -81,7 +81,7 @@ class Wire:
 
     Args:
         bitrate: bits a second; None: frames take no time.
-        referee: decides and hears.
+        referee: decides about frames and is notified of them.
     """
 
     def __init__(self, bitrate: int | None, referee: Referee) -> None:
@@ -95,11 +95,11 @@ class Wire:
         """How long frames have held the wire, in all."""
 
     def attach(self, station: Station) -> None:
-        """Let a station take part."""
+        """Add a station."""
         self._stations.append(station)
 
     def detach(self, station: Station) -> None:
-        """Take a station off; what it had not sent is lost, a frame that is under way is cut off."""
+        """Remove a station; its unsent frames are lost, and a frame under way is cut off."""
         self._stations.remove(station)
         station.fall_silent()
         if self._under_way is not None and self._under_way[0] is station:

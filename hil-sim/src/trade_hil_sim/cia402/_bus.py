@@ -59,7 +59,7 @@ class Cia402Bus(JointBus):
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no node id; there is 1 to 127')
         if joint.counts_per_rev is None:
             raise SimulationError(
-                f'joint."{joint.name}".counts_per_rev: missing; a CiA 402 drive does not tell its counts'
+                f'joint."{joint.name}".counts_per_rev: missing; a CiA 402 drive does not report its counts'
             )
         return Drive(
             joint.id,

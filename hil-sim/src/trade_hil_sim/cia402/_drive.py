@@ -22,9 +22,9 @@ VOLTAGE_ON: Final = 1 << 4
 NO_QUICK_STOP: Final = 1 << 5
 REMOTE: Final = 1 << 9
 MODE_LAG_S: Final = 0.004
-"""From a mode's being asked for to its being shown: a drive changes in its own time."""
+"""Time between the request for a mode and its display: a drive needs a while to change."""
 LOOK_S: Final = 0.005
-"""How often a drive compares where it is with where it should be."""
+"""How often a drive checks its following error."""
 FOLLOWING_ERROR: Final = 0x8611
 LINK_FAULT: Final = 0x8130
 OVER_VOLTAGE: Final = 0x3210
@@ -37,12 +37,12 @@ PRODUCT: Final = 402
 
 
 def _named(model: str) -> list[Object]:
-    """The objects of a drive that says it is of this model."""
+    """The objects of a drive that identifies as this model."""
     return [replace(o, default=model.encode()) if o.name == "device_name" else o for o in OBJECTS]
 
 
 class Drive(JointDevice):
-    """One drive; it boots when made.
+    """One drive; it boots when created.
 
     Args:
         device_id: its node id, 1 to 127.
@@ -106,7 +106,7 @@ class Drive(JointDevice):
             self._plan(t)
 
     def advance(self, t: float) -> None:
-        """Do what is due by itself."""
+        """Run what is due."""
         if self._mode_due <= t:
             self._change_mode(t)
         self.modes.advance(t)
@@ -117,7 +117,7 @@ class Drive(JointDevice):
         self._plan(t)
 
     def _plan(self, t: float) -> None:
-        """Show what is new, and say when to come again."""
+        """Publish changes, and return when to be called next."""
         self._note_motion(t)
         self._show(t)
         self.node.changed(t)
@@ -156,7 +156,7 @@ class Drive(JointDevice):
         return round(acceleration / self.store.get("max_acceleration") * FULL)
 
     def check(self, entry: Object, value: int) -> None:
-        """Refuse modes and methods there are not; raises `Abort`."""
+        """Refuse unsupported modes and methods; raises `Abort`."""
         if entry.name == "mode" and value not in SUPPORTED_MODES | {0}:
             raise Abort(AbortCode.VALUE)
         if entry.name in {"position_limit_min", "position_limit_max"}:
@@ -165,7 +165,7 @@ class Drive(JointDevice):
                 raise Abort(AbortCode.VALUE)
 
     def written(self, name: str, values: Sequence[tuple[Object, int]], t: float) -> None:
-        """Take what a client has written, all at once."""
+        """Apply what a client has written, all at once."""
         changes = [entry.name for entry, value in values if self.store.get(entry.name) != value]
         if changes or name == "sdo_write":
             self._written(name, values, bool(MOTION.intersection(changes)), t)
@@ -180,7 +180,7 @@ class Drive(JointDevice):
         self.modes.written(names, before, t)
 
     def link_lost(self, reason: str, t: float) -> None:
-        """Nobody is in charge any more: object 6007h says what a drive with power does."""
+        """React to the loss of the master: object 6007h says what a powered drive does."""
         match self.store.get("abort_connection_option") if self._machine.powered else 0:
             case 1:
                 self._machine.fail(LINK_FAULT, t, None)
@@ -192,12 +192,12 @@ class Drive(JointDevice):
                 self.note("unattended", t, reason)
 
     def link_back(self, t: float) -> None:
-        """The master is back; a fault stays, whatever caused it."""
+        """React to the master's return; a fault stays, whatever caused it."""
         if self.state_now not in {State.FAULT, State.FAULT_REACTION_ACTIVE}:
             self.node.emergency_over(t)
 
     def power_on(self, t: float) -> None:
-        """Everything is as it was made, but the shaft stays where it is."""
+        """Reset to the initial state; the shaft stays where it is."""
         self._mode_due = inf
         self._machine.enter(State.SWITCH_ON_DISABLED, t)
         self.modes.select(Mode.NONE, t)
@@ -223,7 +223,7 @@ class Drive(JointDevice):
     # sensors and faults
 
     def _look(self, t: float) -> None:
-        """Compare where it is with where it should be."""
+        """Check the following error."""
         self._look_due = t + LOOK_S
         self._shaft.rejoin(t)
         if abs(self._shaft.behind(t)) <= self.store.get("following_error_window"):
@@ -243,7 +243,7 @@ class Drive(JointDevice):
                 super()._do_rare(command, t)
 
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
-        """Let the measured position and speed stand still, or show the truth again."""
+        """Freeze the measured position and speed, or show the truth again."""
         self._frozen = (self._shaft.position(t), self._shaft.speed(t)) if on else None
 
     def _bus_off(self, on: bool, t: float) -> None:
@@ -252,7 +252,7 @@ class Drive(JointDevice):
             self.link_lost("bus-off", t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold the shaft fast, or let go of it."""
+        """Jam the shaft, or release it."""
         self._shaft.jam(on, t)
         if not on and self.state_now is State.OPERATION_ENABLED:
             self.modes.enable(t)
@@ -262,7 +262,7 @@ class Drive(JointDevice):
             self.jam(False, t)
 
     def _place(self, position: float, t: float) -> None:
-        """By hand; an enabled drive goes back to where it should be, or fails if that is too far."""
+        """Turn the shaft by hand; an enabled drive returns to its demand, or fails if that is too far."""
         demand = self._shaft.demand.at(t)[0]
         self._shaft.place(position + self.modes.zero, t)
         self.note("placed", t)
@@ -274,7 +274,7 @@ class Drive(JointDevice):
             self._shaft.go(t, demand, self.store.get("max_profile_velocity"), self.store.get("max_acceleration"))
 
     def wrong_model(self, number: int) -> None:
-        """Say that it is another product."""
+        """Identify as another product."""
         self.store.set("product_code", number)
 
     def _restart(self, t: float) -> None:

@@ -1,4 +1,4 @@
-"""Homing (CiA 402-2, 11): looking for a switch or an index pulse, and what is then called zero."""
+"""Homing (CiA 402-2, 11): searching for a switch or an index pulse, and setting zero there."""
 
 from collections.abc import Callable
 from math import ceil, floor, inf
@@ -43,7 +43,7 @@ class Homing:
         self.running, self.bits = False, REACHED
 
     def start(self, t: float) -> None:
-        """Look for what the method names."""
+        """Start to search for what the method names."""
         method = self._store.get("homing_method")
         if method not in METHODS:
             self.bits = FAILED | REACHED
@@ -63,18 +63,18 @@ class Homing:
                 return SWITCHES.get(method, here)
 
     def interrupt(self, t: float) -> None:
-        """Stop looking."""
+        """Stop the search."""
         if self.running:
             self.forget()
             self._shaft.spin(t, 0.0, self._store.get("homing_acceleration"))
 
     @property
     def due(self) -> float:
-        """When what is looked for is found; a shaft that is held never finds it."""
+        """When the search succeeds; never for a jammed shaft."""
         return self._shaft.demand.ends if self.running and not self._shaft.jammed else inf
 
     def advance(self, t: float) -> float | None:
-        """If it is found: where zero is on the shaft from now on. Home is at minus the home offset."""
+        """The new zero on the shaft, once the search has succeeded. Home is at minus the home offset."""
         if t < self.due:
             return None
         self.running, self.bits = False, REACHED | ATTAINED

@@ -1,4 +1,4 @@
-"""The state machine of a drive (CiA 402-2, 6.4): what commands and faults make of its state, and how motion ends."""
+"""The state machine of a drive (CiA 402-2, 6.4): how commands and faults change its state, and how motion ends."""
 
 from collections.abc import Callable
 from enum import Enum, IntEnum
@@ -14,7 +14,7 @@ __all__ = ["Command", "Emergencies", "Machine", "State", "command", "next_state"
 
 
 class State(IntEnum):
-    """States, as the bits of the statusword that tell them apart."""
+    """States, as the bits of the statusword that distinguish them."""
 
     SWITCH_ON_DISABLED = 0x40
     READY_TO_SWITCH_ON = 0x21
@@ -26,7 +26,7 @@ class State(IntEnum):
 
 
 class Command(Enum):
-    """What the lower bits of a controlword say."""
+    """Commands in the lower bits of a controlword."""
 
     DISABLE_VOLTAGE = "disable_voltage"
     QUICK_STOP = "quick_stop"
@@ -79,7 +79,7 @@ _TRANSITIONS: Final = {
 
 
 def next_state(state: State, wanted: Command) -> State:
-    """Where a command leads; a state that does not know it stays."""
+    """The next state for a command; other states ignore it."""
     return _TRANSITIONS.get(state, {}).get(wanted, state)
 
 
@@ -87,19 +87,19 @@ FAULT_RESET: Final = 1 << 7
 COAST: Final = 1_000_000.0
 """Counts/s^2 at which a shaft without power comes to rest."""
 STAYING: Final = 5
-"""Quick stop options from here on stay in quick stop active."""
+"""Quick stop options of at least this value stay in quick stop active."""
 POWERED: Final = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
 
 
 class Emergencies(Protocol):
-    """Who tells others of errors."""
+    """Reports errors to the network."""
 
     def emergency(self, code: int, t: float) -> None:
-        """There is an error."""
+        """Report an error."""
         ...
 
     def emergency_over(self, t: float) -> None:
-        """There is none any more."""
+        """Report that no error is left."""
         ...
 
 
@@ -119,7 +119,7 @@ class Machine:
         self.causes = set[int]()
         """Errors that cannot be reset because they last."""
         self._then: State | None = None
-        """The state that follows when the shaft has come to rest."""
+        """The next state once the shaft is at rest."""
 
     @property
     def powered(self) -> bool:
@@ -127,16 +127,16 @@ class Machine:
         return self.state in POWERED
 
     def due(self, t: float) -> float:
-        """When `advance` should be called, as of now; the ends of motions are for others to watch."""
+        """When `advance` should be called next; the ends of motions are watched elsewhere."""
         return t if self._then is not None and not self._shaft.moving(t) else inf
 
     def advance(self, t: float) -> None:
-        """Go on when the shaft has come to rest."""
+        """Enter the next state once the shaft is at rest."""
         if self._then is not None and not self._shaft.moving(t):
             self.enter(self._then, t)
 
     def obey(self, before: int, t: float, emergencies: Emergencies) -> None:
-        """Heed the controlword; `before` is as it was."""
+        """Apply the controlword; `before` is its previous value."""
         now = self._store.get("controlword")
         if self.state is State.FAULT:
             if now & FAULT_RESET and not before & FAULT_RESET:
@@ -156,7 +156,7 @@ class Machine:
         """Carry out a command of the state machine."""
         state = next_state(self.state, wanted)
         if state is self.state:
-            if self._then is not None and state is State.OPERATION_ENABLED:  # it was about to be left
+            if self._then is not None and state is State.OPERATION_ENABLED:  # leaving had begun
                 self._then = None
                 self._modes.enable(t)
             return
@@ -169,7 +169,7 @@ class Machine:
             self.enter(state, t)
 
     def _leave_operation(self, wanted: Command, state: State, t: float) -> None:
-        """Operation is left after slowing down, if the option for it says so."""
+        """Leave operation, after slowing down if the option for it says so."""
         if wanted is Command.QUICK_STOP:
             self._quick_stop(t)
             return
@@ -192,7 +192,7 @@ class Machine:
             self._then = State.SWITCH_ON_DISABLED
 
     def enter(self, state: State, t: float) -> None:
-        """Be in a state."""
+        """Enter a state."""
         had_power, has_power = self.state in POWERED, state in POWERED
         changed, self.state = state is not self.state, state
         self._then = None
@@ -209,7 +209,7 @@ class Machine:
             self._modes.stop(t, COAST)
 
     def fail(self, code: int, t: float, emergencies: Emergencies | None) -> None:
-        """Fail: react as object 605Eh says, then stay in fault until reset. Without `emergencies` nobody is told."""
+        """Fail: react as object 605Eh says, then stay in fault until reset. Without `emergencies`, report nothing."""
         self._store.set("error_code", code)
         self._note("shutdown", t, f"error {code:04X}h")
         if emergencies is not None:

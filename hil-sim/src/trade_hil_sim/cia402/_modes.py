@@ -1,4 +1,4 @@
-"""Modes of operation (CiA 402-2, 9 to 14): what set-points make of the shaft, and what the statusword says of them."""
+"""Modes of operation (CiA 402-2, 9 to 14): how set-points move the shaft, and what the statusword reports."""
 
 from collections.abc import Callable
 from enum import IntEnum
@@ -45,7 +45,7 @@ SET_POINT: Final = {
     Mode.CYCLIC_VELOCITY: {"target_velocity", "velocity_offset"},
     Mode.CYCLIC_TORQUE: {"target_torque", "torque_offset"},
 }
-"""What takes effect by being written; profile position and homing wait for bit 4 of the controlword."""
+"""Objects that take effect when written; profile position and homing wait for bit 4 of the controlword."""
 
 NO_HALT: Final = frozenset({Mode.CYCLIC_POSITION, Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE})
 """Bit 8 of the controlword means nothing in these (CiA 402-2, 12 to 14: set-points alone decide)."""
@@ -73,16 +73,16 @@ class Modes:
         self._acknowledged = False
         self._goal: float | None = None
         self._next: float | None = None
-        """A set-point that waits for the one before."""
+        """A set-point queued behind the present one."""
         self._speed = 0.0
-        """The speed wanted last."""
+        """The last target speed."""
         self._halted = False
         self._limited = False
 
     # from the drive
 
     def select(self, mode: Mode, t: float) -> None:
-        """Change the mode; what moves is stopped, unless the new mode has a set-point that takes effect at once."""
+        """Change the mode and stop any motion, unless the new mode has a set-point that takes effect at once."""
         self.mode = mode
         self._forget()
         if self.enabled:
@@ -90,7 +90,7 @@ class Modes:
             self._follow(t)
 
     def enable(self, t: float) -> None:
-        """Operation is enabled: cyclic and velocity set-points take effect as they stand, whoever wrote them."""
+        """Operation is enabled: cyclic and velocity set-points take effect with the values that they have."""
         self.enabled = True
         self._forget()
         self._shaft.forget(t)
@@ -108,7 +108,7 @@ class Modes:
         self._shaft.spin(t, 0.0, deceleration)
 
     def written(self, names: set[str], before: int, t: float) -> None:
-        """Objects have been written; `before` is the controlword as it was."""
+        """Objects have been written; `before` is the previous controlword."""
         if not self.enabled:
             return
         now = self._store.get("controlword")
@@ -134,13 +134,13 @@ class Modes:
         return min(dues)
 
     def next_show(self, t: float) -> float:
-        """When the bits may change after `t` without anybody's doing."""
+        """When the bits may change by themselves after `t`."""
         window_s = self._store.get("position_window_ms") / 1e3
         reached_at = self._shaft.actual.ends + window_s if self._goal is not None else inf
         return min(self._shaft.next_corner(t), reached_at if reached_at > t else inf)
 
     def advance(self, t: float) -> None:
-        """Do what is due."""
+        """Run what is due."""
         if self._shaft.settles_at is not None and t >= self._shaft.settles_at:
             self._shaft.settle(t, self._top_speed(), self._store.get("max_acceleration"))
         if self._next is not None and t >= self._shaft.demand.ends:
@@ -152,7 +152,7 @@ class Modes:
             self.zero = self.zero if zero is None else zero
 
     def bits(self, t: float) -> int:
-        """What the statusword says of the mode: bits 10 to 13."""
+        """Bits 10 to 13 of the statusword, which depend on the mode."""
         if not self.enabled:
             return 0
         limited = LIMITED if self._limited else 0
@@ -232,7 +232,7 @@ class Modes:
             self.homing.interrupt(t)
 
     def _follow(self, t: float) -> None:
-        """Make for the set-point of a mode that has a standing one."""
+        """Move to the set-point, in modes whose set-point stays in effect."""
         match self.mode:
             case Mode.PROFILE_VELOCITY:
                 self._spin(self._store.get("target_velocity"), self._store.get("profile_acceleration"), t)
@@ -253,7 +253,7 @@ class Modes:
                 pass
 
     def _push(self, torque: int, acceleration: float, t: float) -> None:
-        """A torque turns a shaft against its friction: the speed it ends at is proportional to it."""
+        """Turn the shaft against friction: the final speed is proportional to the torque."""
         most = self._store.get("max_torque")
         self._spin(min(most, max(-most, torque)) / FULL * self._top_speed(), acceleration, t)
 
@@ -279,7 +279,7 @@ class Modes:
         return goal
 
     def _limits(self) -> tuple[float, float]:
-        """On the shaft; none where the objects have their defaults."""
+        """Position limits on the shaft; none where the objects have their defaults."""
         low, high = self._store.get("position_limit_min"), self._store.get("position_limit_max")
         return (
             -inf if low == -(2**31) else low + self.zero,

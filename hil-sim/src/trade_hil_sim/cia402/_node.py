@@ -21,13 +21,13 @@ HISTORY: Final = 8
 FIRST_PDO: Final = 0x1400
 LAST_PDO: Final = 0x1BFF
 PROFILE: Final = 0x6000
-"""Objects from here on are the drive's."""
+"""Objects with this index or a greater one belong to the drive."""
 REGISTER_BITS: Final = {0x2: 0b10, 0x3: 0b100, 0x4: 0b1000, 0x81: 0b1_0000, 0x82: 0b1_0000, 0x8: 0b10_0000}
 """Bits of the error register, besides the generic one, by the first digits of an error code (CiA 301)."""
 
 
 class NodeState(IntEnum):
-    """States of network management, as a heartbeat tells them."""
+    """States of network management, as a heartbeat reports them."""
 
     BOOTING = 0x00
     STOPPED = 0x04
@@ -64,7 +64,7 @@ class Node:
         return min(self._boots_at, self._beats_at, self._pdos.due, *self._lost_at.values())
 
     def advance(self, t: float) -> None:
-        """Do what is due."""
+        """Run what is due."""
         if t >= self._boots_at:
             self._boot(t)
         if t >= self._beats_at:
@@ -139,7 +139,7 @@ class Node:
     # power and heartbeats
 
     def reset(self, t: float, *, power: bool = True) -> None:
-        """Forget what was written, and boot. Without `power` the drive's own objects are kept, but motion ends."""
+        """Reset all objects, and boot. Without `power` the drive's own objects are kept, but motion ends."""
         kept = {} if power else {o.name: self._store.get(o.name) for o in self._store.numbers if o.index >= PROFILE}
         self._store.reset()
         for name, value in kept.items():
@@ -172,7 +172,7 @@ class Node:
         self._start_beating(t)
 
     def _hear_heartbeat(self, node: int, t: float) -> None:
-        """Watching begins with the first heartbeat (CiA 301, 7.2.8.3.2.2)."""
+        """Monitor a heartbeat from its first message on (CiA 301, 7.2.8.3.2.2)."""
         for slot in CONSUMERS:
             setting = self._store.get(f"consumer_heartbeat_{slot}")
             if setting >> 16 & 0x7F == node and setting & 0xFFFF:
@@ -195,7 +195,7 @@ class Node:
     # emergencies
 
     def emergency(self, code: int, t: float) -> None:
-        """Tell of an error, and remember it."""
+        """Report an error, and record it."""
         bits = REGISTER_BITS.get(code >> 8) or REGISTER_BITS.get(code >> 12) or 0b1000_0000
         self._store.set("error_register", self._store.get("error_register") | 1 | bits)
         recent = [code, *(self._store.get(f"error_history_{k}") for k in range(1, HISTORY))]
@@ -205,7 +205,7 @@ class Node:
         self._tell(code, t)
 
     def emergency_over(self, t: float) -> None:
-        """Tell that no error is left."""
+        """Report that no error is left."""
         if self._store.get("error_register"):
             self._store.set("error_register", 0)
             self._tell(0, t)
@@ -218,7 +218,7 @@ class Node:
             self._app.put(Frame(cob_id & 0x7FF, data), t)
 
     def changed(self, t: float) -> None:
-        """Something may have happened that event-driven PDOs carry."""
+        """Send event-driven PDOs whose values may have changed."""
         self._pdos.changed(t)
 
     # the dictionary, as the SDO server wants it

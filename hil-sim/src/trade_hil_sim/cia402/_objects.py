@@ -36,7 +36,7 @@ class Object:
     low: int | None = None
     high: int | None = None
     measured: bool = False
-    """Whether it changes by itself all the time, so that a change of it is no event."""
+    """Whether it changes continuously, so that a change of it is no event."""
 
     @property
     def size(self) -> int:
@@ -53,7 +53,7 @@ class Object:
         return (value & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
 
     def decode(self, data: bytes) -> int:
-        """The value bytes on the wire stand for."""
+        """The value of bytes on the wire."""
         return int.from_bytes(data, "little", signed=self.signed)
 
 

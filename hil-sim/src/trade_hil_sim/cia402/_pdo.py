@@ -13,11 +13,11 @@ from ._store import Abort, AbortCode, Store
 __all__ = ["Application", "Pdos"]
 
 FIRST_OBJECT: Final = 0x1000
-"""Below are data types, which a map may name to skip bytes."""
+"""Lower indices are data types, which a map may name to skip bytes."""
 FIRST_SENT: Final = 0x1800
 """Objects of transmit PDOs begin here; those of receive PDOs come before."""
 NUMBER: Final = 0x1FF
-"""The part of an index that tells which PDO."""
+"""The part of an index that gives the PDO's number."""
 INVALID: Final = 1 << 31
 LAST_SYNC_TYPE: Final = 240
 EVENT_TYPES: Final = (254, 255)
@@ -29,7 +29,7 @@ FORMATS: Final = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32
 
 
 class Application(Protocol):
-    """The device behind its communication."""
+    """The device, as its communication side uses it."""
 
     def refresh(self, t: float) -> None:
         """Bring measured values up to date."""
@@ -40,19 +40,19 @@ class Application(Protocol):
         ...
 
     def written(self, name: str, values: Sequence[tuple[Object, int]], t: float) -> None:
-        """Take what has been written, by ``sdo_write`` or ``rpdo1`` and so on, all at once."""
+        """Apply what has been written, by ``sdo_write`` or ``rpdo1`` and so on, all at once."""
         ...
 
     def link_lost(self, reason: str, t: float) -> None:
-        """Nobody is in charge any more: the abort connection option applies."""
+        """React to the loss of the master: the abort connection option applies."""
         ...
 
     def link_back(self, t: float) -> None:
-        """Whose heartbeat was missed is back."""
+        """React to the return of a missed heartbeat."""
         ...
 
     def power_on(self, t: float) -> None:
-        """Start anew; the store has its defaults."""
+        """Start again; the store has its defaults."""
         ...
 
     def put(self, frame: Frame, t: float) -> None:
@@ -84,7 +84,7 @@ class _Pdo:
         self.last: tuple[int, ...] | None = None
         """Values sent last that are not measured."""
         self.waits = False
-        """Whether it is to be sent when the inhibit time is over."""
+        """Whether to send it when the inhibit time is over."""
         self.syncs = 0
         self.held: bytes | None = None
         """Received, and to take effect at the next SYNC."""
@@ -105,8 +105,8 @@ class _Pdo:
 class Pdos:
     """The PDOs of one device.
 
-    An event is a change of a mapped value that does not change by itself all the time: of the statusword, say, but not
-    of the position. What moves is sent by the event timer or at SYNC.
+    An event is a change of a mapped value that does not change continuously: of the statusword, for example, but not
+    of the position. Continuous values are sent by the event timer or at SYNC.
 
     Args:
         store: the device's objects.
@@ -129,7 +129,7 @@ class Pdos:
         """Identifiers of the PDOs it receives."""
 
     def reload(self, index: int) -> None:
-        """An object of a PDO has been written: that PDO begins anew."""
+        """An object of a PDO has been written: that PDO restarts."""
         kind, pdos = ("r", self._received) if index < FIRST_SENT else ("t", self._sent)
         number = index & NUMBER
         pdos[number] = _Pdo(self._store, kind, number + 1)
@@ -157,7 +157,7 @@ class Pdos:
                 self._send(pdo, t)
 
     def hear(self, frame: Frame, t: float) -> bool:
-        """Take a frame if it is one of these PDOs; says whether it is."""
+        """Take a frame if it is one of these PDOs; return whether it is."""
         for pdo in self._received:
             if self.running and pdo.valid and pdo.can_id == frame.can_id:
                 self._hear(pdo, frame.data, t)
@@ -177,7 +177,7 @@ class Pdos:
                 self._apply(pdo, held, t)
 
     def changed(self, t: float) -> None:
-        """Something may have happened: send what carries it."""
+        """Send the PDOs whose values may have changed."""
         for pdo in self._sent:
             if self.running and pdo.valid and not pdo.synchronous and self._events(pdo) != pdo.last:
                 if t < pdo.sent_at + pdo.inhibit_s:
@@ -188,7 +188,7 @@ class Pdos:
     # SDO writes to PDO objects
 
     def check(self, entry: Object, value: int) -> None:
-        """Refuse what must not be written to a PDO's objects; raises `Abort`."""
+        """Refuse invalid writes to a PDO's objects; raises `Abort`."""
         index, kind, number = entry.index, "r" if entry.index < FIRST_SENT else "t", entry.index & NUMBER
         name = f"{kind}pdo{number + 1}"
         valid = not self._store.get(f"{name}_cob_id") & INVALID
@@ -255,7 +255,7 @@ class Pdos:
 
 
 def _mapped(store: Store, kind: str, value: int) -> Object:
-    """The object a map's entry stands for; raises `Abort` if a PDO of this kind cannot carry it."""
+    """The object that a map's entry names; raises `Abort` if a PDO of this kind cannot carry it."""
     index, sub, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
     dummy = next((entry for entry in DUMMIES if (entry.index, entry.sub) == (index, sub)), None)
     entry = store.find(index, sub) if dummy is None else dummy

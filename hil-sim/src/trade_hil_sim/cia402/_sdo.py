@@ -10,7 +10,7 @@ EXPEDITED: Final = 4
 """Up to this many bytes fit into the first frame."""
 SEGMENT: Final = 7
 LONGEST: Final = 1024
-"""No object is longer."""
+"""The greatest length of an object."""
 REQUEST: Final = 8
 
 
@@ -33,18 +33,18 @@ class SdoServer:
         self._dictionary = dictionary
         self._address = (0, 0)
         self._rest: bytes | None = None
-        """What is still to be uploaded."""
+        """Bytes still to be uploaded."""
         self._taken: bytearray | None = None
-        """What has been downloaded so far."""
+        """Bytes downloaded so far."""
         self._size: int | None = None
         self._toggle = 0
 
     def reset(self) -> None:
-        """Forget a transfer that is under way."""
+        """Discard a transfer that is under way."""
         self._rest = self._taken = None
 
     def answer(self, request: bytes, t: float) -> bytes | None:
-        """The answer to a request, if it gets one."""
+        """The answer to a request, if there is one."""
         if len(request) != REQUEST:
             return None
         try:

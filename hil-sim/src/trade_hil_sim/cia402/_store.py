@@ -1,4 +1,4 @@
-"""The values behind the object dictionary, and what an SDO client is told when it asks for the impossible."""
+"""The values of the object dictionary, and the abort codes for invalid SDO requests."""
 
 from collections.abc import Iterable
 from enum import IntEnum
@@ -39,7 +39,7 @@ class Store:
     """Values of objects, by address and by name.
 
     Args:
-        objects: which there are.
+        objects: of the dictionary.
     """
 
     def __init__(self, objects: Iterable[Object]) -> None:
@@ -55,7 +55,7 @@ class Store:
         return [entry for entry in self._objects.values() if entry.name in self._values]
 
     def reset(self) -> None:
-        """Forget everything that was written."""
+        """Reset all values to their defaults."""
         self._values = {o.name: o.default for o in self._objects.values() if isinstance(o.default, int)}
 
     def find(self, index: int, sub: int) -> Object:
@@ -71,7 +71,7 @@ class Store:
         return self._values[name]
 
     def set(self, name: str, value: int) -> None:
-        """Change the value of a number, whatever its access; what does not fit is cut to the nearest that does."""
+        """Change the value of a number, whatever its access; a value out of range becomes the nearest in range."""
         low, high = self._ranges[name]
         self._values[name] = value if low <= value <= high else min(high, max(low, value))
 
@@ -80,7 +80,7 @@ class Store:
         return entry.default if isinstance(entry.default, bytes) else entry.encode(self._values[entry.name])
 
     def check(self, entry: Object, data: bytes) -> int:
-        """The value a client wants written; raises `Abort` if it must not be."""
+        """The value that a client writes; raises `Abort` if the write is not allowed."""
         if entry.access == "ro":
             raise Abort(AbortCode.READ_ONLY)
         if len(data) != entry.size:

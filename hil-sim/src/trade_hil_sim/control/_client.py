@@ -1,4 +1,4 @@
-"""Steering a running simulator: a typed client of its control socket."""
+"""A typed client of a running simulator's control socket."""
 
 import socket
 import threading
@@ -18,22 +18,22 @@ __all__ = ["SimControl"]
 
 _Truth = TypeVar("_Truth", DeviceState, GripperTruth, ArmTruth)
 ANSWER_S: Final = 10.0
-"""How long a simulator may take over a command."""
+"""How long a simulator may take to carry out a command."""
 
 
 class SimControl(FaultMethods):
-    """Makes things happen in a running simulator. Threads may share one.
+    """Injects faults into a running simulator and carries out orders. Threads may share one.
 
     Each fault and order is a method of its name, and `do` takes it as a value. In every method, `ids` are device ids
-    (default: all) and `bus` is the name of a bus (default: every bus). Of a fault of answers, `instruction` is the one
-    whose answers it strikes (default: any), `skip` how many of them go out unharmed first, and `count` how many it
-    strikes (default: all until `heal`).
+    (default: all) and `bus` is the name of a bus (default: every bus). For a fault of answers, `instruction` is the one
+    whose answers it affects (default: any), `skip` how many of them go out intact first, and `count` how many it
+    affects (default: all until `heal`).
 
     Args:
         path: the socket, as the simulator's ready line names it.
 
     Raises:
-        SimulationError: nobody listens there; later, whatever the simulator refuses, with what would be right.
+        SimulationError: no simulator listens there; later, whenever it refuses a command, with what would be valid.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -48,7 +48,7 @@ class SimControl(FaultMethods):
             raise SimulationError(f"no simulator listens on {path}: {problem}") from None
 
     def close(self) -> None:
-        """Hang up. Idempotent; the simulator goes on."""
+        """Disconnect. Idempotent; the simulator keeps running."""
         self._socket.close()
 
     def __enter__(self) -> "SimControl":
@@ -67,7 +67,7 @@ class SimControl(FaultMethods):
         """The truth about one device, by its joint's name or its id.
 
         Raises:
-            SimulationError: no such device; names those there are. The same if an id is on two buses.
+            SimulationError: no such device, or an id that is on two buses; names the devices.
         """
         devices = [device for bus in self.state() for device in bus.devices]
         return _only("devices", which, [(device.joint, device) for device in devices])
@@ -76,7 +76,7 @@ class SimControl(FaultMethods):
         """The truth about one gripper, by its name or its id.
 
         Raises:
-            SimulationError: no such gripper; names those there are. The same if an id is on two buses.
+            SimulationError: no such gripper, or an id that is on two buses; names the grippers.
         """
         grippers = [gripper for bus in self.state() for gripper in bus.grippers]
         return _only("grippers", which, [(one.gripper, one) for one in grippers])
@@ -85,7 +85,7 @@ class SimControl(FaultMethods):
         """The truth about one arm, by its name.
 
         Raises:
-            SimulationError: no such arm; names those there are.
+            SimulationError: no such arm; names the arms.
         """
         arms = [arm for bus in self.state() for arm in bus.arms]
         return _only("arms", which, [(arm.arm, arm) for arm in arms])

@@ -1,4 +1,4 @@
-"""Faults and orders as the words of a command line: ``jam ids=4 bus=wrist``. Pure."""
+"""Faults and orders as arguments of a command line: ``jam ids=4 bus=wrist``. Pure."""
 
 import inspect
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ _KINDS: Final = {**kinds_of(Command), "state": State}
 
 
 def command_of(words: Sequence[str]) -> Command | State:
-    """The command that these words name, a fault and its ``KEY=VALUE``.
+    """The command that these arguments name, a fault and its ``KEY=VALUE``.
 
     Raises:
-        SimulationError: they name none; says what would be right.
+        SimulationError: they name none; says what would be valid.
     """
     name, *pairs = words
     kind = _KINDS.get(name)
@@ -34,10 +34,10 @@ def command_of(words: Sequence[str]) -> Command | State:
 
 def listing() -> str:
     """A line for each fault: its keys but ``bus``, and what it does."""
-    return "".join(f"  {name:<15} {_told(kind)}\n" for name, kind in sorted(_KINDS.items()))
+    return "".join(f"  {name:<15} {_described(kind)}\n" for name, kind in sorted(_KINDS.items()))
 
 
-def _told(kind: type[msgspec.Struct]) -> str:
+def _described(kind: type[msgspec.Struct]) -> str:
     keys = " ".join(key for key in kind.__struct_fields__ if key != "bus")
     said = (inspect.getdoc(kind) or "").splitlines()[0].replace("`", "")
     return f"{said} [{keys}]" if keys else said
@@ -55,5 +55,5 @@ def _value(key: str, text: str) -> object:
 
 
 def _number(text: str) -> object:
-    """What the kind makes a number of; one in hex is one already."""
+    """A number in hex; other text is left for the kind to convert."""
     return int(text, 16) if text.startswith("0x") else text

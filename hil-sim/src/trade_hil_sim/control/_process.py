@@ -30,7 +30,7 @@ END_S: Final = 5.0
 
 
 def _own_folder() -> tuple[Path, BinaryIO]:
-    """A new folder, and the open file that shows that its owner lives: the lock on it ends with the process."""
+    """A new folder, and an open file whose lock shows that its owner is alive: the lock ends with the process."""
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
     sign = (folder / _OWNER).with_suffix(".new").open("wb")
     fcntl.flock(sign, fcntl.LOCK_EX)
@@ -44,7 +44,7 @@ def remove_leftovers() -> list[Path]:
     """Remove the temporary folders of this user's simulators whose owner was killed; returns them."""
     removed: list[Path] = []
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):  # another user's, or another kind of folder, or its owner lives
+        with contextlib.suppress(OSError):  # another user's, or another kind of folder, or its owner is alive
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
                 continue
             with (folder / _OWNER).open("rb") as sign:
@@ -71,12 +71,12 @@ class SimProcess:
         buses: only these; default: all.
         log: file for the byte log; default: one that `close` removes.
         logged: False writes no log: it grows by about 100 kB a second.
-        directory: where ports and control socket go; default: a temporary one that `close` removes.
-        paced: take as long as the real wires.
+        directory: of ports and control socket; default: a temporary one that `close` removes.
+        paced: take the time of the real wires.
         ready_s: how long it may take to start, in seconds.
 
     Raises:
-        SimulationError: it did not start; with what it said.
+        SimulationError: it did not start; includes its output.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class SimProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=complaints,
-                start_new_session=True,  # Ctrl-C is for the driver: it needs its devices to leave them in order
+                start_new_session=True,  # Ctrl-C is for the driver: it needs its devices to shut them down in order
             )
         try:
             self._ready = self._wait_ready(ready_s)
@@ -118,19 +118,19 @@ class SimProcess:
 
     @property
     def ports(self) -> dict[str, str]:
-        """What to open for each bus."""
+        """The port to open for each bus."""
         return dict(self._ready.ports)
 
     @property
     def log_path(self) -> Path:
-        """The byte log, being written. Raises SimulationError if there is none."""
+        """The path of the byte log. Raises SimulationError if there is none."""
         if self._ready.log is None:
             raise SimulationError("this simulator writes no log; start it with logged=True")
         return Path(self._ready.log)
 
     @property
     def control(self) -> SimControl:
-        """Makes things happen in the simulator."""
+        """Injects faults into the simulator and carries out orders."""
         if self._control is None:
             raise SimulationError("the simulator has been closed")
         return self._control
@@ -142,7 +142,7 @@ class SimProcess:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether it is still running."""
         return self._process.poll() is None
 
     @property
@@ -155,12 +155,12 @@ class SimProcess:
         return read_log(self.log_path)
 
     def kill(self) -> None:
-        """End it at once, as a power cut does to the computer it runs on; links stay behind until `close`."""
+        """Kill it at once, like a power cut of its computer; links stay behind until `close`."""
         self._process.kill()
         self._process.wait(END_S)
 
     def close(self) -> None:
-        """End it and remove what it left, the log with it unless one was named. Idempotent."""
+        """End it and remove its files, including the log unless one was named. Idempotent."""
         if self._control is not None:
             self._control.close()
             self._control = None

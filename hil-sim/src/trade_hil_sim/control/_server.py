@@ -1,6 +1,6 @@
-"""The control socket: one line of JSON in, one out. Faults come in here while a robot is being simulated.
+"""The control socket: one line of JSON in, one out. It receives faults while a robot is simulated.
 
-Every `Command` is taken, and ``{"do": "state"}``. Answers are ``{"ok": true}``, with ``"buses"`` for a
+It accepts every `Command`, and ``{"do": "state"}``. Answers are ``{"ok": true}``, with ``"buses"`` for a
 state, or ``{"error": "..."}``.
 """
 
@@ -47,11 +47,11 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ControlServer:
-    """Listens on a Unix socket and steers buses. One thread serves all clients.
+    """Listens on a Unix socket and controls buses. One thread serves all clients.
 
     Args:
         path: the socket; made by `open`, removed by `close`.
-        buses: what to steer.
+        buses: to control.
     """
 
     def __init__(self, path: Path, buses: "Sequence[SimulatedBus]") -> None:
@@ -62,7 +62,7 @@ class ControlServer:
         self._closing = False
 
     def open(self) -> "ControlServer":
-        """Begin to listen."""
+        """Start to listen."""
         if len(os.fsencode(self.path)) > LONGEST_PATH:
             raise SimulationError(f"{self.path} is too long for a socket; give a shorter path, such as /tmp/sim.sock")
         self._listener = _listen(self.path)
@@ -72,7 +72,7 @@ class ControlServer:
         return self
 
     def close(self) -> None:
-        """Hang up on everybody and remove the socket. Idempotent."""
+        """Disconnect all clients and remove the socket. Idempotent."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -89,7 +89,7 @@ class ControlServer:
         self.close()
 
     def answer(self, line: bytes) -> Answer:
-        """What one line of command gets."""
+        """The answer to one line of command."""
         try:
             command = self._decoder.decode(line)
             if isinstance(command, State):
@@ -103,7 +103,7 @@ class ControlServer:
         return Answer(ok=True)
 
     def _meant(self, command: Command) -> "list[tuple[SimulatedBus, Command]]":
-        """Which bus gets what: without a bus's name, each the ids it has."""
+        """The command for each bus; without a bus's name, each bus gets the ids that it has."""
         ids: tuple[int, ...] | None = getattr(command, "ids", None)
         if command.bus is not None:
             if command.bus not in self._buses:
@@ -180,7 +180,7 @@ def _listen(path: Path) -> socket.socket:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the socket of a simulator that was killed, but not that of a living one."""
+    """Remove the socket of a simulator that was killed, but not that of a running one."""
     if path.is_socket():
         with socket.socket(socket.AF_UNIX) as probe:
             try:

@@ -23,7 +23,7 @@ class DamiaoBus(JointBus):
 
     @staticmethod
     def label(frame: Frame) -> tuple[str, int | None]:
-        """Name of a frame, and the motor it comes from or goes to, if answers have the ids their vendor's tool sets."""
+        """Name of a frame, and its motor, if answers have the ids that the vendor's tool sets."""
         data = frame.data
         if frame.extended or frame.remote:
             return "", None

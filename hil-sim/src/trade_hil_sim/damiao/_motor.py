@@ -18,23 +18,23 @@ __all__ = ["Motor"]
 QUICK: Final = 400.0
 """The most it accelerates, in rad/s^2: an assumption, as are the two below."""
 COAST: Final = 60.0
-"""What friction slows it down by without torque, in rad/s^2."""
+"""Deceleration by friction without torque, in rad/s^2."""
 INERTIA: Final = 0.02
 """Newton metres for one rad/s^2."""
 FOLLOW_S: Final = 0.02
-"""In which a near set-point is reached, if they come often: an assumption."""
+"""Time to reach a near set-point, if set-points come often: an assumption."""
 SLOWEST_S: Final = 0.2
 HARDLY_RAD: Final = 5e-4
-"""Nearer than it can tell."""
+"""Below its resolution."""
 VOLTS: Final = (15.0, 52.0)
 HOTTEST_C: Final = 120
 
 
 class Motor(JointDevice):
-    """One motor; it is disabled when made.
+    """One motor; it is disabled when created.
 
     Args:
-        device_id: what it listens to, 1 to 15; it answers as that and 16.
+        device_id: the id it listens to, 1 to 15; it answers with that id plus 16.
         joint: name of the joint, for the log.
         model: ``DM4310`` or another of `MODELS`.
         gear: turns of the motor's own shaft for one turn of the joint.
@@ -67,13 +67,13 @@ class Motor(JointDevice):
             offset_rad=offset_rad,
         )
         self._zero = 0.0
-        """Where its shaft was when it was told to call that 0."""
+        """Where its shaft was when a command set the zero there."""
         self._goal = position_rad
         self._registers: dict[int, float] = {}
         self._power_on()
         self._status = Status.DISABLED
         self._lasting: Status | None = None
-        """What it complains of again when it is cleared."""
+        """Errors that return when they are cleared."""
         self._fed = t
         self._followed = t
         self._plan(t)
@@ -94,13 +94,13 @@ class Motor(JointDevice):
 
     @property
     def ranges(self) -> table.Ranges:
-        """What its numbers mean, as it is set now."""
+        """The present ranges of its numbers."""
         most = (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX)
         return table.Ranges(*(self._registers[number] for number in most))
 
     @property
     def mode(self) -> int:
-        """Which commands it obeys."""
+        """The mode: which commands it obeys."""
         return int(self._registers[Register.CONTROL_MODE])
 
     @property
@@ -124,11 +124,11 @@ class Motor(JointDevice):
         if about:
             self._asked(frame.data, t)
         else:
-            self._told(base, frame.data, t)
+            self._command(base, frame.data, t)
         self._plan(t)
 
     def advance(self, t: float) -> None:
-        """Do what is due by itself."""
+        """Run what is due."""
         if self._expires() <= t:
             self.note("watchdog_expired", t)
             self._fail(Status.LOST_COMMUNICATION, t)
@@ -145,7 +145,7 @@ class Motor(JointDevice):
         ticks = self._registers[Register.TIMEOUT]
         return self._fed + ticks / table.TICKS_PER_S if self._enabled and ticks else inf
 
-    # what it is asked
+    # questions
 
     def _asked(self, data: bytes, t: float) -> None:
         kind, number = data[2], data[3]
@@ -188,9 +188,9 @@ class Motor(JointDevice):
             return copysign(self.ranges.torque_nm, self._shaft.behind(t))
         return self._shaft.actual.at(t)[2] * INERTIA
 
-    # what it is told
+    # commands
 
-    def _told(self, base: int, data: bytes, t: float) -> None:
+    def _command(self, base: int, data: bytes, t: float) -> None:
         if base == 0 and len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in ORDERS:
             self._ordered(data, t)
         elif base == 0 and len(data) == 8:
@@ -260,7 +260,7 @@ class Motor(JointDevice):
             self._journal(name, data, True, t)
 
     def _follow(self, most: float, before: float, t: float) -> None:
-        """Near set-points that come one after the other are run through, not stopped at."""
+        """Pass through near set-points that follow each other, without a stop."""
         period_s, self._followed = max(FOLLOW_S, 2 * (t - self._followed)), t
         if not self._enabled or (self._goal == before and not self._shaft.parted):
             return
@@ -271,7 +271,7 @@ class Motor(JointDevice):
             self._shaft.track(t, self._goal + self._zero, period_s, most, quick)
 
     def _impede(self, wanted: Impedance, t: float) -> None:
-        """A spring pulls it to its end at once; without one a damper has it turn, or a torque speeds it up."""
+        """Move as a MIT command says: a spring pulls to its end at once, else a damper or a torque turns the shaft."""
         if not self._enabled:
             return
         most = self.ranges.velocity_rad_s
@@ -299,7 +299,7 @@ class Motor(JointDevice):
                 super()._do_rare(command, t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold the shaft fast, or let go of it."""
+        """Jam the shaft, or release it."""
         self._shaft.jam(on, t)
 
     def _place(self, position: float, t: float) -> None:
@@ -308,7 +308,7 @@ class Motor(JointDevice):
         self.note("placed", t)
 
     def wrong_model(self, number: int) -> None:
-        """Have the range of positions of another model."""
+        """Take the range of positions of another model."""
         self._registers[Register.POSITION_MAX] = float(number)
 
     def _restart(self, t: float) -> None:
@@ -316,7 +316,7 @@ class Motor(JointDevice):
         self._power_on()
 
     def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:
-        """Change what it measures; it fails by what is outside its limits, and forgets what was before."""
+        """Change what it measures, and end an earlier lasting error; it fails if a value is outside its limits."""
         self._lasting = None
         if temperature_c is not None:
             self.temperature_c = temperature_c

@@ -1,4 +1,4 @@
-"""Numbers in bits: what a MIT command says, and what feedback says. Pure."""
+"""MIT commands and feedback as bit fields. Pure."""
 
 from typing import Final, NamedTuple
 
@@ -21,7 +21,7 @@ class Impedance(NamedTuple):
 
 
 def decode_mit(data: bytes, ranges: Ranges) -> Impedance:
-    """Out of 16, 12, 12, 12 and 12 bits, the most significant first."""
+    """Unpack 16, 12, 12, 12 and 12 bits, the most significant first."""
     whole = int.from_bytes(data, "big")
     return Impedance(
         _value(whole >> 48, 16, -ranges.position_rad, ranges.position_rad),
@@ -35,7 +35,7 @@ def decode_mit(data: bytes, ranges: Ranges) -> Impedance:
 def encode_feedback(
     status: int, esc_id: int, place: tuple[float, float, float], ranges: Ranges, temperatures_c: tuple[int, int]
 ) -> bytes:
-    """Position, velocity and torque in 16, 12 and 12 bits, after who it is and before how hot."""
+    """Pack position, velocity and torque in 16, 12 and 12 bits, after the id and before the temperatures."""
     position, velocity, torque = (
         _number(value, bits, most) for value, bits, most in zip(place, (16, 12, 12), ranges, strict=True)
     )

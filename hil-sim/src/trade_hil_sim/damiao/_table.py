@@ -8,7 +8,7 @@ __all__ = ["MODELS", "Mode", "Ranges", "Register", "Status"]
 EVERYBODY: Final = 0x7FF
 POSITION_VELOCITY, VELOCITY, FORCE_POSITION = 0x100, 0x200, 0x300
 MASTER: Final = 0x10
-"""What a motor's identifier and this make is that of its answers, as its vendor's tool sets it."""
+"""Added to a motor's identifier it gives that of its answers, as the vendor's tool sets it."""
 ENABLE, DISABLE, ZERO, CLEAR = 0xFC, 0xFD, 0xFE, 0xFB
 """Last byte of a frame whose others are FF."""
 READ, WRITE, STORE, REFRESH = 0x33, 0x55, 0xAA, 0xCC
@@ -33,7 +33,7 @@ TICKS_PER_S: Final = 20_000
 
 
 class Register(IntEnum):
-    """Those whose contents matter here."""
+    """Registers whose contents matter here."""
 
     ACCELERATION = 4
     DECELERATION = 5
@@ -55,7 +55,7 @@ READ_ONLY: Final = frozenset((*range(11, 21), 36, *range(50, 57), *range(59, 66)
 
 
 class Mode(IntEnum):
-    """What a motor makes of commands: each has an identifier of its own."""
+    """Control modes; the commands of each have their own identifier."""
 
     MIT = 1
     POSITION_VELOCITY = 2
@@ -64,7 +64,7 @@ class Mode(IntEnum):
 
 
 class Status(IntEnum):
-    """What a motor says of itself; from 8 on it has let go."""
+    """Status of a motor; from 8 on it has switched off its torque."""
 
     DISABLED = 0
     ENABLED = 1
@@ -78,7 +78,7 @@ class Status(IntEnum):
 
 
 class Ranges(NamedTuple):
-    """What the ends of its numbers mean."""
+    """Ranges of its numbers."""
 
     position_rad: float
     velocity_rad_s: float
@@ -102,4 +102,4 @@ MODELS: Final = {
     "DMJH11": Ranges(12.5, 10.0, 12.0),
     "DM6248P": Ranges(12.566, 20.0, 120.0),
 }
-"""As they come."""
+"""Factory defaults."""

@@ -28,7 +28,7 @@ class DynamixelBus(ServoBus[Servo, Packet]):
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
-        paced: take as long as the real wire, return delays included; else answer as fast as possible.
+        paced: take the time of the real wire, return delays included; else answer as fast as possible.
         clock: the servos' clock, in seconds. The line itself keeps real time.
     """
 

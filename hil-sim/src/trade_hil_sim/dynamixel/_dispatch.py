@@ -1,4 +1,4 @@
-"""Who carries out an instruction on the bus, and who answers what in which order. No port, no waiting."""
+"""Dispatches instructions to the servos on a bus, and orders their answers. No port, no waiting."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Dispatch:
         self._silent = silent
 
     def answers(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
-        """Carry out one packet on the servos that hear it; return what comes back, in order."""
+        """Carry out one packet on the servos that receive it; return the answers in order."""
         if not packet.intact:
             return self._to_one(servos, packet, t, _complain_of_crc)
         if packet.instruction in JOINED:
@@ -101,7 +101,7 @@ class Dispatch:
         return found
 
     def _joined(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
-        """One answer made by all; a device that is silent leaves those behind it without their cue."""
+        """One answer built by all; after a silent device, the later ones do not answer."""
         wishes = packet.readings()
         joined = JoinedStatus(sum(wish.length for wish in wishes), len(wishes))
         ids: list[int] = []
@@ -154,7 +154,7 @@ def _shadows(servos: Iterable[Servo], device_id: int) -> list[Servo]:
 
 
 def _collided(given: list[Answer | None]) -> list[Answer]:
-    """Devices with one id answer on top of each other: the bytes of all come, none of them where it belongs."""
+    """Devices with one id answer at the same time: the bytes of all arrive interleaved."""
     answers = [answer for answer in given if answer is not None]
     if len(answers) < 2:
         return answers

@@ -1,6 +1,6 @@
-"""The control table as memory: what may be read and written where and when, with indirect addresses followed.
+"""The control table as memory: checks which reads and writes are allowed, and follows indirect addresses.
 
-Knows nothing of motion or time. Source: ROBOTIS e-Manual, descriptions of the models' control tables.
+Independent of motion and time. Source: ROBOTIS e-Manual, descriptions of the models' control tables.
 """
 
 from typing import Final
@@ -14,7 +14,7 @@ __all__ = ["GOALS", "MOTION", "WATCHDOG_EXPIRED", "ControlTable", "HardwareError
 
 GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_position"})
 MOTION: Final = GOALS | {"torque_enable"}
-"""A write to any of these could set something moving, or let go of it."""
+"""A write to any of these could start a motion, or switch off torque."""
 WATCHDOG_EXPIRED: Final = 255
 """What register 98 shows after its time has run out."""
 
@@ -47,7 +47,7 @@ class ControlTable(Memory[Register]):
         self.restore(model.registers)
 
     def forget_ram(self) -> None:
-        """What happens to the memory at power loss: EEPROM stays, RAM does not."""
+        """Lose power: EEPROM keeps its values, RAM returns to defaults."""
         self._bytes[RAM_BEGINS:] = bytes(self.model.ends - RAM_BEGINS)
         self.restore(register for register in self.model.registers if not register.eeprom)
 
@@ -105,7 +105,7 @@ def _value(register: Register, bytes_at: dict[int, int]) -> int:
 
 
 def check(table: ControlTable, register: Register, value: int, *, by_shadow_id: bool = False) -> None:
-    """Raise `Refusal` if the state of the other registers forbids this write."""
+    """Raise `Refusal` if other registers forbid this write."""
     name = register.name
     if register.eeprom:
         _check_unlocked(table, register, by_shadow_id)

@@ -1,6 +1,6 @@
-"""The models of the X series, and MX with the firmware for protocol 2.0: what differs between them.
+"""The models of the X series, and MX with the firmware for protocol 2.0: their differences.
 
-Source: ROBOTIS e-Manual, the page of each model. Where no speed without load was found (XW430, XW540-H260), it is that
+Source: ROBOTIS e-Manual, the page of each model. Where no no-load speed was found (XW430, XW540-H260), it is that
 of the velocity limit; XD430-T350 and XD540-T270 have the figures of the XH, whose control table they share.
 """
 
@@ -20,17 +20,17 @@ MOST_SPEED: Final = 1023
 
 @dataclass(frozen=True, slots=True)
 class _Family:
-    """What models of one size and supply have in common."""
+    """Data common to models of one size and supply."""
 
     supply_v: float
     volts: tuple[int, int]
     """Its limits as shipped, in 0.1 V."""
     temperature: int = 80
     lowest: int | None = None
-    """The least the voltage limits can be set to, where that is not how it is shipped."""
+    """The lowest value for the voltage limits, where it differs from the default."""
     firmware: int = 45
     bauds: int = 7
-    """The greatest value of its baud rate register."""
+    """The highest value of its baud rate register."""
     most_speed: int = MOST_SPEED
     shutdown: int = 52
     led: bool = True
@@ -63,7 +63,7 @@ class _Family:
 
 
 _X330_INDIRECT: Final = (Indirect(1, 20, 168, 208),)
-"""As the manual has it, and the vendor's table for firmware 52; the one for older firmware begins at 224."""
+"""From the manual and the vendor's table for firmware 52; the table for older firmware begins at 224."""
 _XL430: Final = _Family(12.0, (60, 140), 72)
 _XC430: Final = _Family(12.0, (60, 160))
 _X430: Final = _Family(12.0, (95, 160))

@@ -29,11 +29,11 @@ RESYNC: Final = b"\xff\xff\xfd"
 STUFFED: Final = b"\xff\xff\xfd\xfd"
 HIGHEST_ID: Final = 252
 BODY: Final = 7
-"""Where the instruction stands: header, id and length come before."""
+"""Position of the instruction: header, id and length come before."""
 LONGEST: Final = 4096
-"""Bytes a packet may claim; more is noise. No X-series device takes as many."""
+"""The greatest length of a packet; more is noise. No X-series device accepts as many bytes."""
 ALERT: Final = 0x80
-"""Bit of a status packet's error field: a hardware error is latched, register 70 tells which."""
+"""Bit of a status packet's error field: a hardware error is latched, and register 70 says which."""
 
 
 class Instruction(IntEnum):
@@ -84,7 +84,7 @@ _CRC: Final = _crc_table()
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 with polynomial 0x8005, nothing reflected; pass the last result to go on (e-Manual, "CRC Calculation")."""
+    """CRC-16 with polynomial 0x8005, not reflected; pass the last result to continue (e-Manual, "CRC Calculation")."""
     for byte in data:
         crc = (crc << 8 & 0xFF00) ^ _CRC[crc >> 8 ^ byte]
     return crc
@@ -96,7 +96,7 @@ def stuff(body: bytes) -> bytes:
 
 
 def unstuff(body: bytes) -> bytes:
-    """Undo `stuff`."""
+    """Reverse `stuff`."""
     return body.replace(STUFFED, RESYNC)
 
 
@@ -197,7 +197,7 @@ class PacketReader(packets.PacketReader[Packet]):
 
 
 def _header_at(held: bytes) -> int:
-    """Where the first header begins; what may be the beginning of one at the end is kept."""
+    """Where the first header begins; a partial header at the end is kept."""
     at = held.find(HEADER)
     if at >= 0:
         return at
@@ -214,7 +214,7 @@ def _inner_header(held: bytes, end: int) -> int | None:
     while at >= 0:
         after = at + len(RESYNC)
         if after < end and after >= len(held):
-            return None  # the byte that decides has not come yet
+            return None  # the byte that decides has not arrived yet
         if after >= end or held[after] != RESYNC[-1]:
             return at
         at = held.find(RESYNC, after + 1, end)

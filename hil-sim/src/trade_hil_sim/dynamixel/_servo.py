@@ -1,4 +1,4 @@
-"""One simulated servo: how it answers instructions, and what it does by itself as time passes.
+"""One simulated servo: its answers to instructions, and its behaviour over time.
 
 Sources: ROBOTIS e-Manual, the models' pages (control table descriptions), "DYNAMIXEL Protocol 2.0". Where the manual
 leaves a choice, the one that is harder on a driver was taken; docs/simulators.md lists them.
@@ -24,18 +24,18 @@ CLEAR_MULTI_TURN: Final = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])
 
 
 class Servo(ServoModel[ControlTable, Shaft]):
-    """A servo, fresh from the box but for its id, baud rate and position: torque off, position mode.
+    """A servo with factory settings except its id, baud rate and position: torque off, position mode.
 
     Args:
         device_id: 0 to 252.
         model: which control table.
-        position_counts: where the shaft stands at the beginning; 2048 is the centre.
+        position_counts: the initial position of the shaft; 2048 is the centre.
         baud: one of the rates register 8 knows.
         joint: name of the joint it drives, for logs.
         reversed_: whether the joint turns against the device.
         offset_rad: joint angle when the device reads its centre.
         t: the time, in seconds, on the clock of all later calls.
-        emit: told what happens.
+        emit: called with each event.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Servo(ServoModel[ControlTable, Shaft]):
         self._tick_frozen_at: float | None = None
         self._start_ram(t)
 
-    # what it is
+    # properties
 
     @property
     def baud(self) -> int:
@@ -84,7 +84,7 @@ class Servo(ServoModel[ControlTable, Shaft]):
 
     @property
     def status_return_level(self) -> int:
-        """What it answers, register 68: 0 pings, 1 reads as well, 2 everything."""
+        """Status return level, register 68: 0 pings, 1 reads as well, 2 everything."""
         return self.memory.get("status_return_level")
 
     def error_field(self, code: ErrorCode = ErrorCode.NONE) -> int:
@@ -118,10 +118,10 @@ class Servo(ServoModel[ControlTable, Shaft]):
         super()._boot(t)
         self._check_supply(t)
 
-    # instructions; the bus calls heard() for each it could hear, whoever it is for
+    # instructions; the bus calls heard() for each one on the wire, whichever device it addresses
 
     def heard(self, t: float) -> None:
-        """An instruction went over the bus: that feeds the bus watchdog."""
+        """An instruction was on the bus: reset the bus watchdog."""
         self.advance(t)
         self._heard_at = t
 
@@ -135,11 +135,11 @@ class Servo(ServoModel[ControlTable, Shaft]):
         return self.memory.read(address, length)
 
     def write(self, address: int, data: bytes, t: float, *, by_shadow_id: bool = False) -> None:
-        """Write to the control table, all of it or nothing; raises `Refusal`."""
+        """Write to the control table, completely or not at all; raises `Refusal`."""
         changes = self.memory.plan(address, data)
         for register, value in changes:
             check(self.memory, register, value, by_shadow_id=by_shadow_id)
-        # torque last: it sets off for the goal that came with it
+        # torque last: the motion starts toward the goal of the same write
         for register, value in sorted(changes, key=lambda change: change[0].name == "torque_enable"):
             self._apply(register, value, t)
         if self.shaft.mode.goal in {register.name for register, _ in changes} and self.torque:
@@ -161,7 +161,7 @@ class Servo(ServoModel[ControlTable, Shaft]):
         self.write(*kept, t)
 
     def clear(self, params: bytes, t: float) -> None:
-        """Forget whole turns; raises `Refusal` while it moves."""
+        """Clear whole turns; raises `Refusal` while it moves."""
         if params != CLEAR_MULTI_TURN:
             raise Refusal(ErrorCode.DATA_RANGE, f"clear takes 01 44 58 4C 22, not {params.hex(' ')}")
         if self.shaft.moving(t):
@@ -195,7 +195,7 @@ class Servo(ServoModel[ControlTable, Shaft]):
             self.fail(HardwareError.OVERHEATING, t)
 
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:
-        """Let the position register, and the realtime tick if asked, stand still, or show the truth again."""
+        """Freeze the position register, and the realtime tick if asked, or show the truth again."""
         super().freeze(on, t, tick=tick)
         self._tick_frozen_at = t if on and tick else None
 

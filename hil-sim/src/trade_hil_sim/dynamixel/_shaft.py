@@ -1,4 +1,4 @@
-"""The moving part of a servo: which registers set it going how, and what its sensors then show."""
+"""The moving part of a servo: how registers drive it, and what its sensors show."""
 
 from math import inf
 from typing import Final
@@ -19,7 +19,7 @@ class Shaft(ServoShaft):
 
     Args:
         table: the servo's registers; read for goals, written with what the sensors show.
-        position_counts: where the shaft stands, as register 132 would show it.
+        position_counts: the position of the shaft, as register 132 would show it.
         t: now, in seconds.
     """
 
@@ -42,13 +42,13 @@ class Shaft(ServoShaft):
         self.course = at_rest(t, self._inside(position_counts))
 
     def wrap(self, t: float) -> None:
-        """Forget whole turns: the position becomes 0 to 4095."""
+        """Clear whole turns: the position becomes 0 to 4095."""
         position, speed, _ = self.course.at(t)
         within_a_turn = self._flip(self._flip(position) % COUNTS_PER_TURN)
         self.course = to_speed(t, within_a_turn, speed, 0.0, QUICK_COUNTS_S2)
 
     def follow(self, t: float) -> None:
-        """Set off for what the goal register of the present mode asks for."""
+        """Start the motion that the goal register of the present mode asks for."""
         position, speed, _ = self.course.at(t)
         if self.jammed:
             self.course = at_rest(t, position)
@@ -65,7 +65,7 @@ class Shaft(ServoShaft):
 
     @property
     def tolerance(self) -> int:
-        """How far off it may be held without straining."""
+        """The position error that a held shaft may have without overload."""
         return IN_POSITION_COUNTS if self.mode.seeks_position else 0
 
     def refresh(self, t: float, torque: bool) -> None:
@@ -92,7 +92,7 @@ class Shaft(ServoShaft):
         return -1 if self._table.get("drive_mode") & 1 else 1
 
     def _flip(self, position: float) -> float:
-        """Between shaft and encoder, either way: reverse mode mirrors about the centre."""
+        """Convert between shaft and encoder, either way: reverse mode mirrors about the centre."""
         return 2 * CENTRE - position if self.direction < 0 else position
 
     def _inside(self, register: float) -> float:

@@ -39,12 +39,12 @@ class Mode(IntEnum):
 
     @property
     def seeks_position(self) -> bool:
-        """Whether the goal position is what it goes for."""
+        """Whether it moves to the goal position."""
         return self in {Mode.POSITION, Mode.EXTENDED_POSITION, Mode.CURRENT_BASED_POSITION}
 
     @property
     def goal(self) -> str:
-        """The register that sets it going."""
+        """The register that starts a motion."""
         names = {Mode.CURRENT: "goal_current", Mode.VELOCITY: "goal_velocity", Mode.PWM: "goal_pwm"}
         return names.get(self, "goal_position")
 
@@ -97,7 +97,7 @@ class Model(registers.Model[Register]):
 
     @property
     def full_effort_counts(self) -> int:
-        """What stands at address 126 at all it can do."""
+        """The register at address 126 in its full form."""
         return self.by_name["current_limit"].default if "current_limit" in self.by_name else FULL_LOAD
 
     @property
@@ -113,7 +113,7 @@ FULL_LOAD: Final = 1000
 
 
 def gain(address: int, name: str, default: int) -> Register:
-    """A gain of its controllers, of which the simulation only keeps the number."""
+    """A gain of its controllers; the simulation only stores it."""
     return Register(address, 2, name, WRITE, default, *GAIN)
 
 
@@ -130,7 +130,7 @@ def _indirect(banks: Sequence[Indirect]) -> list[Register]:
 
 
 def x_series(number: int, firmware: int, own: Sequence[Register], indirect: Sequence[Indirect]) -> tuple[Register, ...]:
-    """What all models share, with a model's own items put in."""
+    """The registers that all models share, with a model's own inserted."""
     shared = [
         Register(0, 2, "model_number", READ, number),
         Register(2, 4, "model_information", READ),

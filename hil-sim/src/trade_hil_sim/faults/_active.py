@@ -1,4 +1,4 @@
-"""The faults of answers that are in force on one bus."""
+"""The active faults of answers on one bus."""
 
 from trade_hil_sim.faults._commands import AnswerFault, Mute, Piece
 
@@ -24,13 +24,13 @@ class _Active:
 
 
 class ActiveFaults:
-    """Faults in the order they were added; each strikes the answers it names."""
+    """Faults in the order they were added; each affects the answers that it names."""
 
     def __init__(self) -> None:
         self._active: list[_Active] = []
 
     def add(self, fault: AnswerFault) -> None:
-        """Bring a fault into force; faults act in the order they were added."""
+        """Activate a fault; faults act in the order they were added."""
         self._active.append(_Active(fault))
 
     def unmute(self, ids: tuple[int, ...] | None) -> None:
@@ -43,15 +43,15 @@ class ActiveFaults:
 
     @property
     def empty(self) -> bool:
-        """Whether none is in force."""
+        """Whether none is active."""
         return not self._active
 
     def silences(self, device_id: int, instruction: str) -> bool:
-        """Whether this answer is not given at all; counts as one matched."""
+        """Whether this answer is suppressed; counts as one match."""
         return self.strikes(Mute, (device_id,), instruction)
 
     def strikes(self, kind: type[AnswerFault], ids: tuple[int, ...], instruction: str) -> bool:
-        """Whether a fault of this kind hits this answer; counts as one matched."""
+        """Whether a fault of this kind affects this answer; counts as one match."""
         return any(a.hits(ids, instruction) for a in self._active if isinstance(a.fault, kind))
 
     def names(self, instruction: str) -> bool:
@@ -61,7 +61,7 @@ class ActiveFaults:
     def shape(
         self, answer: bytes, ids: tuple[int, ...], instruction: str, *, but: tuple[type[AnswerFault], ...] = (Mute,)
     ) -> list[Piece]:
-        """The answer as the faults in force leave it, but for those of some kinds."""
+        """The answer after the active faults were applied, except those of some kinds."""
         pieces = [Piece(answer)]
         for active in self._active:
             if not isinstance(active.fault, but) and active.hits(ids, instruction):

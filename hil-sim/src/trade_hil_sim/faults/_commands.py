@@ -1,10 +1,10 @@
-"""The faults and orders as plain values, so that they can be made in Python or sent over the control socket.
+"""The faults and orders as plain values, so that they can be created in Python or sent over the control socket.
 
 On a CAN bus every frame of a device is an answer, and its name (``heartbeat``, ``tpdo1``, ``sdo_reply``, ...) the
-instruction; a fault that names a frame of clients (``sync``, ``rpdo1``, ...) strikes that.
+instruction; a fault that names a frame of clients (``sync``, ``rpdo1``, ...) affects that frame.
 
-Two kinds: faults of answers, which change the bytes of some answers on their way out, and orders, which do something to
-a device or to the line once.
+Two kinds: faults of answers, which change the bytes of some answers on their way out, and orders, which act once on
+a device or on the line.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -51,11 +51,11 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
 class SimulationError(ValueError):
-    """A simulator was asked for something it cannot do; the message says what would be right."""
+    """A simulator cannot do what was requested; the message says what would be valid."""
 
 
 class Piece(NamedTuple):
-    """Part of an answer, and how much later than it should it leaves."""
+    """Part of an answer, and the delay with which it leaves."""
 
     data: bytes
     late_s: float = 0.0
@@ -68,21 +68,21 @@ class _Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_u
 
 class _Devices(_Order, frozen=True, kw_only=True):
     ids: tuple[int, ...] | None = None
-    """Devices it concerns; default: all on the bus."""
+    """Affected devices; default: all on the bus."""
 
 
 class AnswerFault(_Devices, frozen=True, kw_only=True):
-    """What goes wrong with answers, and with which of them."""
+    """A fault of answers, and which answers it affects."""
 
     instruction: str | None = None
-    """Only answers to this one: ``ping``, ``read``, ``sync_read``, ...; default: any."""
+    """Only answers to this instruction: ``ping``, ``read``, ``sync_read``, ...; default: any."""
     skip: Annotated[int, Meta(ge=0)] = 0
-    """How many matching answers go out unharmed first."""
+    """How many matching answers go out intact first."""
     count: Annotated[int, Meta(ge=1)] | None = None
-    """How many answers it strikes; default: all, until healed."""
+    """How many answers it affects; default: all, until healed."""
 
     def strikes(self, ids: tuple[int, ...], instruction: str) -> bool:
-        """Whether it concerns an answer of these devices to this instruction."""
+        """Whether it affects an answer of these devices to this instruction."""
         whom = self.ids is None or any(i in self.ids for i in ids)
         return whom and self.instruction in {None, instruction}
 
@@ -95,12 +95,12 @@ class Mute(AnswerFault, frozen=True, tag="mute"):
     """Devices obey but do not answer."""
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
-        """Nothing of it."""
+        """No part of the answer."""
         return pieces[:0]
 
 
 class Late(AnswerFault, frozen=True, kw_only=True, tag="late"):
-    """Answers come `s` seconds late; the bus goes on meanwhile."""
+    """Answers arrive `s` seconds late; the bus continues meanwhile."""
 
     s: Seconds
 
@@ -125,7 +125,7 @@ class Truncate(AnswerFault, frozen=True, kw_only=True, tag="truncate"):
     missing: Annotated[int, Meta(ge=1)] = 3
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
-        """The beginning."""
+        """The answer without its end."""
         *before, (data, late_s) = pieces
         return [*before, Piece(data[: -self.missing], late_s)]
 
@@ -136,7 +136,7 @@ class Garbage(AnswerFault, frozen=True, kw_only=True, tag="garbage"):
     hex: str = "fffffd00ff"
 
     def __post_init__(self) -> None:
-        """Refuse what is not hex."""
+        """Refuse bytes that are not hex."""
         bytes.fromhex(self.hex)
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
@@ -150,7 +150,7 @@ class Dribble(AnswerFault, frozen=True, kw_only=True, tag="dribble"):
     s: Seconds
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
-        """Single bytes, each later than the one before."""
+        """Single bytes, each with a greater delay."""
         whole, late_s = b"".join(piece.data for piece in pieces), pieces[0].late_s
         return [Piece(bytes([byte]), late_s + k * self.s) for k, byte in enumerate(whole)]
 
@@ -159,13 +159,13 @@ class Duplicate(AnswerFault, frozen=True, tag="duplicate"):
     """The answer comes twice."""
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
-        """The same, and once more when it is through."""
+        """The same answer twice in a row."""
         span_s = pieces[-1].late_s - pieces[0].late_s
         return [*pieces, *(Piece(data, late_s + span_s) for data, late_s in pieces)]
 
 
 class Echo(_Order, frozen=True, kw_only=True, tag="echo"):
-    """The adapter sends back what it hears, as a half-duplex adapter without echo suppression does."""
+    """The adapter sends back what it receives, as a half-duplex adapter without echo suppression does."""
 
     on: bool = True
 
@@ -187,13 +187,13 @@ class Replug(_Order, frozen=True, tag="replug"):
 
 
 class HangUp(_Order, frozen=True, kw_only=True, tag="hang_up"):
-    """A controller hangs up on its clients of one kind; they may connect again."""
+    """A controller disconnects its clients of one kind; they may connect again."""
 
     kind: Literal["rtde", "dashboard", "script"]
 
 
 class Local(_Order, frozen=True, kw_only=True, tag="local"):
-    """A controller is switched to local control: it takes no orders from the network. With ``on`` false, back."""
+    """A controller is in local control: it takes no orders from the network. With ``on`` false it takes them."""
 
     on: bool = True
 
@@ -205,22 +205,22 @@ class BusOff(_Devices, frozen=True, kw_only=True, tag="bus_off"):
 
 
 class Absent(_Devices, frozen=True, kw_only=True, tag="absent"):
-    """Devices are off the bus: they neither hear nor answer. With ``on`` false they are back."""
+    """Devices are off the bus: they neither receive nor answer. With ``on`` false they are back."""
 
     on: bool = True
     nth: Annotated[int, Meta(ge=1)] | None = None
-    """Only the first, second, ... device of the bus, which tells two of one id apart."""
+    """Only the first, second, ... device of the bus, to distinguish two of one id."""
 
 
 class Freeze(_Devices, frozen=True, kw_only=True, tag="freeze"):
-    """The measured position stands still although the shaft moves; with `tick`, the device's clock as well."""
+    """The measured position is frozen although the shaft moves; with `tick`, the device's clock as well."""
 
     on: bool = True
     tick: bool = False
 
 
 class Jam(_Devices, frozen=True, kw_only=True, tag="jam"):
-    """The shaft is held fast; straining against that for a second is an overload."""
+    """The shaft is jammed; after a second of pushing against that, the device has an overload."""
 
     on: bool = True
 
@@ -249,7 +249,7 @@ class Emergency(_Devices, frozen=True, kw_only=True, tag="emergency"):
 
 
 class Supply(_Devices, frozen=True, kw_only=True, tag="supply"):
-    """Set what devices measure of their supply and housing; outside their limits they shut down."""
+    """Set the measured supply voltage and temperature of devices; outside their limits they shut down."""
 
     voltage_v: Annotated[float, Meta(ge=0, le=100)] | None = None
     temperature_c: Byte | None = None
@@ -266,9 +266,9 @@ class Put(_Devices, frozen=True, kw_only=True, tag="put"):
 
     width_m: Annotated[float, Meta(ge=0, le=1)] | None = None
     stiffness_n_m: Annotated[float, Meta(gt=0)] = 50_000.0
-    """How many newtons press it in by a metre."""
+    """Stiffness of the object in N/m."""
     inside: bool = False
-    """It is hollow, and the fingers meet it when they open."""
+    """The object is hollow, and the fingers meet it when they open."""
 
 
 Command = (
@@ -301,6 +301,6 @@ Command = (
 
 
 def kinds_of(union: object) -> dict[str, type[Command]]:
-    """The words a command may have under ``do``, and what each makes."""
+    """The values of a command's ``do``, and the struct of each."""
     kinds: tuple[type[Command], ...] = getattr(union, "__args__", ())
     return {str(kind.__struct_config__.tag): kind for kind in kinds}

@@ -1,4 +1,4 @@
-"""Each fault and order as a method. Its body, its help and most of its keywords are those of the struct of its name."""
+"""Each fault and order as a method. Its body, help and most keywords come from the struct of its name."""
 # ruff: noqa: B027 - the bodies of the methods are generated
 
 import inspect
@@ -38,7 +38,7 @@ class OfAnswers(OnBus, total=False):
 def _generated(
     declared: "Callable[Concatenate[FaultMethods, _P], None]",
 ) -> "Callable[Concatenate[FaultMethods, _P], None]":
-    """The method of a declaration: it makes a struct and has it done."""
+    """The method of a declaration: it makes a struct and carries it out."""
     kind = _KINDS[declared.__name__]
     signature = _signature(declared)
 
@@ -56,7 +56,7 @@ def _generated(
 
 
 def _signature(declared: Callable[..., None]) -> inspect.Signature:
-    """That of a declaration, with the other fields of its struct in place of its ``**where``."""
+    """The signature of a declaration, with the other fields of its struct in place of its ``**where``."""
     own = inspect.signature(declared)
     named = [parameter for parameter in own.parameters.values() if parameter.kind is not parameter.VAR_KEYWORD]
     others = [
@@ -68,7 +68,7 @@ def _signature(declared: Callable[..., None]) -> inspect.Signature:
 
 
 class FaultMethods(ABC):
-    """What can be done to simulated devices: a method for each fault, which makes the value and hands it to `do`."""
+    """Methods for all faults and orders; each makes the value and passes it to `do`."""
 
     @abstractmethod
     def do(self, command: Command) -> None:

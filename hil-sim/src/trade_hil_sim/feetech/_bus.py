@@ -27,7 +27,7 @@ class FeetechBus(ServoBus[Servo, Packet]):
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
-        paced: take as long as the real wire, return delays included; else answer as fast as possible.
+        paced: take the time of the real wire, return delays included; else answer as fast as possible.
         clock: the servos' clock, in seconds. The line itself keeps real time.
     """
 
@@ -60,7 +60,7 @@ class FeetechBus(ServoBus[Servo, Packet]):
             self._reply(_of(servos, packet.device_id), packet, lambda one: _obey(one, packet, t))
 
     def _reply(self, servos: Sequence[Servo], packet: Packet, act: Callable[[Servo], bytes | None]) -> None:
-        """Have servos of one id do it and answer: one of them, or several on top of each other."""
+        """Let servos of one id carry it out and answer: one alone, or several at the same time."""
         answers: list[bytes] = []
         delay_s = 0.0
         device_id = packet.device_id
@@ -93,7 +93,7 @@ def _unanswered(packet: Packet) -> bool:
 
 
 def _obey(servo: Servo, packet: Packet, t: float) -> bytes | None:
-    """Carry a packet out; the data of its answer, or None for one that is not answered: it makes no sense."""
+    """Carry a packet out; return the data of its answer, or None for an invalid packet, which gets no answer."""
     asked, wishes = packet.readings(), packet.writings()
     match packet.instruction:
         case Instruction.READ if asked:

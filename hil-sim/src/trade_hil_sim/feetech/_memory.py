@@ -1,6 +1,6 @@
-"""The memory table as memory: live bytes, and those that are kept without power.
+"""The memory table as memory: live bytes, and those that survive a loss of power.
 
-Knows nothing of motion or time.
+Independent of motion and time.
 """
 
 from trade_hil_sim.serial._registers import Memory
@@ -19,7 +19,7 @@ class MemoryTable(Memory[Register]):
         self.factory_reset()
 
     def keep(self, name: str) -> None:
-        """Have an EEPROM register's value survive power loss."""
+        """Let an EEPROM register's value survive power loss."""
         register = self.model.by_name[name]
         span = slice(register.address, register.address + register.size)
         self._kept[span] = self._bytes[span]
@@ -31,7 +31,7 @@ class MemoryTable(Memory[Register]):
         self.set("torque_limit", self.get("max_torque"))
 
     def factory_reset(self, spared: tuple[str, ...] = ()) -> None:
-        """All registers at their defaults, for good, but for some."""
+        """Set all registers except some to their defaults, permanently."""
         values = {name: self.get(name) for name in spared}
         self.restore(self.model.registers)
         for name, value in values.items():
@@ -43,7 +43,7 @@ class MemoryTable(Memory[Register]):
         return bytes(self._bytes[address : address + length]).ljust(length, b"\0")
 
     def plan(self, address: int, data: bytes) -> tuple[dict[str, int], list[str]]:
-        """What writing bytes at an address changes, and what it leaves as it is: read-only, half, or out of range."""
+        """The changes by a write, and the registers that it cannot change: read-only, half, or out of range."""
         changes: dict[str, int] = {}
         refused: list[str] = []
         for name in self.touched(address, len(data)):

@@ -15,7 +15,7 @@ __all__ = ["Instruction", "Packet", "PacketReader", "checksum", "encode", "statu
 
 HEADER: Final = b"\xff\xff"
 LONGEST: Final = 250
-"""The greatest LEN that is no noise: an assumption."""
+"""The greatest valid LEN, an assumption; more is noise."""
 
 
 class Instruction(IntEnum):
@@ -33,7 +33,7 @@ class Instruction(IntEnum):
 
 
 def checksum(body: bytes) -> int:
-    """The last byte of a packet whose other bytes, without the header, are these."""
+    """The check sum of a packet with these bytes after the header."""
     return 0xFF - sum(body) % 256
 
 

@@ -1,4 +1,4 @@
-"""One simulated servo: how it carries out instructions, and what it does by itself as time passes.
+"""One simulated servo: how it carries out instructions, and its behaviour over time.
 
 Where the sources leave a choice, the one that is harder on a driver was taken; docs/simulators.md lists them.
 """
@@ -18,7 +18,7 @@ __all__ = ["MOTION", "Servo", "Status"]
 PROTECTION_UNIT_S: Final = 0.01
 TAKE_FOR_CENTRE: Final = 128
 MOTION: Final = frozenset({"torque_enable", "goal_position"})
-"""A write to any of these could set something moving, or let go of it."""
+"""A write to any of these could start a motion, or switch off torque."""
 
 
 class Status:
@@ -32,19 +32,19 @@ class Status:
 
 
 class Servo(ServoModel[MemoryTable, Shaft]):
-    """A servo, fresh from the box but for its id, baud rate and position: torque off, position mode.
+    """A servo with factory settings except its id, baud rate and position: torque off, position mode.
 
     Args:
         device_id: 0 to 253.
         model: which memory table.
-        position_counts: where the shaft stands at the beginning; 2048 is the centre.
+        position_counts: the initial position of the shaft; 2048 is the centre.
         baud: one of the rates register 6 knows.
         joint: name of the joint it drives, for logs.
         reversed_: whether the joint turns against the device.
         offset_rad: joint angle when the device reads its centre.
         t: the time, in seconds, on the clock of all later calls.
         goal_switches_on: a goal written while torque is off switches it on, as on real servos; else it is only kept.
-        emit: told what happens.
+        emit: called with each event.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
         self._strained_towards = 0.0
         self._start_ram(t)
 
-    # what it is
+    # properties
 
     @property
     def baud(self) -> int:
@@ -95,7 +95,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
 
     @property
     def status(self) -> int:
-        """What it complains of: the bits of register 65."""
+        """Its latched errors: the bits of register 65."""
         limit = self.memory.get
         bits = self._latched
         if not limit("min_voltage") <= self.supply_v * 10 <= limit("max_voltage"):
@@ -106,7 +106,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
 
     @property
     def _share(self) -> float:
-        """Of the motor's torque, what its protection leaves."""
+        """The fraction of the motor's torque that its protection allows."""
         cut = self.status & self.memory.get("unload_condition")
         if cut & ~Status.OVERLOAD:
             return 0.0
@@ -114,7 +114,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
 
     @property
     def overload_s(self) -> float:
-        """How long it strains against a jam before it gives up, register 35."""
+        """How long it pushes against a jam before an overload, register 35."""
         return self.memory.get("protection_time") * PROTECTION_UNIT_S
 
     def _controller(self) -> Controller:
@@ -139,7 +139,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
         return self.memory.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> None:
-        """Write to the memory table what can be written; the rest stays as it is, and no answer tells of it."""
+        """Write to the memory table what can be written; the rest stays as it is, and no answer reports that."""
         self.advance(t)
         changes, refused = self.memory.plan(address, data)
         if refused or not changes:
@@ -181,13 +181,13 @@ class Servo(ServoModel[MemoryTable, Shaft]):
         super().do(command, t)
 
     def fail(self, bits: int, t: float) -> None:
-        """Latch complaints; those named in the unload condition (19) cut the motor off."""
+        """Latch errors; those named in the unload condition (19) switch the motor off."""
         self._strained_towards, before = self.shaft.ahead(t), self._share
         self._latched |= bits
         self._complain(t, before)
 
     def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:
-        """Change what it measures of its supply and housing; it complains while that is outside its limits."""
+        """Change what it measures of its supply and housing; it reports an error while that is outside its limits."""
         before = self._share
         super().set_supply(t, voltage_v=voltage_v, temperature_c=temperature_c)
         self._complain(t, before)
@@ -195,7 +195,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
     # inside
 
     def _complain(self, t: float, before: float) -> None:
-        """Heed its protection, which left so much of the motor's torque before."""
+        """Apply its overload protection; the argument is the fraction of torque that it allowed before."""
         if self._share < before:
             self.note("shutdown", t, f"status {self.status:#04x}")
         if self._share != before and self.torque:

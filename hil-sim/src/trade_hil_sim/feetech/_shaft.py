@@ -1,4 +1,4 @@
-"""The moving part of a servo: which registers set it going how, and what its sensors then show."""
+"""The moving part of a servo: how registers drive it, and what its sensors show."""
 
 from typing import Final
 
@@ -19,7 +19,7 @@ class Shaft(ServoShaft):
 
     Args:
         memory: the servo's registers; read for goals, written with what the sensors show.
-        position_counts: where the shaft stands, as register 56 would show it.
+        position_counts: the position of the shaft, as register 56 would show it.
         t: now, in seconds.
     """
 
@@ -36,13 +36,13 @@ class Shaft(ServoShaft):
         self.course = at_rest(t, position_counts + self._memory.get("homing_offset"))
 
     def take_for_centre(self, t: float) -> None:
-        """From now on the present position reads 2048: the homing offset makes up for it."""
+        """Make the present position read 2048, by changing the homing offset."""
         shaft = self.course.at(t)[0] % COUNTS_PER_TURN
         self.course = at_rest(t, shaft)
         self._memory.set("homing_offset", max(-2047, min(2047, round(shaft) - CENTRE)))
 
     def follow(self, t: float, share: float) -> None:
-        """Set off for the goal, with a share of the motor's torque and speed. In other modes it stands still."""
+        """Start toward the goal with a fraction of the motor's torque and speed. In other modes the shaft rests."""
         position, speed, _ = self.course.at(t)
         if self.jammed:
             self.course = at_rest(t, position)
@@ -54,12 +54,12 @@ class Shaft(ServoShaft):
             self.course = to_position(t, position, speed, goal, top, acceleration)
 
     def goal(self) -> int:
-        """Where it goes: the goal position, within the range there is."""
+        """Its target: the goal position, limited to the valid range."""
         low, high, goal = (self._memory.get(name) for name in ("min_angle", "max_angle", "goal_position"))
         return goal if low == high == 0 else max(low, min(high, goal))
 
     def ahead(self, t: float) -> float:
-        """How far the goal is, in counts, with the sign of the way."""
+        """The distance to the goal in counts, with its sign."""
         return self.goal() - self.position(t)
 
     def refresh(self, t: float, *, on: bool) -> None:

@@ -29,7 +29,7 @@ class Register(registers.Register):
 
     @property
     def eeprom(self) -> bool:
-        """Whether it can be kept without power."""
+        """Whether it can survive a loss of power."""
         return EEPROM_BEGINS <= self.address < RAM_BEGINS
 
     def decode(self, raw: bytes) -> int:

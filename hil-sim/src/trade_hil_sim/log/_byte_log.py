@@ -1,6 +1,6 @@
 """The byte log: every chunk or frame on the wire, every decoded instruction and every device event, with its time.
 
-It is the judge in tests of safety: what a device received and did, not what anybody believes to have sent. Times are
+Tests of safety rely on it: it has what a device received and did, not what a client believes it sent. Times are
 ``time.monotonic()`` (CLOCK_MONOTONIC), which on Linux is one clock for all processes of a machine.
 """
 
@@ -19,12 +19,12 @@ Direction = Literal["in", "out"]
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     """One line of the log.
 
-    - ``received`` and ``sent``: raw bytes, as the simulator read and wrote them. A client that has an answer finds it,
-      and what led to it, in the log.
-    - ``frame``: one frame that got through on a CAN bus, at the end of its last bit, logged before anybody hears it;
+    - ``received`` and ``sent``: raw bytes, as the simulator read and wrote them. When a client has an answer, the
+      log already has it and its cause.
+    - ``frame``: one frame that got through on a CAN bus, at the end of its last bit, logged before it is delivered;
       ``name`` is what it is (``sync``, ``rpdo1``, ...), ``device_id`` the device it comes from or goes to.
     - ``instruction``: one decoded instruction, one entry for each device that a group write addresses.
-    - ``event``: something a device did by itself or in answer: ``motion_started``, ``at_rest``, ``torque_on``,
+    - ``event``: something that a device did by itself or in response: ``motion_started``, ``at_rest``, ``torque_on``,
       ``torque_off``, ``watchdog_expired``, ``watchdog_cleared``, ``rebooted``, ``refused``, ``shutdown``, ...
     """
 
@@ -33,29 +33,29 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     bus: str
     kind: Kind
     name: str = ""
-    """Of an instruction or event: which; of bytes sent: the instruction they answer."""
+    """The name of an instruction or event; for bytes sent, the instruction that they answer."""
     device_id: int | None = None
-    """Id on the bus; 254 stands for all devices."""
+    """Id on the bus; 254 means all devices."""
     ids: tuple[int, ...] = ()
-    """Of a group read: the ids it names."""
+    """The ids in a group read."""
     joint: str = ""
     hex: str = ""
-    """The bytes: on the wire, or the data an instruction carries."""
+    """Bytes on the wire, or the data of an instruction."""
     can_id: int | None = None
     source: str = ""
-    """Of a frame: who sent it, a joint's name or ``client1`` and so on in the order they came."""
+    """The sender of a frame: a joint's name, or ``client1`` and so on in the order of connection."""
     direction: Direction | None = None
-    """Of a frame: ``in`` from a client, ``out`` from a device."""
+    """The direction of a frame: ``in`` from a client, ``out`` from a device."""
     address: int | None = None
     registers: tuple[str, ...] = ()
     """Names of the registers an instruction writes, looked up through indirect addresses."""
     moves: bool = False
-    """Whether this instruction could set something moving: it writes torque or goal registers."""
+    """Whether this instruction could start a motion: it writes torque or goal registers."""
     position_counts: int | None = None
     position_rad: float | None = None
     """The joint's angle in the robot file's sense; without a robot file, the device's angle from its centre."""
     width_m: float | None = None
-    """How far a gripper is open."""
+    """Opening of a gripper."""
     detail: str = ""
 
     @property

@@ -1,4 +1,4 @@
-"""Reading a byte log: pure questions about what a bus has seen."""
+"""Reads a byte log: pure queries about what a bus has seen."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from math import inf
@@ -67,7 +67,7 @@ def frames(
     direction: Direction | None = None,
     **span: "Unpack[Span]",
 ) -> list[Entry]:
-    """Frames that got through on CAN buses, in the order they did.
+    """Frames that got through on CAN buses, in that order.
 
     Args:
         entries: where to look.
@@ -86,7 +86,7 @@ def frames(
 def instructions(
     entries: Iterable[Entry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
 ) -> list[Entry]:
-    """Decoded instructions; those to everybody (id 254) count for every device.
+    """Decoded instructions; broadcasts (id 254) count for every device.
 
     Args:
         entries: where to look.
@@ -115,7 +115,7 @@ def motion_writes(entries: Iterable[Entry], *, device_id: int | None = None, **s
 
     Of CAN drives: those that change controlword, mode or a target. Of arms: commands to move, set-points, freedrive.
 
-    A registered write counts, and so does the action that lets it loose. Switching torque off counts, too.
+    A registered write counts, and so does the action that triggers it. Switching torque off counts, too.
     """
     return [e for e in writes(entries, device_id=device_id, **span) if e.moves]
 

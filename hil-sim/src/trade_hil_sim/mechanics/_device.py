@@ -1,6 +1,6 @@
-"""What simulated devices have in common: faults and orders befall them, they log events, and their truth can be asked.
+"""Base classes of simulated devices: they take faults and orders, log events, and report their true state.
 
-Time is an argument everywhere, in seconds on the clock of the bus; nothing happens but in `advance`.
+Time is an argument everywhere, in seconds on the clock of the bus; everything happens in `advance`.
 """
 
 from abc import ABC, abstractmethod
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 __all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "start_rad", "unheard"]
 
 Emit = Callable[[Entry], None]
-"""Puts a line into the log; a bus fills in its name."""
+"""Adds a line to the log; a bus fills in its name."""
 
 
 def unheard(entry: Entry) -> None:
-    """Drop a line: the device is on no bus."""
+    """Discard a line: the device is on no bus."""
 
 
 def start_rad(joint: "Joint") -> float:
-    """Where the shaft of a joint begins, from its offset: the joint is at zero, or as near as its limits allow."""
+    """The initial position of a joint's shaft, from its offset: at zero, or as near as the joint's limits allow."""
     angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
     return (-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad)
 
@@ -41,7 +41,7 @@ class DeviceModel(ABC):
     def __init__(self) -> None:
         self.emit: Emit = unheard
         self.absent = False
-        """Off the bus: it neither hears nor answers."""
+        """Off the bus: it neither receives nor answers."""
         self.supply_v, self.temperature_c = self.healthy
 
     @property
@@ -51,14 +51,14 @@ class DeviceModel(ABC):
 
     @abstractmethod
     def advance(self, t: float) -> None:
-        """Do what is due by itself by time `t`, in order."""
+        """Run everything that is due by time `t`, in order."""
 
     @abstractmethod
     def state(self, t: float) -> DeviceState | GripperTruth:
         """The truth about it at time `t`."""
 
     def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it cannot have."""
+        """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
         self.advance(t)
         match command:
             case faults.Absent():
@@ -77,7 +77,7 @@ class DeviceModel(ABC):
                 self._do_rare(command, t)
 
     def _do_rare(self, command: faults.Command, t: float) -> None:  # noqa: ARG002 - for those that know more
-        """Carry out what only some kinds of devices know."""
+        """Carry out a command that only some kinds of devices support."""
         raise self._refusal(command)
 
     def _refusal(self, command: faults.Command) -> faults.SimulationError:
@@ -96,15 +96,15 @@ class DeviceModel(ABC):
 
     @abstractmethod
     def _restore(self, t: float) -> None:
-        """Be the model it is, with nothing wrong with its supply that lasts."""
+        """Report its true model again, and end lasting faults of the supply."""
 
     @abstractmethod
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:
-        """Let the measured position, and the clock if asked, stand still, or show the truth again."""
+        """Freeze the measured position, and the clock if asked, or show the truth again."""
 
     @abstractmethod
     def jam(self, on: bool, t: float) -> None:
-        """Hold the shaft fast, or let go of it."""
+        """Jam the shaft, or release it."""
 
     @abstractmethod
     def wrong_model(self, number: int) -> None:
@@ -201,12 +201,12 @@ class JointModel(DeviceModel):
         self.emit(entry)
 
     def _note_motion(self, t: float) -> None:
-        """Log that it has set off, or come to rest."""
+        """Log that it has started, or come to rest."""
         moving = self._moving(t)
         if moving != self._underway:
             self._underway = moving
             self.note("motion_started" if moving else "at_rest", t, self._bound_for() if moving else "")
 
     def _bound_for(self) -> str:
-        """Where it sets off for, for the log."""
+        """The target of the motion, for the log."""
         return ""

@@ -12,7 +12,7 @@ __all__ = ["Course", "at_rest", "to_position", "to_speed"]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A motion made of stretches of constant acceleration, after which the speed stays what it is."""
+    """A motion made of stretches of constant acceleration, then constant speed."""
 
     begins: float
     position: float
@@ -20,14 +20,14 @@ class Course:
     stretches: tuple[tuple[float, float], ...] = ()
     """Pairs of duration and acceleration."""
     goal: float | None = None
-    """Where it ends exactly, if it ends at rest at a place asked for."""
+    """The exact end position, if it ends at rest at a requested position."""
     ends: float = field(init=False)
     """When the last stretch is over."""
     final_speed: float = field(init=False)
     """Speed after the last stretch."""
 
     def __post_init__(self) -> None:
-        """Find what is asked for most often."""
+        """Compute the values that are queried most often."""
         lasts, speed = 0.0, self.speed
         for duration, acceleration in self.stretches:
             lasts += duration

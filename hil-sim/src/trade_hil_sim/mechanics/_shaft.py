@@ -1,4 +1,4 @@
-"""The shaft and what is demanded of it. Counts, counts/s, counts/s^2; time is an argument."""
+"""A shaft and its demand. Counts, counts/s, counts/s^2; time is an argument."""
 
 from math import copysign, inf
 from typing import Final
@@ -16,14 +16,14 @@ class Shaft:
 
     Args:
         position: where it is, in counts.
-        t: since when.
+        t: the start time.
     """
 
     def __init__(self, position: float, t: float) -> None:
         self.demand = self.actual = at_rest(t, position)
         self.jammed = False
         self.settles_at: float | None = None
-        """When a set-point that it could not follow should have been reached; it makes for it from then on."""
+        """When a set-point that it could not follow should have been reached; the shaft moves there from then on."""
 
     def position(self, t: float) -> float:
         """Where it is."""
@@ -53,7 +53,7 @@ class Shaft:
 
     @property
     def parted(self) -> bool:
-        """Whether it may be elsewhere than demanded."""
+        """Whether its position may differ from the demand."""
         return self.demand is not self.actual
 
     def behind(self, t: float) -> float:
@@ -88,7 +88,7 @@ class Shaft:
             self.demand = self.actual = Course(t, position, wanted, ((period_s, 0.0),), goal)
 
     def settle(self, t: float, top_speed: float, acceleration: float) -> None:
-        """Make for the set-point that could not be followed."""
+        """Move to the set-point that the shaft could not follow."""
         self.settles_at = None
         position, speed, _ = self.actual.at(t)
         goal = self.demand.goal
@@ -96,7 +96,7 @@ class Shaft:
             self.actual = to_position(t, position, speed, goal, top_speed, acceleration)
 
     def rejoin(self, t: float) -> None:
-        """If it has arrived where it should be, demand and shaft are one again."""
+        """Once it has reached the demand, let both move together again."""
         if self.parted and not self.moving(t) and t >= self.demand.ends and abs(self.behind(t)) < STILL:
             self.demand = self.actual
 
@@ -106,13 +106,13 @@ class Shaft:
         self.settles_at = None
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold it fast, or let go of it."""
+        """Jam it, or release it."""
         self.jammed = on
         if on:
             self.place(self.position(t), t)
 
     def forget(self, t: float) -> None:
-        """Demand what is."""
+        """Set the demand to the actual position."""
         self.settles_at = None
         if self.parted:
             self.demand = self.actual = at_rest(t, self.position(t)) if self.jammed else self.actual

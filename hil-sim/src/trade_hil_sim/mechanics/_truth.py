@@ -1,4 +1,4 @@
-"""The truth about simulated devices, as the control socket tells it: what they do, whatever their answers say."""
+"""The true state of simulated devices, as the control socket reports it, whatever their answers say."""
 
 import msgspec
 
@@ -39,13 +39,13 @@ class GripperTruth(msgspec.Struct, frozen=True, kw_only=True):
     activated: bool
     moving: bool
     holding: bool
-    """It presses on something on its way to the goal."""
+    """It presses on an object on its way to the goal."""
     object_m: float | None = None
-    """How wide the object is that was put between its fingers; None: there is none."""
+    """Width of the object between its fingers; None without one."""
     force_n: float
-    """The force it was told to press with."""
+    """The commanded force."""
     fault: int
-    """What its fault register reads."""
+    """Value of its fault register."""
     absent: bool
 
 
@@ -59,7 +59,7 @@ class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
     positions_rad: list[float]
     velocities_rad_s: list[float]
     pose: list[float]
-    """Of its flange: x, y, z in m, and a rotation vector in rad."""
+    """Pose of its flange: x, y, z in m, and a rotation vector in rad."""
     moving: bool
     robot_mode: str
     safety_mode: str
@@ -68,7 +68,7 @@ class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
     freedrive: bool
     speed_fraction: float
     watchdog_hz: float
-    """How often it has to hear from the host; 0: not armed."""
+    """The lowest rate at which the host must send; 0: not armed."""
     absent: bool
 
 

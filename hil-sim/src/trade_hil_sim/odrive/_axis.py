@@ -1,4 +1,4 @@
-"""An axis of an ODrive: what it is told, what it tells, its state, its errors and its watchdog. Time is an argument."""
+"""An axis of an ODrive: its commands, messages, state, errors and watchdog. Time is an argument."""
 
 import struct
 from math import inf, isfinite, tau
@@ -31,7 +31,7 @@ MOVING: Final = frozenset(
 
 
 class Axis(JointDevice):
-    """One axis; it is calibrated and idle when made.
+    """One axis; it is calibrated and idle when created.
 
     Args:
         device_id: its node, 0 to 62.
@@ -78,7 +78,7 @@ class Axis(JointDevice):
         self._state, self._result = State.IDLE, Result.SUCCESS
         self._errors = self._disarmed_by = 0
         self._lasting = 0
-        """Errors that come back when they are cleared."""
+        """Errors that return when they are cleared."""
         self._fed = t
         self._beat_due, self._estimates_due = t + HEARTBEAT_S, t + ESTIMATES_S
         self._plan(t)
@@ -106,7 +106,7 @@ class Axis(JointDevice):
         self._plan(t)
 
     def advance(self, t: float) -> None:
-        """Do what is due by itself."""
+        """Run what is due."""
         if self._expires() <= t:
             self.note("watchdog_expired", t)
             self._fail(Errors.WATCHDOG, t)
@@ -129,7 +129,7 @@ class Axis(JointDevice):
     def _armed(self) -> bool:
         return self._state is not State.IDLE
 
-    # what it is told
+    # commands
 
     def _obey(self, command: Command, values: tuple[float, ...], data: bytes, t: float) -> None:
         name = command.name.lower()
@@ -176,13 +176,13 @@ class Axis(JointDevice):
             self._disarm(Result.DISARMED, t)
 
     def _restart(self, t: float) -> None:
-        """All that is not saved is as it was made; the shaft stays where it is."""
+        """Reset everything that is not saved; the shaft stays where it is."""
         self._disarm(Result.SUCCESS, t)
         self._errors, self._disarmed_by = self._lasting, 0
         self._motor.forget_settings()
         self.note("booted", t)
 
-    # what it tells
+    # messages
 
     def _tell(self, command: Command, t: float) -> None:
         self.send(Frame(self.device_id << 5 | command, self._answer(command, t)), t)
@@ -218,7 +218,7 @@ class Axis(JointDevice):
                 super()._do_rare(command, t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold the shaft fast, or let go of it."""
+        """Jam the shaft, or release it."""
         self._motor.jam(on, t)
 
     def _place(self, position: float, t: float) -> None:
@@ -226,7 +226,7 @@ class Axis(JointDevice):
         self.note("placed", t)
 
     def wrong_model(self, number: int) -> None:
-        """Say that it is of another product line."""
+        """Identify as another product line."""
         self._shown_line = number & 0xFF
 
     def _check_supply(self, t: float) -> None:

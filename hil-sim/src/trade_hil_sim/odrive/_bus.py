@@ -27,7 +27,7 @@ class OdriveBus(JointBus):
 
     @staticmethod
     def label(frame: Frame) -> tuple[str, int | None]:
-        """Name of a frame, and the node it concerns; a question is named after its answer: ``ask_get_iq``."""
+        """Name of a frame, and its node; a request is named after its answer: ``ask_get_iq``."""
         if frame.extended:
             return "", None
         command, node = _KNOWN.get(frame.can_id & 0x1F), frame.can_id >> 5

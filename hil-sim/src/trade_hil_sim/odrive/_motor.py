@@ -1,4 +1,4 @@
-"""The controller of an axis and the motor it turns: which inputs send it where. Turns, turns/s; time is an argument."""
+"""The controller of an axis and the motor it turns: how inputs move it. Turns, turns/s; time is an argument."""
 
 from math import copysign
 from typing import Final
@@ -12,49 +12,49 @@ __all__ = ["Motor"]
 QUICK: Final = 200.0
 """The most the motor accelerates, in turns/s^2: an assumption."""
 COAST: Final = 20.0
-"""What friction slows it down by without torque, in turns/s^2: an assumption."""
+"""Deceleration by friction without torque, in turns/s^2: an assumption."""
 INERTIA: Final = 0.01
 """Newton metres for one turn/s^2: an assumption."""
 AMPERES: Final = 0.2
 """For one turn/s^2: an assumption."""
 VELOCITY_LIMIT: Final = 30.0
 TRAJECTORY: Final = (2.0, 0.5)
-"""Speed and acceleration as an ODrive comes."""
+"""Factory speed and acceleration of an ODrive."""
 RAMP: Final = 1.0
-"""Of velocities, in turns/s^2, as an ODrive comes."""
+"""Factory ramp of velocities, in turns/s^2."""
 
 
 class Motor:
     """One motor.
 
     Args:
-        turns: where it is.
-        t: since when.
+        turns: its position.
+        t: the start time.
     """
 
     def __init__(self, turns: float, t: float) -> None:
         self.shaft = Shaft(turns, t)
         self.goal = turns
-        """Where it was sent last."""
+        """Its last target."""
         self.forget_settings()
 
     def forget_settings(self) -> None:
-        """As after a restart."""
+        """Reset, as after a restart."""
         self.control, self._input = int(Control.POSITION), int(Input.PASSTHROUGH)
         self._limit = VELOCITY_LIMIT
         self._trajectory_speed, self._trajectory_accel = TRAJECTORY
         self._velocity = self._torque = 0.0
 
     def amperes(self, t: float) -> float:
-        """What it takes to accelerate it so, or to strain against what holds it."""
+        """The torque for this acceleration, or against a jam."""
         if self.shaft.jammed and self.shaft.parted:
             return copysign(QUICK * AMPERES, self.shaft.behind(t))
         return self.shaft.actual.at(t)[2] * AMPERES
 
-    # what it is told
+    # commands
 
     def told(self, command: Command, values: tuple[float, ...], t: float, *, armed: bool) -> None:
-        """Take settings and inputs."""
+        """Apply settings and inputs."""
         match command:
             case Command.SET_CONTROLLER_MODE:
                 self.control, self._input = int(values[0]), int(values[1])
@@ -79,7 +79,7 @@ class Motor:
             self._follow(command, t)
 
     def arm(self, t: float) -> None:
-        """Torque on: it stands where it is, unless its input is a speed or a torque."""
+        """Torque on: it holds its position, unless its input is a speed or a torque."""
         self.goal = self.shaft.position(t)
         if self.control != Control.POSITION:
             self._follow(Command.SET_CONTROLLER_MODE, t)
@@ -101,7 +101,7 @@ class Motor:
         elif command is Command.SET_INPUT_POS:  # a trajectory begins with its goal, not with its mode
             self.shaft.go(t, self.goal, self._trajectory_speed, self._trajectory_accel)
 
-    # what is done to it
+    # faults
 
     def place(self, turns: float, t: float) -> None:
         """Turn it by hand."""
@@ -109,7 +109,7 @@ class Motor:
         self.shaft.forget(t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold it fast, or let go of it: then it makes for where it should be."""
+        """Jam it, or release it: then it moves to its target."""
         if on or self.shaft.jammed:
             goal = self.shaft.demand.goal
             self.shaft.jam(on, t)

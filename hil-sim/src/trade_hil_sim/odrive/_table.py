@@ -43,7 +43,7 @@ class State(IntEnum):
 
 
 class Control(IntEnum):
-    """What is controlled."""
+    """Control modes."""
 
     TORQUE = 1
     VELOCITY = 2
@@ -51,7 +51,7 @@ class Control(IntEnum):
 
 
 class Input(IntEnum):
-    """What becomes of an input."""
+    """Input modes."""
 
     PASSTHROUGH = 1
     VEL_RAMP = 2
@@ -69,7 +69,7 @@ class Result(IntEnum):
 
 
 class Errors(IntFlag):
-    """Those a simulated axis finds itself; others can be struck into it."""
+    """Errors that a simulated axis detects itself; a fault can set others."""
 
     UNDER_VOLTAGE = 0x200
     OVER_VOLTAGE = 0x100
@@ -91,7 +91,7 @@ ANSWERS: Final = frozenset(
         Command.GET_POWERS,
     }
 )
-"""What an axis tells: cyclically, or asked by a remote frame or one without data."""
+"""Messages of an axis: cyclic, or requested by a remote frame or one without data."""
 
 ORDERS: Final = {
     Command.ESTOP: struct.Struct(""),
@@ -108,4 +108,4 @@ ORDERS: Final = {
     Command.CLEAR_ERRORS: struct.Struct(""),
     Command.SET_ABSOLUTE_POSITION: struct.Struct("<f"),
 }
-"""What an axis is told; longer data is cut, shorter is not obeyed."""
+"""Commands to an axis; longer data is cut, shorter data is ignored."""

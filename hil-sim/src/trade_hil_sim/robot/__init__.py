@@ -1,1 +1,1 @@
-"""Simulated buses out of a robot file, and the thread that each of them has."""
+"""Simulated buses of a robot file, each with its own thread."""

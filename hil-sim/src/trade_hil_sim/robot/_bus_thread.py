@@ -1,4 +1,4 @@
-"""The thread of a bus: it waits for wires and for a bell, and does what other threads ask of it."""
+"""The thread of a bus: it waits for I/O and a wake-up pipe, and carries out calls from other threads."""
 
 import os
 import select
@@ -20,7 +20,7 @@ __all__ = ["BusThread", "Mailbox", "listener", "ready"]
 
 _T = TypeVar("_T")
 _FEW: Final = 1024
-"""``select`` knows lower numbers only, and waits as briefly as it is told; ``poll`` rounds up to a millisecond."""
+"""``select`` supports only lower descriptors, but any timeout; ``poll`` rounds up to a millisecond."""
 
 
 class _HasFile(Protocol):
@@ -31,10 +31,10 @@ File = TypeVar("File", bound="int | _HasFile")
 
 
 def ready(reading: Sequence[File], writing: Sequence[File] = (), timeout_s: float | None = None) -> list[File]:
-    """Those of the first that can be read, or have ended, once there is one or one of the second can be written.
+    """Waits until a file of the first is readable or ended, or one of the second writable; returns those of the first.
 
     Args:
-        reading: files, or things that have one.
+        reading: files, or objects with a descriptor.
         writing: likewise.
         timeout_s: how long to wait, in seconds; None: as long as it takes.
     """
@@ -59,7 +59,7 @@ def _number(thing: "int | _HasFile") -> int:
 
 
 def listener(host: str, number: int) -> socket.socket:
-    """A socket that listens on a port, or with 0 on any; raises OSError if it is taken."""
+    """A socket that listens on a port, or with 0 on any; raises OSError if the port is in use."""
     made = socket.socket()
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -73,35 +73,35 @@ def listener(host: str, number: int) -> socket.socket:
 
 
 class Mailbox:
-    """Calls to be made in one thread, in the order they came; nobody is left waiting when that ends.
+    """A queue of calls that one thread makes in order; calls that are left when it ends are refused.
 
     Args:
-        who: whose thread it is, for messages.
-        answer_s: how long one may take.
+        who: the thread's owner, for messages.
+        answer_s: how long a call may take.
     """
 
     def __init__(self, who: str, answer_s: float) -> None:
         self._who, self._answer_s = who, answer_s
         self._asked: deque[tuple[Callable[[], None], Callable[[Exception], None]]] = deque()
-        """How to carry out each call, and how to refuse it."""
+        """For each call, the functions that carry it out and refuse it."""
         self._guard = threading.Lock()
         self._rope = -1
-        """Where the bell is rung; below 0 while nobody listens."""
+        """The write end of the wake-up pipe; below 0 while the thread does not listen."""
         self.bell = -1
-        """Readable when something was asked for, or `ring` was called."""
+        """Readable after a call was queued or `ring` was called."""
 
     def open(self) -> None:
-        """From here on the bell can be heard."""
+        """Open the wake-up pipe."""
         self.bell, self._rope = os.pipe()
         os.set_blocking(self.bell, False)
         os.set_blocking(self._rope, False)
 
     def ask(self, act: Callable[[], _T]) -> _T:
-        """Have the thread make a call, and wait for what comes of it; not to be called in the thread itself.
+        """Let the thread make a call, and wait for its result; not to be called in the thread itself.
 
         Raises:
-            SimulationError: it does not listen any more.
-            TimeoutError: it is busy with something else.
+            SimulationError: the thread no longer listens.
+            TimeoutError: the thread is busy.
         """
         done: Future[_T] = Future()
 
@@ -119,19 +119,19 @@ class Mailbox:
         return done.result(self._answer_s)
 
     def ring(self) -> None:
-        """Wake the thread, for it to look for itself."""
+        """Wake the thread."""
         with self._guard:
             self._ring()
 
     def run(self) -> None:
-        """In the thread, when the bell is heard: do what was asked."""
+        """In the thread, after a wake-up: make the queued calls."""
         with suppress(BlockingIOError):
             os.read(self.bell, 4096)
         while self._asked:
             self._asked.popleft()[0]()
 
     def close(self) -> None:
-        """In the thread, at its end: who has asked and who does so from now on is told."""
+        """In the thread, at its end: refuse queued and later calls."""
         with self._guard:
             os.close(self._rope)
             self._rope = -1
@@ -144,17 +144,17 @@ class Mailbox:
 
     def _ring(self) -> None:
         if self._rope >= 0:
-            with suppress(BlockingIOError):  # it is rung already
+            with suppress(BlockingIOError):  # a wake-up is pending already
                 os.write(self._rope, b"!")
 
 
 class BusThread(ABC):
-    """A bus with a thread of its own, from `open` to `close`.
+    """A bus with its own thread, from `open` to `close`.
 
     Args:
         name: of the bus, in messages and of the thread.
-        answer_s: how long the thread may take over what it is asked.
-        kind: what it is, in messages.
+        answer_s: how long the thread may take for a call.
+        kind: the kind of bus, in messages.
     """
 
     def __init__(self, name: str, answer_s: float, kind: str = "bus") -> None:
@@ -165,7 +165,7 @@ class BusThread(ABC):
         self._thread: threading.Thread | None = None
 
     def open(self) -> "Self":
-        """Plug in: from now on clients can come."""
+        """Plug in: from now on clients can connect."""
         if self._thread is not None:
             raise SimulationError(f"{self._who} is open, or was; make a new one")
         self._errands.open()
@@ -179,7 +179,7 @@ class BusThread(ABC):
         return self
 
     def close(self) -> None:
-        """Hang up and end the thread. Idempotent; a log passed in stays open."""
+        """Disconnect clients and end the thread. Idempotent; a log passed in stays open."""
         if self._thread is None or self._closing:
             return
         self._closing = True
@@ -195,22 +195,22 @@ class BusThread(ABC):
 
     @abstractmethod
     def _begin(self) -> None:
-        """Take what clients open; the bell can be heard already."""
+        """Open the ports for clients; the wake-up pipe is open already."""
 
     @abstractmethod
     def _step(self) -> None:
-        """In the thread: wait for the bell and all else, and do what is due."""
+        """In the thread: wait for wake-ups and I/O, and do what is due."""
 
     @abstractmethod
     def _end(self) -> None:
-        """In the thread, at its end: free what clients open."""
+        """In the thread, at its end: free the ports."""
 
     def _in_thread(self, act: Callable[[], _T]) -> _T:
-        """Have the thread make a call; before `open`, make it here."""
+        """Let the thread make a call; before `open`, make it here."""
         return act() if self._thread is None else self._ask(act)
 
     def _ask(self, act: Callable[[], _T]) -> _T:
-        """Have the thread make a call; raises `SimulationError` while there is none."""
+        """Let the thread make a call; raises `SimulationError` while it does not run."""
         return act() if threading.current_thread() is self._thread else self._errands.ask(act)
 
     def _run(self) -> None:

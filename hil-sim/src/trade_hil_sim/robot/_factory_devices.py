@@ -1,4 +1,4 @@
-"""Buses with devices as they leave the factory, which no robot file can describe: all of them have the same id."""
+"""Buses with factory-new devices, which no robot file can describe: all of them have the same id."""
 
 from math import pi
 from pathlib import Path
@@ -23,7 +23,7 @@ _FACTORY: Final = {
     "robotiq": _Factory(115_200, 9),
 }
 _APART_RAD: Final = 0.2
-"""How far from each other their shafts stand."""
+"""Distance between the positions of their shafts."""
 
 
 def fresh_bus(words: str, directory: Path, *, log: ByteLog | None = None, paced: bool = True) -> SimulatedBus:
@@ -31,12 +31,12 @@ def fresh_bus(words: str, directory: Path, *, log: ByteLog | None = None, paced:
 
     Args:
         words: such as ``neck=dynamixel:XL430-W250,XL430-W250``.
-        directory: where its port goes.
+        directory: of its port.
         log: where to record.
-        paced: take as long as the real wire.
+        paced: take the time of the real wire.
 
     Raises:
-        SimulationError: the words are others, or name what is not simulated.
+        SimulationError: the words have another form, or name something that is not simulated.
     """
     name, equals, rest = words.partition("=")
     driver, colon, models = rest.partition(":")

@@ -1,4 +1,4 @@
-"""From a robot file to simulated buses: which class simulates which driver. The only module that reads robot files."""
+"""Builds simulated buses from a robot file, by the class for each driver. The only module that reads robot files."""
 
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
@@ -22,14 +22,14 @@ __all__ = [
 
 GROUP: Final = "trade.sims"
 """Entry points of this group are `SimulatedBusClass`es, or for cameras and sensors `SimulatedSenseClass`es; their names
-are those of the drivers they stand in for."""
+are those of the drivers that they replace."""
 
 Truth = Callable[[], Sequence[BusState]]
-"""What all buses of the robot do at this moment."""
+"""The true state of all buses of the robot."""
 
 
 class SimulatedBus(Protocol):
-    """One bus with its devices, or a camera, or a sensor: whatever is behind one port."""
+    """One bus with its devices, or a camera, or a sensor: everything behind one port."""
 
     @property
     def name(self) -> str:
@@ -38,7 +38,7 @@ class SimulatedBus(Protocol):
 
     @property
     def port(self) -> Path | str:
-        """What a client opens: a path, or such as ``socketcand:127.0.0.1:29536/can0``; final from `open` on."""
+        """The port for clients: a path, or such as ``socketcand:127.0.0.1:29536/can0``; final from `open` on."""
         ...
 
     def open(self) -> object:
@@ -46,11 +46,11 @@ class SimulatedBus(Protocol):
         ...
 
     def close(self) -> None:
-        """Free everything; idempotent."""
+        """Free all resources; idempotent."""
         ...
 
     def do(self, command: Command) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
         ...
 
     def state(self) -> BusState:
@@ -60,7 +60,7 @@ class SimulatedBus(Protocol):
 
 @runtime_checkable
 class SimulatedBusClass(Protocol):
-    """What an entry point of the group ``trade.sims`` names."""
+    """The class that an entry point of the group ``trade.sims`` names for a driver of buses."""
 
     def from_robot(
         self,
@@ -71,13 +71,13 @@ class SimulatedBusClass(Protocol):
         log: ByteLog | None = None,
         paced: bool = True,
     ) -> SimulatedBus:
-        """Make the bus a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        """Create the bus of a robot file, not yet open; raises `SimulationError` naming what is not supported."""
         ...
 
 
 @runtime_checkable
 class SimulatedSenseClass(Protocol):
-    """What such an entry point names for a driver of cameras or sensors."""
+    """The class that such an entry point names for a driver of cameras or sensors."""
 
     def from_record(
         self,
@@ -88,7 +88,7 @@ class SimulatedSenseClass(Protocol):
         log: ByteLog | None = None,
         paced: bool = True,
     ) -> SimulatedBus:
-        """Make the device a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        """Create the device of a robot file, not yet open; raises `SimulationError` naming what is not supported."""
         ...
 
 
@@ -104,10 +104,10 @@ def buses_of(
 
     Args:
         robot: from `read_robot`.
-        directory: where the ports go.
-        names: which of them; default: all.
-        log: where all of them record.
-        paced: take as long as the real wires.
+        directory: of the ports.
+        names: of those to simulate; default: all.
+        log: where all record.
+        paced: take the time of the real wires.
     """
     senses = (*robot.cameras, *robot.sensors)
     known = {device.name for device in (*robot.buses, *senses)}
@@ -158,11 +158,11 @@ def _sense_class(driver: str) -> SimulatedSenseClass:
 def find_simulator(
     driver: str, installed: Sequence[EntryPoint] | None = None
 ) -> SimulatedBusClass | SimulatedSenseClass:
-    """The class that simulates what a driver talks to.
+    """The class that simulates the devices of a driver.
 
     Args:
         driver: its name in robot files.
-        installed: where to look; default: the entry points of all installed packages.
+        installed: where to search; default: the entry points of all installed packages.
 
     Raises:
         SimulationError: there is none, or more than one.

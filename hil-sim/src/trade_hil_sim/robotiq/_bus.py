@@ -46,7 +46,7 @@ class RobotiqBus(DeviceLine[Gripper]):
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
-        paced: take as long as the real wire, the gap before an answer included; else answer as fast as possible.
+        paced: take the time of the real wire, the gap before an answer included; else answer as fast as possible.
         clock: the grippers' clock, in seconds. The line itself keeps real time.
     """
 
@@ -71,7 +71,7 @@ class RobotiqBus(DeviceLine[Gripper]):
             devices: the grippers on it.
             port: path the client will open instead of the record's.
             log: where to record.
-            paced: take as long as the real wire.
+            paced: take the time of the real wire.
 
         Raises:
             SimulationError: a model or baud rate that is not simulated.
@@ -142,7 +142,7 @@ class RobotiqBus(DeviceLine[Gripper]):
 
 
 def _moves(gripper: Gripper, request: Request) -> bool:
-    """Whether a write leaves the gripper told to move: to go, to activate, or to let go by itself."""
+    """Whether a write commands motion: to go, to activate, or to release automatically."""
     before, now = gripper.command, list(gripper.command)
     for at, value in enumerate(request.values, request.write_at - table.COMMAND):
         if 0 <= at < len(now):
@@ -153,7 +153,7 @@ def _moves(gripper: Gripper, request: Request) -> bool:
 
 
 def _obey(gripper: Gripper, request: Request, t: float) -> bytes | ExceptionCode | None:
-    """Carry a request out; what is answered, or why not."""
+    """Carry a request out; return the answer, or the exception."""
     if request.function not in set(Function):
         return ExceptionCode.FUNCTION
     if not request.whole or request.read_count > MOST_REGISTERS:

@@ -1,6 +1,6 @@
 """One simulated 2F-85: registers, activation, fingers that move at constant speed, an object between them.
 
-Time is an argument everywhere, in seconds on the caller's clock; nothing happens but in `advance`.
+Time is an argument everywhere, in seconds on the caller's clock; everything happens in `advance`.
 """
 
 from collections.abc import Sequence
@@ -19,17 +19,17 @@ from . import _table as table
 __all__ = ["Gripper", "Object"]
 
 CYCLE_S: Final = 0.005
-"""Requests are taken over by the motion control at its next cycle; until then the status is that of before."""
+"""The motion control applies requests at its next cycle; until then the status is the previous one."""
 ACTIVATION_COUNTS_S: Final = 320.0
 """How fast the fingers close and open while they find their stops."""
 PATIENCE_S: Final = 1.0
-"""Heard nothing for this long: fault 09, until the cycle after the next request."""
+"""Without a request for this long: fault 09, until the cycle after the next request."""
 HOT_C: Final = 85
-"""From here on fault 08 is shown: an assumption, as are the two below."""
+"""Fault 08 begins at this temperature: an assumption, as are the two below."""
 COOL_C: Final = 80
-"""Until it is cooler than this."""
+"""Fault 08 ends below this temperature."""
 LEAST_V: Final = 21.6
-"""Below it, 24 V less a tenth, fault 0A."""
+"""Fault 0A begins below this supply, 24 V less a tenth."""
 _MOVING_CURRENT: Final = 12
 _NEVER: Final = inf
 _CLOSE_COUNTS: Final = 0.5
@@ -51,12 +51,12 @@ class Object:
     width_m: float
     stiffness_n_m: float
     inside: bool
-    """It is hollow and met from inside, by opening."""
+    """It is hollow, and the fingers meet it from inside, by opening."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Fingers on their way at constant speed, or at rest where a stretch ends."""
+    """Fingers that move at constant speed, or rest where a motion ends."""
 
     begins: float
     start: float
@@ -82,10 +82,10 @@ class Gripper(LineDevice):
 
     Args:
         device_id: slave id.
-        name: of the gripper in the robot file, for the log.
-        width_m: how far it is open.
+        name: the gripper's name in the robot file, for the log.
+        width_m: its opening.
         t: now.
-        baud: what it listens at.
+        baud: its baud rate.
         exceptions: answer bad requests with exceptions; the manual says it stays silent.
     """
 
@@ -104,7 +104,7 @@ class Gripper(LineDevice):
         super().__init__()
         self._device_id, self.name, self.baud, self.exceptions = device_id, name, baud, exceptions
         self.foreign = False
-        """Another Modbus device has its id, with other registers."""
+        """Whether another Modbus device, with other registers, has its id."""
         self._wanted = [0, 0, 0]
         self._taken = [0, 0, 0]
         self._take_at = _NEVER
@@ -134,7 +134,7 @@ class Gripper(LineDevice):
         return action, position, how
 
     def write(self, address: int, values: Sequence[int], t: float) -> bool:
-        """Take registers over at the next cycle; False if they are not there, and nothing is written."""
+        """Apply registers at the next cycle; False, without a write, if they do not exist."""
         at = address - table.COMMAND
         if not (at >= 0 and at + len(values) <= table.REGISTERS and values):
             return False
@@ -145,7 +145,7 @@ class Gripper(LineDevice):
         return True
 
     def read(self, address: int, count: int, t: float) -> tuple[int, ...] | None:
-        """Registers as they are now; None if they are not there."""
+        """The present values of registers; None if they do not exist."""
         for base, values in ((table.COMMAND, self.command), (table.STATUS, self.status(t))):
             at = address - base
             if at >= 0 and count > 0 and at + count <= table.REGISTERS:
@@ -188,18 +188,18 @@ class Gripper(LineDevice):
     # --- time
 
     def heard(self, t: float) -> None:
-        """It was asked something."""
+        """A request has arrived."""
         if t - self._heard_at > PATIENCE_S:
             self._deaf_until = t + CYCLE_S
         self._heard_at = t
 
     def next_due(self) -> float | None:
-        """When something happens by itself."""
+        """When `advance` should be called next."""
         due = min(self._take_at, self._deaf_until, self._stretch.ends if self._moving else _NEVER)
         return None if due == _NEVER else due
 
     def advance(self, t: float) -> None:
-        """Let everything happen that is due."""
+        """Run everything that is due."""
         while (due := self.next_due()) is not None and due <= t:
             if due == self._take_at:
                 self._take_at = _NEVER
@@ -241,7 +241,7 @@ class Gripper(LineDevice):
             self._run_to(table.CLOSED_COUNTS, ACTIVATION_COUNTS_S, t)
 
     def _go(self, t: float) -> None:
-        """Go where the registers say, if it may."""
+        """Move to the goal in the registers, if it is allowed to."""
         if self._activated and self._going and not self._fault:
             _, position, how = self._taken
             self._run_to(_within(position & 0xFF), table.speed_of(how >> 8), t)
@@ -258,7 +258,7 @@ class Gripper(LineDevice):
             self._arrive(t)
 
     def _where_met(self, here: float, goal: float) -> float:
-        """Where the way to a goal ends: there, or at the object, pressed in as far as the force goes."""
+        """Where the motion to a goal ends: there, or at the object, compressed as far as the force allows."""
         if self._jammed:
             return here
         if self._put is None or self._put.inside == (goal > here):
@@ -299,7 +299,7 @@ class Gripper(LineDevice):
     # --- the world
 
     def put(self, what: Object | None, t: float) -> None:
-        """Put an object between the fingers, or take it away; fingers under way or gripping go on as that demands."""
+        """Put an object between the fingers, or take it away; moving or gripping fingers react to that."""
         self._put = what
         self._go(t)
 
@@ -319,16 +319,16 @@ class Gripper(LineDevice):
         self.foreign = True
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold the fingers fast, or let go."""
+        """Jam the fingers, or release them."""
         self._jammed = on
         self._go(t)
 
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
-        """Let the position read stand still."""
+        """Freeze the position that it reports."""
         self._frozen = round(self.position(t)) if on else None
 
     def fail(self, fault: int, t: float) -> None:
-        """Latch a fault: the fingers stand; after a major one it has to be activated again."""
+        """Latch a fault and stop the fingers; after a major one it has to be activated again."""
         self._fault = fault
         if fault >= table.MAJOR_FAULT:
             self._activated = self._activating = False
@@ -345,14 +345,14 @@ class Gripper(LineDevice):
             self.fail(table.HOT_FAULT, t)
 
     def _restore(self, t: float) -> None:  # noqa: ARG002 - at once
-        """End what was done to it but for a major fault, which only a new activation clears."""
+        """End all faults except a major one, which only a new activation clears."""
         self.foreign = False
         self.supply_v, self.temperature_c = self.healthy
         if self._fault < table.MAJOR_FAULT:
             self._fault = 0
 
     def brown_out(self, t: float) -> None:
-        """The supply dips: the registers are 0, the fingers stand, and it has to be activated again."""
+        """The supply dips: the registers are 0, the fingers stop, and it has to be activated again."""
         self._wanted, self._taken, self._take_at = [0, 0, 0], [0, 0, 0], _NEVER
         self._activated = self._activating = False
         self._fault = 0

@@ -29,13 +29,13 @@ MOST_REGISTERS: Final = 125
 GAP_S: Final = 0.00175
 """Silence between two requests at more than 19200 baud."""
 PATIENCE_S: Final = 0.05
-"""A request whose next byte has not come after this long is given up. Real slaves allow 0.75 ms; a pty tears more."""
+"""A request whose next byte has not come after this long is discarded. Real slaves allow 0.75 ms; a pty adds gaps."""
 _HEAD: Final = 2
 _CRC: Final = 2
 
 
 class Function(IntEnum):
-    """The functions a gripper knows."""
+    """The functions that a gripper supports."""
 
     READ = 0x03
     READ_INPUT = 0x04
@@ -54,7 +54,7 @@ class ExceptionCode(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request, taken apart as far as its function is known."""
+    """One request, parsed as far as its function is known."""
 
     device_id: int
     function: int
@@ -67,7 +67,7 @@ class Request:
 
     @property
     def name(self) -> str:
-        """What the log and the faults call it."""
+        """Its name in the log and in faults."""
         return Function(self.function).name.lower() if self.function in set(Function) else f"function {self.function}"
 
 
@@ -107,8 +107,8 @@ def exception(request: Request, code: ExceptionCode) -> bytes:
 class RequestReader:
     """Finds requests in the bytes of a client.
 
-    Frames are told apart by the length their function has: on a pseudo-terminal the gaps between them are lost. What
-    cannot be a request, or has a wrong CRC, is thrown away up to the next silence, as a slave does that counts gaps.
+    Functions give the lengths of frames, since a pseudo-terminal loses the gaps between them. What
+    cannot be a request, or has a wrong CRC, is discarded up to the next silence, like in a slave that measures gaps.
     """
 
     def __init__(self) -> None:
@@ -116,13 +116,13 @@ class RequestReader:
         self._lost = False
 
     def silence(self, s: float) -> None:
-        """No byte came for so long."""
+        """Note how long no byte has arrived."""
         if (self._lost and s > GAP_S) or s > PATIENCE_S:
             self._held.clear()
             self._lost = False
 
     def feed(self, data: bytes) -> Iterator[Request | None]:
-        """Every request that is whole with these bytes; None for one that was damaged."""
+        """Every request that these bytes complete; None for a damaged one."""
         if self._lost:
             return
         self._held += data
@@ -141,7 +141,7 @@ class RequestReader:
 
 
 def _length(held: bytearray) -> int | None:
-    """Bytes of the frame that begins here; None while that is open, 0 if it is none."""
+    """Length of the frame that begins here; None while it is unknown, 0 if it is no frame."""
     if len(held) < _HEAD:
         return None
     if held[1] not in _LAYOUTS:
@@ -186,4 +186,4 @@ _LAYOUTS: Final[dict[int, tuple[int, Callable[[bytes], Request]]]] = {
     Function.WRITE: (9, _writing),
     Function.READ_WRITE: (13, _reading_and_writing),
 }
-"""By function: the length of a request without its values, and how to take its body apart."""
+"""By function: the length of a request without its values, and how to parse its body."""

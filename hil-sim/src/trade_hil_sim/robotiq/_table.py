@@ -42,12 +42,12 @@ COMMUNICATION_FAULT: Final = 0x09
 HOT_FAULT: Final = 0x08
 LOW_VOLTAGE_FAULT: Final = 0x0A
 MAJOR_FAULT: Final = 0x0A
-"""From here on the fingers stand until rACT has been 0."""
+"""Faults from this one on stop the fingers until rACT has been 0."""
 
 STROKE_M: Final = 0.085
 OPEN_COUNTS: Final = 3
 CLOSED_COUNTS: Final = 230
-"""Where the fingers meet their stops; requests beyond are fulfilled there."""
+"""Positions of the mechanical stops; requests beyond end there."""
 _SPEED_M_S: Final = (0.020, 0.150)
 _FORCE_N: Final = (20.0, 235.0)
 _SPAN: Final = CLOSED_COUNTS - OPEN_COUNTS
@@ -64,12 +64,12 @@ def counts_of(width_m: float) -> float:
 
 
 def speed_of(request: int) -> float:
-    """Counts a second of a speed request."""
+    """Speed in counts/s of a speed request."""
     slow, fast = _SPEED_M_S
     return (slow + (fast - slow) * request / 255) * _SPAN / STROKE_M
 
 
 def force_of(request: int) -> float:
-    """Newtons of a force request."""
+    """Force in newtons of a force request."""
     weak, strong = _FORCE_N
     return weak + (strong - weak) * request / 255

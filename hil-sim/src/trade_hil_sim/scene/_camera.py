@@ -1,4 +1,4 @@
-"""The camera: an HTTP server on the loopback interface that answers each request with what is seen at that moment."""
+"""The camera: an HTTP server on the loopback interface that answers each request with the picture of that moment."""
 
 import socket
 import threading
@@ -25,7 +25,7 @@ __all__ = ["SceneCamera"]
 _SIZE_PX: Final = (320, 240)
 _ANSWER_S: Final = 5.0
 _CLIENT_S: Final = 1.0
-"""How long a client may take over its request, and over taking the answer."""
+"""How long a client may take to send its request, and to receive the answer."""
 _LONGEST_MUTE_S: Final = 60.0
 _LONGEST_REQUEST: Final = 8192
 _TARGET: Final = "/scene.png"
@@ -35,7 +35,7 @@ class SceneCamera(BusThread):
     """A network camera: ``GET /scene.png`` is a picture of the robot. One client is answered after the other.
 
     Args:
-        truth: what the robot's buses do.
+        truth: returns the state of the robot's buses.
         name: of the camera in the robot file.
         width_px: how wide its pictures are.
         height_px: how high.
@@ -73,7 +73,7 @@ class SceneCamera(BusThread):
         """The camera of a robot file, as large as that says.
 
         Raises:
-            SimulationError: it is no camera, or a size that is none.
+            SimulationError: it is no camera, or its size is invalid.
         """
         sizes = [device.options.get(key, usual) for key, usual in zip(("width_px", "height_px"), _SIZE_PX, strict=True)]
         width, height = (size if isinstance(size, int) else 0 for size in sizes)
@@ -83,18 +83,18 @@ class SceneCamera(BusThread):
 
     @property
     def port(self) -> str:
-        """Where its pictures are; final from `open` on."""
+        """The URL of its pictures; final from `open` on."""
         return f"http://127.0.0.1:{self._number}{_TARGET}"
 
     def state(self) -> BusState:
-        """Whether it can be reached; it has no devices."""
+        """Its state: whether it is plugged in; it has no devices."""
         return BusState(name=self.name, port=self.port, plugged=self._listener is not None)
 
     def do(self, command: faults.Command) -> None:
         """Carry out a fault or an order: those of answers, ``unplug``, ``replug``, ``freeze`` and ``heal``.
 
         Raises:
-            SimulationError: it is another.
+            SimulationError: any other fault.
         """
         match command:
             case faults.Unplug() | faults.Replug():
@@ -170,7 +170,7 @@ class SceneCamera(BusThread):
         self._note("sent", f"{sum(len(piece.data) for piece in pieces)} bytes")
 
     def _patient(self, client: socket.socket, until: float) -> bool:
-        """Wait; False if the client gave up before, or the camera has other things to do."""
+        """Wait; False if the client disconnects first, or the camera is woken."""
         left_s = until - time.monotonic()
         return left_s <= 0 or not ready([client.fileno(), self._errands.bell], timeout_s=left_s)
 

@@ -1,7 +1,7 @@
 """What a camera sees of a simulated robot: each device in a field of the picture of its own, as a PNG file. Pure.
 
-A joint is a limb that swings about the middle of its field: 0 rad points to the right, positive angles turn it
-counter-clockwise. A gripper is two fingers, as far apart as they are, and what was put between them. An arm has a field
+A joint is a limb that turns about the middle of its field: 0 rad points to the right, positive angles turn it
+counter-clockwise. A gripper is two fingers, at their real distance, and the object between them. An arm has a field
 for each of its joints.
 """
 
@@ -22,7 +22,7 @@ FLOOR: Final[Colour] = (52, 56, 64)
 LIMB: Final[Colour] = (240, 200, 60)
 OBJECT: Final[Colour] = (220, 60, 50)
 _SPAN_M: Final = 0.12
-"""As much of the world as a gripper's field shows from side to side."""
+"""Width in metres that a gripper's field shows."""
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _TRUECOLOUR_8: Final = bytes((8, 2, 0, 0, 0))
@@ -39,7 +39,7 @@ class Field(NamedTuple):
 
 
 def fields(buses: Sequence[BusState], width_px: int, height_px: int) -> dict[str, Field]:
-    """Where each device is seen, by its name in the robot file; the joints of an arm are ``right.0`` to ``right.5``."""
+    """The field of each device, by its name in the robot file; the joints of an arm are ``right.0`` to ``right.5``."""
     names = [name for name, _ in _seen(buses)]
     columns = max(1, ceil(sqrt(len(names))))
     rows = max(1, ceil(len(names) / columns))

@@ -1,4 +1,4 @@
-"""What simulated serial buses have in common: devices behind one line, faults of their answers, orders to them."""
+"""Base class of simulated serial buses: devices behind one line, faults of their answers, orders to them."""
 
 import threading
 import time
@@ -29,7 +29,7 @@ class LineDevice(DeviceModel):
 
     @abstractmethod
     def next_due(self) -> float | None:
-        """When something happens by itself; None if never."""
+        """When `advance` should be called next; None if never."""
 
 
 _Device = TypeVar("_Device", bound=LineDevice)
@@ -43,7 +43,7 @@ class DeviceLine(ABC, Generic[_Device]):
         port: stable path the client opens; made here, gone after `close`.
         name: of the bus, in the log.
         log: where to record; default: a log in memory, at `log`.
-        paced: take as long as the real wire, pauses before answers included; else answer as fast as possible.
+        paced: take the time of the real wire, pauses before answers included; else answer as fast as possible.
         clock: the devices' clock, in seconds. The line itself keeps real time.
     """
 
@@ -75,7 +75,7 @@ class DeviceLine(ABC, Generic[_Device]):
         return self
 
     def close(self) -> None:
-        """Hang up and remove the port. Idempotent; a log passed in stays open."""
+        """Disconnect and remove the port. Idempotent; a log passed in stays open."""
         self._line.close()
 
     def __enter__(self) -> "Self":
@@ -86,7 +86,7 @@ class DeviceLine(ABC, Generic[_Device]):
 
     @property
     def devices(self) -> Sequence[_Device]:
-        """The devices; take care, the bus's own thread uses them, too."""
+        """The devices. The bus's own thread uses them, too."""
         return tuple(self._devices)
 
     def state(self) -> BusState:
@@ -105,7 +105,7 @@ class DeviceLine(ABC, Generic[_Device]):
     # faults and orders
 
     def do(self, command: faults.Command) -> None:
-        """Carry out one fault or order; raises `SimulationError` for a device that is not here."""
+        """Carry out one fault or order; raises `SimulationError` if the bus lacks the device."""
         match command:
             case faults.Unplug():
                 self._line.unplug()
@@ -156,13 +156,13 @@ class DeviceLine(ABC, Generic[_Device]):
     # the far end of the line; called from its thread
 
     def wake_in_s(self) -> float | None:
-        """Seconds until a device does something by itself."""
+        """Seconds until `wake` should be called."""
         with self._lock:
             due = min((due for device in self._devices if (due := device.next_due()) is not None), default=None)
             return None if due is None else due - self._clock()
 
     def wake(self) -> None:
-        """Let the devices do what is due."""
+        """Let the devices run what is due."""
         with self._lock:
             t = self._clock()
             for device in self._devices:
@@ -179,19 +179,19 @@ class DeviceLine(ABC, Generic[_Device]):
 
     @abstractmethod
     def _silent_for(self, s: float) -> None:
-        """No byte came for so long before those that are taken next."""
+        """Note how long the line was silent before the next bytes."""
 
     @abstractmethod
     def _take(self, data: bytes, t: float) -> None:
         """Carry out what the client sent."""
 
     def _answer(self, data: bytes, ids: tuple[int, ...], instruction: str, *, after_s: float, device_id: int) -> None:
-        """Send an answer as the faults in force leave it."""
+        """Send an answer after the active faults were applied."""
         for piece, late_s in self._faults.shape(data, ids, instruction):
             self._line.send(piece, after_s=after_s, late_s=late_s, name=instruction, device_id=device_id)
             after_s = 0.0
 
 
 def interleaved(answers: Sequence[bytes]) -> bytes:
-    """What comes of answers on top of each other: the bytes of all, none of them where it belongs."""
+    """Simultaneous answers as they arrive: the bytes of all, interleaved."""
     return bytes(byte for column in zip_longest(*answers) for byte in column if byte is not None)

@@ -19,13 +19,13 @@ __all__ = ["Peer", "SerialLine"]
 BITS_PER_BYTE: Final = 10
 """8N1: start bit, eight data bits, stop bit."""
 SPIN_S: Final = 0.0002
-"""``time.sleep`` overshoots by up to this much, so the rest of a wait is spun."""
+"""``time.sleep`` overshoots by up to this much, so the line busy-waits for the rest."""
 ANSWER_S: Final = 5.0
-"""How long the line's thread may take to pull or set the plug."""
+"""How long the line's thread may take to plug or unplug."""
 
 
 class Peer(Protocol):
-    """What sits at the far end of a line. All three are called from the line's thread."""
+    """The far end of a line. The line's thread makes all three calls."""
 
     def received(self, data: bytes, t: float) -> None:
         """Bytes from the client, read at `t` seconds (monotonic)."""
@@ -36,7 +36,7 @@ class Peer(Protocol):
         ...
 
     def wake(self) -> None:
-        """The time asked for has come."""
+        """The requested time has come."""
         ...
 
 
@@ -71,7 +71,7 @@ class SerialLine(BusThread):
         self._baud: int | None = None
         self._terminal: Terminal | None = None
 
-    # what a peer uses, in the line's thread
+    # for the peer, in the line's thread
 
     @property
     def client_baud(self) -> int | None:
@@ -85,7 +85,7 @@ class SerialLine(BusThread):
 
         Args:
             data: what to send.
-            after_s: pause before them on the wire; later bytes wait behind. Ignored when not paced.
+            after_s: pause before them on the wire; later bytes wait for them. Ignored when not paced.
             late_s: hold only these bytes back this long beyond their time, paced or not.
             name: the instruction they answer, for the log.
             device_id: who sends, for the log.
@@ -97,7 +97,7 @@ class SerialLine(BusThread):
         self._order += 1
         heapq.heappush(self._out, _Chunk(due + late_s, self._order, data, name, device_id))
 
-    # what anybody uses
+    # for any thread
 
     @property
     def plugged(self) -> bool:
@@ -109,11 +109,11 @@ class SerialLine(BusThread):
         self._ask(self._unplug)
 
     def replug(self) -> None:
-        """Plug in again: a new pty behind the same link. Clients must open it anew."""
+        """Plug in again: a new pty behind the same link. Clients must open it again."""
         self._ask(self._replug)
 
     def nudge(self) -> None:
-        """Ask the peer again when it wants to be woken; call this when it has changed its mind."""
+        """Query the peer's wake-up time again; call this when it has changed."""
         self._errands.ring()
 
     # the thread
@@ -152,7 +152,7 @@ class SerialLine(BusThread):
     def _write_due(self) -> None:
         while self._terminal is not None and self._out and self._out[0].due - time.monotonic() < SPIN_S + 0.001:
             chunk = heapq.heappop(self._out)
-            # logged first: whoever has an answer finds it in the log, and the wire does not wait for the log
+            # logged first: when a client has an answer, the log has it too, and the wire does not wait for the log
             due = max(chunk.due, time.monotonic())
             self._note("sent", chunk.data, due, name=chunk.name, device_id=chunk.device_id)
             _sleep_until(due)
@@ -180,7 +180,7 @@ class SerialLine(BusThread):
         self._baud = self._terminal.client_baud()
         if self.paced:
             self._wire_free_at = max(t, self._wire_free_at) + len(data) * self._byte_s()
-        # events that fell due before these bytes come first in the log
+        # events that were due before these bytes come first in the log
         self._peer.wake()
         self._note("received", data, t)
         self._peer.received(data, t)

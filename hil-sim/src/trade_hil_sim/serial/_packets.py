@@ -1,4 +1,4 @@
-"""Packets of instructions to servos, as far as protocols agree: what is read and written where. Pure."""
+"""Instruction packets for servos, as far as protocols agree: which registers they read and write. Pure."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -46,26 +46,26 @@ class Packet(ABC):
 
     @abstractmethod
     def readings(self) -> list[Reading]:
-        """What it asks for; nothing if it reads nothing or its parameters make no sense."""
+        """The reads that it requests; none if it reads nothing or its parameters are invalid."""
 
     @abstractmethod
     def writings(self) -> list[Writing]:
-        """What it asks to be written; nothing if it writes nothing or its parameters make no sense."""
+        """The writes that it requests; none if it writes nothing or its parameters are invalid."""
 
 
 _Packet = TypeVar("_Packet", bound=Packet)
 
 
 class PacketReader(ABC, Generic[_Packet]):
-    """Cuts a stream of bytes into packets, wherever the chunks break."""
+    """Cuts a stream of bytes into packets, independent of the chunks."""
 
     def __init__(self) -> None:
         self._held = b""
         self.skipped = 0
-        """Bytes thrown away so far because they belonged to no packet."""
+        """Bytes discarded so far because they belonged to no packet."""
 
     def feed(self, data: bytes) -> list[_Packet]:
-        """Take in bytes; return the packets they completed."""
+        """Add bytes; return the packets that they complete."""
         self._held += data
         packets: list[_Packet] = []
         while (packet := self._next()) is not None:
@@ -73,12 +73,12 @@ class PacketReader(ABC, Generic[_Packet]):
         return packets
 
     def reset(self) -> None:
-        """Forget a packet begun."""
+        """Discard a partial packet."""
         self._skip(len(self._held))
 
     @abstractmethod
     def _next(self) -> _Packet | None:
-        """Take the next packet out of what is held; None if it is not whole yet."""
+        """Take the next packet from the buffer; None if it is not complete yet."""
 
     def _skip(self, count: int) -> None:
         self._held = self._held[count:]

@@ -1,4 +1,4 @@
-"""A pty dressed as a serial port: raw on both sides, with a stable name, and the client's baud rate readable."""
+"""A pty that acts as a serial port: raw on both sides, with a stable name, and the client's baud rate readable."""
 
 import array
 import fcntl
@@ -13,7 +13,7 @@ from typing import Final
 __all__ = ["Terminal"]
 
 TCGETS2: Final = 0x802C542A
-"""Linux ioctl that tells baud rates outside the classic list (asm-generic/ioctls.h)."""
+"""Linux ioctl that reads baud rates outside the classic list (asm-generic/ioctls.h)."""
 SPEED_WORD: Final = 10
 """Where ``struct termios2`` keeps the input speed, counted in 32-bit words."""
 CLASSIC: Final = {
@@ -25,7 +25,7 @@ class Terminal:
     """One plugged-in serial adapter; `close` unplugs it.
 
     Both ends stay open here: with the client's end closed, reading would fail whenever no client has it open. The link
-    goes when the adapter goes, because the number of a closed pty is soon somebody else's.
+    goes when the adapter goes, because the system soon reuses the number of a closed pty.
 
     Args:
         link: the stable name clients open; replaced atomically.
@@ -67,7 +67,7 @@ class Terminal:
         fresh.replace(self.link)
 
     def close(self) -> None:
-        """Unplug: remove the link, then hang up. Call it from the thread that polls `master`."""
+        """Unplug: remove the link, then close the pty. Call it from the thread that polls `master`."""
         with suppress(FileNotFoundError):
             self.link.unlink()
         self._close_ends()

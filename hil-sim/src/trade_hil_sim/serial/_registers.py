@@ -31,7 +31,7 @@ class Register(ABC):
     @property
     @abstractmethod
     def eeprom(self) -> bool:
-        """Whether it can be kept without power."""
+        """Whether it can survive a loss of power."""
 
     @property
     def writable(self) -> bool:
@@ -103,5 +103,5 @@ class Memory(Generic[_Register_co]):
         return tuple(dict.fromkeys(register.name for register in found if register is not None))
 
     def _target(self, address: int) -> int:
-        """The byte that an address stands for."""
+        """The byte that an address refers to."""
         return address

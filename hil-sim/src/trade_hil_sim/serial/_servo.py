@@ -1,4 +1,4 @@
-"""A servo with a table of registers: its shaft, and what it does by itself as time passes, whoever made it."""
+"""A servo of any vendor with a table of registers: its shaft, and its behaviour over time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ QUICK_COUNTS_S2: Final = 200.0 / RAD_PER_COUNT
 IN_POSITION_COUNTS: Final = 10
 RETURN_DELAY_UNIT_S: Final = 2e-6
 BOOT_S: Final = 0.1
-"""How long it hears nothing after a reboot: an assumption."""
+"""How long it receives nothing after a reboot: an assumption."""
 OVERLOAD: Final = 0x20
 """Bit of an overload in the error registers of all these servos."""
 
@@ -34,9 +34,9 @@ class ServoShaft(ABC):
     """
 
     direction = 1
-    """-1: positive counts are turns the other way."""
+    """-1: positive counts turn the other way."""
     tolerance = IN_POSITION_COUNTS
-    """How far off it may be held without straining."""
+    """The position error that a held shaft may have without overload."""
 
     def __init__(self, course: Course) -> None:
         self.course = course
@@ -53,7 +53,7 @@ class ServoShaft(ABC):
 
     @abstractmethod
     def ahead(self, t: float) -> float:
-        """How far the goal is, in counts, or how fast it should turn, with the sign of the way."""
+        """The distance to the goal in counts, or the target speed, with its sign."""
 
     def speed(self, t: float) -> float:
         """How fast it turns, in counts/s."""
@@ -69,15 +69,15 @@ class ServoShaft(ABC):
         self.course = to_speed(t, position, speed, 0.0, QUICK_COUNTS_S2)
 
     def strains(self, t: float) -> bool:
-        """Whether it is held off where it should go or how fast it should turn."""
+        """Whether a jam keeps it from its target position or speed."""
         return self.jammed and abs(self.ahead(t)) > self.tolerance
 
     def freeze(self, on: bool, t: float) -> None:
-        """Let the position register show what it shows now, whatever the shaft does, or the truth again."""
+        """Freeze the position register, or show the truth again."""
         self._shown = self.position(t) if on else None
 
     def _effort(self, t: float) -> float:
-        """Between -1 and 1: all there is against a jam, else for acceleration and a little for friction."""
+        """Load between -1 and 1: full against a jam, else for acceleration and a little for friction."""
         _, speed, acceleration = self.course.at(t)
         if self.strains(t):
             return copysign(1.0, self.ahead(t))
@@ -90,21 +90,21 @@ _Shaft_co = TypeVar("_Shaft_co", bound=ServoShaft, covariant=True)
 
 
 class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
-    """A servo, fresh from the box but for its id, baud rate and position: torque off, position mode.
+    """A servo with factory settings except its id, baud rate and position: torque off, position mode.
 
     Args:
         memory: its registers.
         shaft: what it moves.
         model: its name.
-        supply_v: what it is made for.
+        supply_v: its nominal supply.
         joint: name of the joint it drives, for logs.
         reversed_: whether the joint turns against the device.
         offset_rad: joint angle when the device reads its centre.
-        emit: told what happens.
+        emit: called with each event.
     """
 
     overload_s = 1.0
-    """How long it strains against a jam before it gives up."""
+    """How long it pushes against a jam before an overload."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
         self._boots_at: float | None = None
         self._strains_since: float | None = None
 
-    # what it is
+    # properties
 
     @property
     def device_id(self) -> int:
@@ -150,12 +150,12 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
 
     @property
     def torque(self) -> bool:
-        """Whether the motor is switched on; its protection may have cut it off all the same."""
+        """Whether torque is enabled; its protection may still have switched the motor off."""
         return self.memory.get("torque_enable") != 0
 
     @property
     def hears(self) -> bool:
-        """Whether it is there and awake."""
+        """Whether it is on the bus and not rebooting."""
         return not self.absent and self._boots_at is None
 
     @property
@@ -179,11 +179,11 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
     # time
 
     def next_due(self) -> float | None:
-        """When it will next do something by itself."""
+        """When `advance` should be called next."""
         return min((t for t, _ in self._dues()), default=None)
 
     def advance(self, t: float) -> None:
-        """Let happen what is due by time `t`, in order."""
+        """Run everything that is due by time `t`, in order."""
         while due := min((due for due in self._dues() if due[0] <= t), key=lambda due: due[0], default=None):
             when, happen = due
             happen(when)
@@ -207,10 +207,10 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
 
     @abstractmethod
     def _start_ram(self, t: float) -> None:
-        """Begin with the RAM at its defaults."""
+        """Start with the RAM at its defaults."""
 
     def reboot(self, t: float, event: str = "rebooted") -> None:
-        """Lose the RAM area, let go of the shaft, and hear nothing for a moment."""
+        """Lose the RAM area and the torque, and receive nothing for a moment."""
         self.note(event, t)
         self._release(t)
         self.memory.set("torque_enable", 0)
@@ -238,7 +238,7 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
         self._set_off(t) if self.torque else self._note_motion(t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Hold the shaft fast, or let go of it."""
+        """Jam the shaft, or release it."""
         if on == self.shaft.jammed:
             return
         self.shaft.jammed = on
@@ -250,7 +250,7 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
             self._set_off(t)
 
     def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - not all have a clock
-        """Let the position register stand still, or show the truth again."""
+        """Freeze the position register, or show the truth again."""
         self.shaft.freeze(on, t)
 
     def wrong_model(self, number: int) -> None:
@@ -266,7 +266,7 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
 
     @abstractmethod
     def _set_off(self, t: float) -> None:
-        """Make for the goal, if it may."""
+        """Move to the goal, if it is allowed to."""
 
     def _release(self, t: float) -> None:
         self._strains_since = None

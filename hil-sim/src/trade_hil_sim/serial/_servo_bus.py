@@ -1,4 +1,4 @@
-"""A simulated bus of servos: who hears a packet, and what goes into the log."""
+"""A simulated bus of servos: it distributes packets and logs instructions."""
 
 import time
 from abc import abstractmethod
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["ServoBus"]
 
 PAUSE_S: Final = 0.1
-"""A packet whose next byte has not come after this long is given up."""
+"""A packet whose next byte has not come after this long is discarded."""
 _Servo = TypeVar("_Servo", bound=ServoModel[Memory[Register], ServoShaft])
 _Packet = TypeVar("_Packet", bound=Packet)
 
@@ -35,7 +35,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
     """Names of the models that are simulated."""
     bauds: ClassVar[Collection[int]]
     motion: ClassVar[frozenset[str]]
-    """Registers of which a write could set something moving, or let go of it."""
+    """Registers whose write could start a motion, or switch off torque."""
     _deaf_to: int | None = None
     """The baud rate of the client that was logged as wrong last."""
 
@@ -50,7 +50,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
             joints: the joints on it.
             port: path the client will open instead of the record's.
             log: where to record.
-            paced: take as long as the real wire.
+            paced: take the time of the real wire.
 
         Raises:
             SimulationError: a model or baud rate that is not simulated.
@@ -74,11 +74,11 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
 
     @abstractmethod
     def _new_reader(self) -> PacketReader[_Packet]:
-        """What cuts the client's bytes into packets."""
+        """A parser for the client's bytes."""
 
     @abstractmethod
     def _carry_out(self, servos: list[_Servo], packet: _Packet, t: float) -> None:
-        """Have the servos that hear it carry out a packet."""
+        """Let the servos that receive a packet carry it out."""
 
     @cached_property
     def _reader(self) -> PacketReader[_Packet]:

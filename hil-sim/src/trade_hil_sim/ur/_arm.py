@@ -1,4 +1,4 @@
-"""A simulated arm: six joints, brakes, safety modes. It is told what to do and moves when time passes."""
+"""A simulated arm: six joints, brakes, safety modes. It takes commands, and moves when `advance` is called."""
 
 from collections.abc import Callable, Sequence
 from math import pi
@@ -17,15 +17,15 @@ __all__ = ["HOME", "JOINTS", "Arm"]
 
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 HOME: Final = (0.0, -pi / 2, pi / 2, -pi / 2, -pi / 2, 0.0)
-"""The elbow up, the tool pointing down: where a simulated arm begins."""
+"""The initial pose of a simulated arm: elbow up, tool pointing down."""
 _LIMIT_RAD: Final = 2 * pi
 _HALT_RAD_S2: Final = 15.0
-"""How it brakes when its program ends or safety stops it."""
+"""Deceleration when its program ends or safety stops it."""
 _POWER_S: Final = 0.2
 _UNLOCK_S: Final = 5.0
 _JAMMED_S: Final = 0.3
 _PAUSING_S: Final = 0.1
-"""A safeguard stop brakes it to rest on its way in this time."""
+"""A safeguard stop brakes it to rest on its path in this time."""
 _EVERY_RAD: Final = 0.02
 _EVERY_M: Final = 0.01
 Six = tuple[float, ...]
@@ -37,9 +37,9 @@ class Arm:
     Args:
         model: such as ``UR5e``.
         name: of the arm in the robot file.
-        q: where it stands, in rad.
+        q: its joint angles, in rad.
         running: powered, brakes released; else it is off.
-        t: when, on the clock that `advance` is called with.
+        t: now, on the clock of `advance`.
         unlock_s: how long after a protective stop it can be unlocked at the earliest.
     """
 
@@ -64,7 +64,7 @@ class Arm:
         self.stopped: Callable[[], None] = lambda: None
         """Called when safety ends whatever program runs."""
         self.paused: Callable[[bool], None] = lambda _: None
-        """Called when a safeguard stop holds it up, and when that is over."""
+        """Called when a safeguard stop pauses it, and when that is over."""
         self.t = t
         self.jammed = False
         self._motion: Motion = Held()
@@ -72,10 +72,10 @@ class Arm:
         self._unlock_s, self._locked_at = unlock_s, t
         self._jammed_s = 0.0
         self._pace = 1.0
-        """How fast its motion goes on: 0 while a safeguard stop holds it up."""
+        """Fraction of full speed: 0 while a safeguard stop pauses it."""
         self._modes: list[tuple[float, RobotMode]] = []
 
-    # --- what it is
+    # --- state
 
     @property
     def series(self) -> Series:
@@ -94,7 +94,7 @@ class Arm:
 
     @property
     def motion(self) -> Motion:
-        """What it is about."""
+        """Its present motion."""
         return self._motion
 
     @property
@@ -163,12 +163,12 @@ class Arm:
     # --- commands
 
     def move_joints(self, goal: Sequence[float], speed: float, accel: float) -> bool:
-        """Straight in joint space: speed in rad/s and acceleration of the joint that turns most."""
+        """Move straight in joint space: speed in rad/s and acceleration of the joint that turns most."""
         length = max(abs(b - a) for a, b in zip(self.q, goal, strict=True))
         return self._begin(Way([self.q, tuple(goal)], length, speed, accel))
 
     def move_line(self, pose: Sequence[float], speed: float, accel: float) -> bool:
-        """Straight in space: speed in m/s; False, and a protective stop, if the way leads out of reach."""
+        """Move straight in space: speed in m/s; False, and a protective stop, if the way leads out of reach."""
         start = self.pose()
         metres, turn = way_of(start, pose)
         count = max(2, int(metres / _EVERY_M) + 1, int(turn / _EVERY_RAD / 2) + 1)
@@ -183,14 +183,14 @@ class Arm:
         return self._begin(Way(points, metres or turn, speed, accel))
 
     def servo(self, target: Sequence[float]) -> bool:
-        """After this target, at once."""
+        """Follow this target, at once."""
         if isinstance(self._motion, Servo):
             self._motion.target = tuple(target)
             return self.ready
         return self._begin(Servo(tuple(target)))
 
     def turn(self, speeds: Sequence[float], accel: float, lasts_s: float) -> bool:
-        """At these speeds; asking for the same again changes nothing, so it can be asked in every cycle."""
+        """Move at these speeds; repeating the same command changes nothing, so it can come in every cycle."""
         asked = (tuple(speeds), accel, lasts_s)
         if isinstance(self._motion, Speed) and self._motion.asked == asked and lasts_s <= 0:
             return self.ready
@@ -225,7 +225,7 @@ class Arm:
         return True
 
     def release_brakes(self) -> bool:
-        """Let the arm carry itself; powers it on first if need be."""
+        """Release the brakes; powers the arm on first if needed."""
         self.power(True)
         if self.robot_mode is not RobotMode.RUNNING:
             after = self._modes[-1][0] if self._modes else self.t
@@ -260,7 +260,7 @@ class Arm:
         return True
 
     def reboot(self) -> None:
-        """As after a loss of power: off, its brakes on, everything forgotten."""
+        """Reset as after a loss of power: off, its brakes on, all state lost."""
         self._motion, self._moving, self.qd, self._pace = Held(), False, (0.0,) * 6, 1.0
         self._modes.clear()
         self.safety_mode, self.speed_fraction = SafetyMode.NORMAL, 1.0

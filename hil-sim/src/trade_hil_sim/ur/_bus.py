@@ -1,4 +1,4 @@
-"""A simulated controller with its arm: the three ports clients know, one thread, faults, and the log."""
+"""A simulated controller with its arm: the three ports of clients, one thread, faults, and the log."""
 
 import random
 import socket
@@ -37,12 +37,12 @@ _ARM: Final = 0
 _REBOOT_S: Final = 0.5
 _TRIES: Final = 100
 _CATCH_UP: Final = 25
-"""Cycles made up for when this thread was held up; more are skipped, as if the controller had stood still."""
+"""Cycles that are caught up when this thread was late; more are skipped, as if the controller had paused."""
 _MOVING: Final = ("actual_q", "actual_qd", "target_q", "target_qd", "actual_TCP_pose", "target_TCP_pose")
 
 
 class UrBus(BusThread):
-    """One controller on a loopback address of its own; its ports are those of a real one.
+    """One controller on its own loopback address; its ports are those of a real one.
 
     Args:
         arm: what it moves.
@@ -104,14 +104,14 @@ class UrBus(BusThread):
         arm = Arm(record.model, name=record.name, q=tuple(record.poses.get("home", HOME)))
         return cls(arm, host=host if host.startswith("127.") else "", name=bus.name, log=log)
 
-    # --- what anybody uses
+    # --- for any thread
 
     def state(self) -> BusState:
         """The truth, now."""
         return self._in_thread(self._state)
 
     def do(self, command: faults.Command) -> None:
-        """Carry out one fault or order; raises `SimulationError` for what is not here."""
+        """Carry out one fault or order; raises `SimulationError` if it does not support it."""
         self._in_thread(lambda: self._do(command))
 
     # --- the thread
@@ -145,7 +145,7 @@ class UrBus(BusThread):
         return max(0.0, min(times) - time.monotonic())
 
     def _pass_time(self, now: float) -> None:
-        """Every cycle that is due: the joints, the script, and what clients are sent."""
+        """Run every cycle that is due: the joints, the script, and the data for clients."""
         behind = int((now - self.arm.t) / self._period_s)
         if behind > _CATCH_UP:
             self.arm.t += (behind - _CATCH_UP) * self._period_s
@@ -162,7 +162,7 @@ class UrBus(BusThread):
     # --- connections
 
     def _listen(self) -> None:
-        """Take the three ports; where no address is given, of the first address where all are free."""
+        """Open the three ports; without a given address, on the first address where all are free."""
         for _ in range(_TRIES):
             host = self.port or f"127.{random.randint(64, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"  # noqa: S311 - no secret
             try:
@@ -329,5 +329,5 @@ class UrBus(BusThread):
         self._emit(Entry(time.monotonic(), "", "event", name, source=source, detail=detail))
 
     def _emit(self, entry: Entry) -> None:
-        """Log it as of now: the arm's own time may lag behind when this thread is held up."""
+        """Log it as of now: the arm's own time may lag when this thread is late."""
         self.log.add(msgspec.structs.replace(entry, t=time.monotonic(), bus=self.name, device_id=_ARM))

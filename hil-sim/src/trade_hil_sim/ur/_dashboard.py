@@ -1,6 +1,6 @@
 """The dashboard server: one line in, one line out, about power, safety and programs.
 
-Source: Universal Robots, "Dashboard Server e-Series"; the wording of the answers is what clients parse.
+Source: Universal Robots, "Dashboard Server e-Series"; clients parse the wording of the answers.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _WAIT: Final = "Cannot unlock protective stop until 5s after occurrence. Always 
 
 
 class Dashboard:
-    """Answers lines.
+    """Answers the lines of clients.
 
     Args:
         program: of the arm.
@@ -61,7 +61,7 @@ class Dashboard:
         }
 
     def answer(self, line: str) -> str:
-        """What a line gets."""
+        """The answer to a line."""
         word = " ".join(line.split())
         low = word.lower()
         if low in self._asked and low not in self._arm.series.lacks:
@@ -86,7 +86,7 @@ class Dashboard:
 
 
 def lines_in(held: bytearray) -> list[str]:
-    """Take the whole lines out of what has come in."""
+    """Take the complete lines from the buffer."""
     whole, found, rest = bytes(held).rpartition(b"\n")
     held[:] = rest
     return [line.decode(errors="replace").strip() for line in whole.split(b"\n")] if found else []

@@ -1,4 +1,4 @@
-"""Where the flange of an arm is, and which joint angles bring it to a pose. Pure arithmetic.
+"""Forward and inverse kinematics of an arm's flange. Pure arithmetic.
 
 A pose is x, y, z in m and a rotation vector in rad, as the controller has it.
 """
@@ -12,7 +12,7 @@ from ._table import Model
 __all__ = ["Matrix", "flange", "joints_for", "pose_between", "pose_of", "way_of"]
 
 Matrix = tuple[tuple[float, ...], ...]
-"""Three rows: a rotation, and in the fourth column a place."""
+"""A transformation in three rows: a rotation, and a position in the fourth column."""
 
 _ALPHA: Final = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 _STEP_RAD: Final = 1e-6
@@ -40,12 +40,12 @@ def flange(model: Model, q: Sequence[float]) -> Matrix:
 
 
 def pose_of(matrix: Matrix) -> tuple[float, ...]:
-    """The same as a pose."""
+    """The flange as a pose."""
     return (*(row[3] for row in matrix), *_rotation_vector(matrix))
 
 
 def pose_between(start: Sequence[float], goal: Sequence[float], part: float) -> tuple[float, ...]:
-    """A pose on the straight way from one to another, turning at an even rate."""
+    """A pose on the straight path between two, with constant rotation speed."""
     first, turn = _rotation(start[3:]), _turn(start, goal)
     matrix = _times(_rotation([part * angle for angle in turn]), first)
     place = (a + part * (b - a) for a, b in zip(start[:3], goal[:3], strict=True))
@@ -53,12 +53,12 @@ def pose_between(start: Sequence[float], goal: Sequence[float], part: float) -> 
 
 
 def way_of(start: Sequence[float], goal: Sequence[float]) -> tuple[float, float]:
-    """How far it is from one pose to another: in m and in rad."""
+    """The distance between two poses: in m and in rad."""
     return _norm([b - a for a, b in zip(start[:3], goal[:3], strict=True)]), _norm(_turn(start, goal))
 
 
 def joints_for(model: Model, pose: Sequence[float], near: Sequence[float]) -> tuple[float, ...] | None:
-    """Joint angles in rad for a pose, from those it is near to; None if it is out of reach.
+    """Joint angles in rad for a pose, near given ones; None if it is out of reach.
 
     Damped Newton: it goes to the solution next to where it starts.
     """
@@ -130,7 +130,7 @@ def _norm(vector: Sequence[float]) -> float:
 
 
 def _least_squares(columns: Sequence[Sequence[float]], error: Sequence[float]) -> list[float]:
-    """The step that best ends the error, a little shorter where there is none: (J'J + damping) step = J' error."""
+    """The step that best reduces the error, a little shorter where none can: (J'J + damping) step = J' error."""
     rows = [[_dot(one, other) for other in columns] + [_dot(one, error)] for one in columns]
     for i, row in enumerate(rows):
         row[i] += _DAMPING

@@ -1,4 +1,4 @@
-"""How an arm moves: along a way with an end, after a target that changes, at a speed, or down to rest.
+"""Motions of an arm: along a path, after a changing target, at a speed, or to rest.
 
 Steps of a fixed time; angles in rad, times in s.
 """
@@ -13,27 +13,27 @@ from trade_hil_sim.mechanics._profile import to_position
 __all__ = ["MAX_SPEED_RAD_S", "Braking", "Free", "Held", "Motion", "Servo", "Speed", "Way"]
 
 MAX_SPEED_RAD_S: Final = 3.14159
-"""No joint turns faster."""
+"""The greatest speed of a joint."""
 _SERVO_ACCEL_RAD_S2: Final = 40.0
-"""How hard a joint is accelerated after a streamed target."""
+"""The acceleration of a joint that follows a streamed target."""
 
 Six = tuple[float, ...]
 
 
 class Motion(ABC):
-    """What the joints do next; `done` once they are at rest for good."""
+    """A motion of the joints; `done` once they are at rest and stay so."""
 
     done = False
     begun = True
-    """False: it has not set anything moving yet."""
+    """False: nothing moves yet."""
 
     @abstractmethod
     def step(self, q: Six, qd: Six, dt: float) -> tuple[Six, Six]:
-        """Angles and speeds, a step of time later."""
+        """Angles and speeds one time step later."""
 
 
 class Held(Motion):
-    """The brakes, or a position that is held."""
+    """Rest, by the brakes or by holding a position."""
 
     done = True
 
@@ -43,11 +43,11 @@ class Held(Motion):
 
 
 class Free(Held):
-    """Freedrive: nobody pushes, so it stays where it is."""
+    """Freedrive without a push: the arm stays where it is."""
 
 
 class Way(Motion):
-    """Through some points in a trapezoid of speed.
+    """Moves through points with a trapezoidal speed profile.
 
     Args:
         points: joint angles, evenly spaced along the way; the first is where it begins.
@@ -64,11 +64,11 @@ class Way(Motion):
 
     @property
     def part(self) -> float:
-        """How much of the way lies behind, 0 to 1."""
+        """The fraction of the path that is done, 0 to 1."""
         return self._course.at(self._t)[0] / self._length if self._length else 1.0
 
     def step(self, q: Six, qd: Six, dt: float) -> tuple[Six, Six]:  # noqa: ARG002
-        """Where the trapezoid has got to."""
+        """The position on the trapezoid now."""
         self._t += dt
         self.done = self._t >= self._course.ends
         after = self._points[-1] if self.done else self._at(self.part)
@@ -82,7 +82,7 @@ class Way(Motion):
 
 
 class Servo(Motion):
-    """After a target that is given again and again; it is held for ever if it is not."""
+    """Follows a target that is renewed repeatedly; otherwise holds the last one without end."""
 
     def __init__(self, target: Six) -> None:
         self.target = target
@@ -97,7 +97,7 @@ class Servo(Motion):
         most, way = _SERVO_ACCEL_RAD_S2 * dt, target - angle
         if abs(way) <= most * dt and abs(speed) <= most:
             return target, 0.0
-        # what it covers in this step is not there for braking any more
+        # the distance of this step is no longer available for braking
         braking = sqrt(most * most / 4 + 2 * _SERVO_ACCEL_RAD_S2 * abs(way)) - most / 2
         wanted = copysign(min(MAX_SPEED_RAD_S, braking, abs(way) / dt), way)
         speed += _within(wanted - speed, most)
@@ -105,7 +105,7 @@ class Servo(Motion):
 
 
 class Speed(Motion):
-    """At a speed, for a time or (0) for ever."""
+    """Moves at a speed, for a time or (0) without end."""
 
     def __init__(self, speeds: Six, accel: float, lasts_s: float) -> None:
         self._ramp = Braking(accel, speeds)
@@ -120,7 +120,7 @@ class Speed(Motion):
 
 
 class Braking(Motion):
-    """To rest, or to other speeds, all joints in the same time: the one with the longest way at this acceleration."""
+    """Changes all joints to rest or other speeds in the same time; the greatest change uses this acceleration."""
 
     def __init__(self, accel: float, wanted: Six = (0.0,) * 6) -> None:
         self._accel = max(accel, 1e-3)

@@ -1,4 +1,4 @@
-"""The program a controller runs: the control script of ur-rtde, which a host speaks to by registers, or its own.
+"""The program of a controller: the control script of ur-rtde, which a host controls through registers, or its own.
 
 The numbers in the registers, and when the script reads and writes them, were observed on the wire between the library
 and a controller; the script itself is the library's.
@@ -26,9 +26,9 @@ _READY: Final = 1
 _DONE: Final = 2
 _RUNNING_BIT: Final = 1 << 15
 _EVERY_CYCLE: Final = frozenset({Command.SERVO_J, Command.SERVO_L, Command.SPEED_J, Command.STEP_TIME})
-"""Commands that are obeyed again in every cycle, and not answered."""
+"""Commands that are carried out again in every cycle, and not answered."""
 _ENDING: Final = frozenset({Command.MOVE_J, Command.MOVE_J_IK, Command.MOVE_L, Command.MOVE_L_FK})
-"""Moves with an end: asynchronous, or the script hears nothing until they have ended."""
+"""Moves with an end: asynchronous, or the script reads no commands until they have ended."""
 _MOVES: Final = frozenset(
     {
         *(Command.MOVE_J, Command.MOVE_J_IK, Command.MOVE_L, Command.MOVE_L_FK, Command.SPEED_J),
@@ -39,12 +39,12 @@ _WAVE_RAD_S: Final = 0.2
 
 
 class Program:
-    """What runs on the controller of one arm.
+    """The running program on the controller of one arm.
 
     Args:
         arm: what it moves.
-        emit: where it logs.
-        step_s: how long a cycle of the controller takes.
+        emit: called with each log entry.
+        step_s: the controller's cycle time.
     """
 
     def __init__(self, arm: Arm, emit: Callable[[Entry], None], step_s: float) -> None:
@@ -68,10 +68,10 @@ class Program:
         self._operation = self._writes = 0
         arm.stopped, arm.paused = self.stop, self.pause
 
-    # --- from outside
+    # --- from clients
 
     def upload(self, text: str) -> None:
-        """A program has come over the script port; it takes the place of the one that runs."""
+        """Run a program from the script port, in place of the present one."""
         control = "def rtde_control()" in text
         self.stop()
         self._log("upload", detail="control" if control else text[:200], moves=not control)
@@ -79,7 +79,7 @@ class Program:
             self._starts_at = self.arm.t + _START_S
 
     def play(self) -> bool:
-        """Run a program of the controller's own: it turns the last joint slowly, for ever."""
+        """Run a program of the controller's own: it turns the last joint slowly, without end."""
         if not self.arm.ready:
             return False
         self.stop()
@@ -87,7 +87,7 @@ class Program:
         return self.arm.turn((0.0,) * 5 + (_WAVE_RAD_S,), 1.0, 0.0)
 
     def stop(self) -> None:
-        """End it; what it moves brakes."""
+        """End it; the joints that it moves brake."""
         self._starts_at = None
         if self.state != STOPPED:
             self.state, self.kind = STOPPED, ""
@@ -97,9 +97,9 @@ class Program:
         self._busy, self._async, self._shown = False, None, Command.NOTHING
 
     def pause(self, on: bool) -> None:
-        """A safeguard stop holds it up: the script reads nothing and its watchdog does not count, then both go on.
+        """Pause for a safeguard stop: the script reads nothing and its watchdog does not count until it is over.
 
-        Whether the watchdog of a real one counts meanwhile is not known: here is the case that helps nobody.
+        Whether the watchdog of a real one counts meanwhile is unknown: this is the case that is worse for a driver.
         """
         if self.state == (PLAYING if on else PAUSED):
             self.state = PAUSED if on else PLAYING
@@ -107,7 +107,7 @@ class Program:
             self.arm.note("program_paused" if on else "program_resumed")
 
     def written(self, ints: Mapping[int, int], doubles: Mapping[int, float]) -> None:
-        """Registers have been set by a client."""
+        """A client has set registers."""
         self.ints.update(ints)
         self.doubles.update(doubles)
         if 0 not in ints:
@@ -121,7 +121,7 @@ class Program:
     # --- time
 
     def cycle(self) -> None:
-        """One step of the script: look at the registers, obey, answer."""
+        """Run one step of the script: read the registers, carry out the command, answer."""
         if self._starts_at is not None and self.arm.t >= self._starts_at:
             self._start()
         if self.kind != "control" or self.state != PLAYING:
@@ -156,7 +156,7 @@ class Program:
         self.arm.note("program_started")
 
     def _obey(self, number: int) -> bool:
-        """Do it; True if its answer waits for the end of a motion."""
+        """Carry the command out; True if its answer waits for the end of a motion."""
         d = [self.doubles.get(k, 0.0) for k in range(18)]
         arm = self.arm
         match number:
@@ -201,7 +201,7 @@ class Program:
                 self._work_out(number, d)
 
     def _work_out(self, number: int, d: Sequence[float]) -> None:
-        """Answer a question of geometry; a pose that the arm cannot get to, asked for its angles, ends the script."""
+        """Answer a question of geometry; asking for the angles of an unreachable pose ends the script."""
         near = d[6:12] if number in {Command.INVERSE_KINEMATICS_NEAR, Command.REACHES_NEAR} else None
         match number:
             case Command.FORWARD_KINEMATICS | Command.FORWARD_KINEMATICS_OF:
@@ -215,7 +215,7 @@ class Program:
             case Command.REACHES | Command.REACHES_NEAR:
                 self.out_ints[1] = int(self.arm.joints_for(d[:6], near) is not None)
             case _:
-                self.out_doubles.update(dict.fromkeys(range(6), 0.0))  # not simulated: answered, and nothing done
+                self.out_doubles.update(dict.fromkeys(range(6), 0.0))  # not simulated: answered without effect
 
     def _move(self, number: int, d: Sequence[float]) -> bool:
         arm, goal = self.arm, d[:6]
@@ -252,7 +252,7 @@ class Program:
     # --- the log
 
     def _log_command(self, number: int) -> None:
-        """Every set-point of a stream, but of what stays in the register only the first."""
+        """Log every set-point of a stream, but a value that stays in the register only once."""
         again = number == self._shown and number not in _EVERY_CYCLE
         self._shown = Command(number) if number in set(Command) else Command.NOTHING
         if again or number == Command.NOTHING:
@@ -263,5 +263,5 @@ class Program:
         self._log(name, detail=f"{values} until it ends" if waits else values, moves=number in _MOVES)
 
     def _log(self, name: str, *, detail: str, moves: bool) -> None:
-        t = time.monotonic()  # when it came: the arm's own time may lag behind
+        t = time.monotonic()  # the time of arrival: the arm's own time may lag
         self._emit(Entry(t, "", "instruction", name, joint=self.arm.name, detail=detail, moves=moves))

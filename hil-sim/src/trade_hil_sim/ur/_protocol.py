@@ -11,7 +11,7 @@ __all__ = ["LONGEST", "MOST_PAYLOAD", "Packet", "PacketType", "Recipe", "frames"
 
 _HEAD: Final = struct.Struct(">HB")
 LONGEST: Final = 65_535
-"""Bytes a packet can have."""
+"""The greatest length of a packet."""
 MOST_PAYLOAD: Final = LONGEST - _HEAD.size
 
 Value = float | int | bool | Sequence[float] | Sequence[int]
@@ -37,15 +37,15 @@ class Packet(NamedTuple):
     payload: bytes = b""
 
     def encode(self) -> bytes:
-        """As it goes over the wire."""
+        """The packet as bytes on the wire."""
         return _HEAD.pack(_HEAD.size + len(self.payload), self.kind) + self.payload
 
 
 def frames(held: bytearray) -> Iterator[Packet]:
-    """Take the whole packets out of what has come in; what is not whole yet stays.
+    """Take the complete packets from the buffer; an incomplete one stays.
 
     Raises:
-        ValueError: a size below that of the head: what follows is lost.
+        ValueError: a size below that of the head, so what follows is lost.
     """
     while len(held) >= _HEAD.size:
         size, kind = _HEAD.unpack_from(held)
@@ -59,12 +59,12 @@ def frames(held: bytearray) -> Iterator[Packet]:
 
 
 def names_in(payload: bytes) -> list[str]:
-    """The names of a list separated by commas; one at its end is no name."""
+    """The names in a list separated by commas; a comma at its end adds none."""
     return [name for name in payload.decode("ascii", "replace").split(",") if name]
 
 
 class Recipe:
-    """Fields that travel together.
+    """Fields that are sent together.
 
     Args:
         names: of the fields, in order.

@@ -1,4 +1,4 @@
-"""The RTDE interface: clients say which fields they want and which they set, then both sides send them."""
+"""The RTDE interface: clients select the fields that they read and set, then both sides send them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
@@ -17,10 +17,10 @@ Say = Callable[[Packet, str], None]
 
 
 class RtdeSession:
-    """What one client has set up.
+    """The set-up of one client.
 
     Args:
-        say: sends it a packet; the second argument names what it is, for faults.
+        say: sends it a packet; the second argument names the packet, for faults.
     """
 
     def __init__(self, say: Say) -> None:
@@ -28,7 +28,7 @@ class RtdeSession:
         self.outputs: Recipe | None = None
         self.recipe_id = 0
         self.every = 1
-        """Cycles from one packet of data to the next."""
+        """Cycles between two packets of data."""
         self.started = False
         self.inputs: list[Recipe] = []
 
@@ -48,7 +48,7 @@ class Rtde:
         self._sessions: list[RtdeSession] = []
         self._cycles = 0
         self.frozen: dict[str, Value] = {}
-        """Fields that stay as they are, whatever the truth."""
+        """Frozen fields."""
 
     def joined(self, say: Say) -> RtdeSession:
         """A client has connected."""
@@ -57,20 +57,20 @@ class Rtde:
         return session
 
     def left(self, session: RtdeSession) -> None:
-        """It has gone; its fields can be set by others."""
+        """A client has disconnected; others can set its fields."""
         self._sessions.remove(session)
 
     def said(self, session: RtdeSession, held: bytearray) -> None:
-        """Obey what has come from a client.
+        """Carry out the packets of a client.
 
         Raises:
-            ValueError: it speaks another language.
+            ValueError: the bytes are not RTDE.
         """
         for packet in frames(held):
             self._obey(session, packet)
 
     def cycle(self) -> None:
-        """Send data to those whose turn it is."""
+        """Send data to the clients that are due in this cycle."""
         self._cycles += 1
         due = [s for s in self._sessions if s.started and s.outputs is not None and self._cycles % s.every == 0]
         if not due:
@@ -140,7 +140,7 @@ class Rtde:
 
 
 def measured(arm: Arm, program: Program) -> dict[str, Value]:
-    """What the controller tells in a cycle."""
+    """The values of the controller in a cycle."""
     pose, still = arm.pose(), (0.0,) * 6
     values: dict[str, Value] = {name: _NOTHING[kind] for name, kind in OUTPUTS.items()}
     powered = arm.robot_mode >= RobotMode.POWER_ON

@@ -1,4 +1,4 @@
-"""What a controller's RTDE interface knows by name, and the numbers of its modes.
+"""The fields of a controller's RTDE interface, and the numbers of its modes.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": field names and types, robot and safety modes.
 """
@@ -32,7 +32,7 @@ TYPES: Final = {
     "VECTOR6INT32": "6i",
     "VECTOR6UINT32": "6I",
 }
-"""Type of a field -> how it is packed, big-endian."""
+"""Type of a field -> its format, big-endian."""
 
 _SIXES: Final = (
     *("target_q", "target_qd", "target_qdd", "target_current", "target_moment"),
@@ -56,7 +56,7 @@ OUTPUTS: Final = {
     **{f"output_int_register_{n}": "INT32" for n in range(48)},
     **{f"output_double_register_{n}": "DOUBLE" for n in range(48)},
 }
-"""Name -> type of what a client can have sent to it."""
+"""Name -> type of the fields that a client can read."""
 
 _BYTES: Final = (
     *("standard_digital_output", "standard_digital_output_mask"),
@@ -72,7 +72,7 @@ INPUTS: Final = {
     **{f"input_int_register_{n}": "INT32" for n in range(48)},
     **{f"input_double_register_{n}": "DOUBLE" for n in range(48)},
 }
-"""Name -> type of what a client can set."""
+"""Name -> type of the fields that a client can set."""
 
 
 class RobotMode(IntEnum):
@@ -111,12 +111,12 @@ class SafetyMode(IntEnum):
 
     @property
     def cuts_power(self) -> bool:
-        """Whether the arm is without power in it, and stays so when it is over."""
+        """Whether the arm has no power in it, and none afterwards."""
         return self > SafetyMode.SAFEGUARD_STOP
 
 
 class Command(IntEnum):
-    """What ``input_int_register_0`` asks of the control script of ur-rtde 1.6.5 (observed on the wire)."""
+    """Commands in ``input_int_register_0`` to the control script of ur-rtde 1.6.5 (observed on the wire)."""
 
     NOTHING = 0
     MOVE_J = 1
@@ -149,14 +149,14 @@ class Command(IntEnum):
 
 
 class Series(NamedTuple):
-    """What controllers of one series have in common."""
+    """Data common to the controllers of one series."""
 
     version: tuple[int, int, int, int]
-    """Of their software."""
+    """Version of their software."""
     rate_hz: float
     """Cycles a second."""
     lacks: frozenset[str]
-    """Fields and lines that the other series knows."""
+    """Fields and lines that only the other series supports."""
 
 
 E_SERIES: Final = Series((5, 11, 1, 108_318), 500.0, frozenset())

@@ -1,4 +1,4 @@
-"""The TCP side of a controller: its ports, and connections whose answers leave when they are due."""
+"""The TCP side of a controller: its ports, and connections that send each answer when it is due."""
 
 import socket
 import time
@@ -16,16 +16,16 @@ PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
 """The same on every controller."""
 
 MOST_UNSENT: Final = 65_536
-"""Bytes kept for a client that does not read; then it is hung up on."""
+"""Bytes kept for a client that does not read; beyond that it is disconnected."""
 SEND_BUFFER: Final = 32_768
-"""Bytes the system may keep for a client: one that lay frozen wakes to little that is old."""
+"""Bytes that the system buffers for a client: small, so that one that was frozen finds little old data."""
 MOST_READ: Final = 65_536
 MOST_HELD: Final = 1 << 20
-"""Bytes of a line, a packet or a program that is not whole yet; more has no end."""
+"""The greatest length of an incomplete line, packet or program."""
 
 
 class Client:
-    """A connection.
+    """One TCP connection of a client.
 
     Args:
         connection: accepted.
@@ -39,7 +39,7 @@ class Client:
         self.connection = connection
         self.name = name
         self.held = bytearray()
-        """What has come in and is not whole yet."""
+        """Received bytes that are not complete yet."""
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._unsent = bytearray()
 
@@ -49,16 +49,16 @@ class Client:
 
     @property
     def due(self) -> float | None:
-        """When its next answer may leave, on CLOCK_MONOTONIC; None if there is none."""
+        """When its next answer is due, on CLOCK_MONOTONIC; None if there is none."""
         return self._waiting[0][0] if self._waiting else None
 
     @property
     def unsent(self) -> bool:
-        """Whether the system did not take all of it."""
+        """Whether bytes still wait to be written."""
         return bool(self._unsent)
 
     def read(self) -> bool:
-        """Take in what has come; False when it has hung up."""
+        """Read the available bytes; False when the client has disconnected."""
         try:
             data = self.connection.recv(MOST_READ)
         except BlockingIOError:
@@ -69,14 +69,14 @@ class Client:
         return bool(data)
 
     def tell(self, pieces: Sequence[Piece]) -> None:
-        """Queue an answer. What is late holds up what comes after it: a stream keeps its order."""
+        """Queue an answer. A late one delays those behind it: a stream keeps its order."""
         now = time.monotonic()
         for data, late_s in pieces:
             before = self._waiting[-1][0] if self._waiting else now
             self._waiting.append((max(now + late_s, before), data))
 
     def flush(self) -> bool:
-        """Write what is due and can be written without waiting; False when it is gone, or does not read."""
+        """Write what is due without waiting; False when the client has disconnected or does not read."""
         now = time.monotonic()
         while self._waiting and self._waiting[0][0] <= now:
             self._unsent += self._waiting.popleft()[1]
@@ -89,12 +89,12 @@ class Client:
         return len(self._unsent) <= MOST_UNSENT
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         self.connection.close()
 
 
 def listeners(host: str) -> dict[str, socket.socket]:
-    """A socket that listens on each; raises OSError when one is taken."""
+    """A listening socket for each port; raises OSError when one is in use."""
     made: dict[str, socket.socket] = {}
     try:
         for name, number in PORTS.items():
