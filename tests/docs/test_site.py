@@ -94,15 +94,20 @@ def test_the_reference_has_every_public_name_once(package: str) -> None:
 
 
 def test_decisions_are_in_their_index_by_number_and_title() -> None:
-    """With WRITE_TABLES=1 in the environment the index is written anew."""
+    """With WRITE_TABLES=1 in the environment the index is written again."""
     index = DECISIONS / "README.md"
     text = index.read_text(encoding="utf-8")
     head = text[: text.index("|---|---|\n") + len("|---|---|\n")]
-    told = head + "".join(map(_row, sorted(DECISIONS.glob("0*.md"))))
+    expected = head + "".join(map(_row, sorted(DECISIONS.glob("0*.md"))))
     if os.environ.get("WRITE_TABLES"):
-        index.write_text(told, encoding="utf-8")
+        index.write_text(expected, encoding="utf-8")
         return
-    assert text == told
+    assert text == expected
+
+
+def test_each_decision_has_one_topic() -> None:
+    topics = (DECISIONS / "README.md").read_text(encoding="utf-8").partition("## By number")[0]
+    assert sorted(re.findall(r"\((\d{4}-[^)]+)\)", topics)) == sorted(path.name for path in DECISIONS.glob("0*.md"))
 
 
 def _row(decision: Path) -> str:
