@@ -128,7 +128,7 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
         stack.callback(bus.close)
         bus.open()
     control = stack.enter_context(ControlServer(options.control or directory / "_control", buses))
-    told = Ready(
+    announced = Ready(
         ready=True,
         ports={bus.name: str(bus.port) for bus in buses},
         log=None if options.log is None else str(options.log.absolute()),
@@ -136,7 +136,7 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
     )
     gc.collect()
     gc.freeze()  # a later garbage collection of everything loaded would delay every device by as much as a deadline
-    sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
+    sys.stdout.write(msgspec.json.encode(announced).decode() + "\n")
     sys.stdout.flush()
     stop.wait(options.parent, sys.stdin.fileno() if options.stdin else None)
 
@@ -177,10 +177,10 @@ class _Stop:
             if stdin is not None:
                 watched.append(stdin)
             while True:
-                told = ready(watched)
-                if stdin in told and os.read(stdin or 0, 4096):
-                    told.remove(stdin or 0)
-                if told:
+                ended = ready(watched)
+                if stdin in ended and os.read(stdin or 0, 4096):
+                    ended.remove(stdin or 0)
+                if ended:
                     return
 
     def close(self) -> None:

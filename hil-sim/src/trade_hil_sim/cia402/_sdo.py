@@ -74,12 +74,12 @@ class SdoServer:
     def _begin_download(self, request: bytes, t: float) -> bytes:
         self.reset()
         self._address, command = _address(request), request[0]
-        told = command & 1
+        sized = command & 1
         if command & 2:
-            length = EXPEDITED - (command >> 2 & 3) if told else EXPEDITED
+            length = EXPEDITED - (command >> 2 & 3) if sized else EXPEDITED
             self._dictionary.write(*self._address, request[4 : 4 + length], t)
         else:
-            self._size = int.from_bytes(request[4:], "little") if told else None
+            self._size = int.from_bytes(request[4:], "little") if sized else None
             if self._size is not None and self._size > LONGEST:
                 raise Abort(AbortCode.TOO_LONG)
             self._taken, self._toggle = bytearray(), 0

@@ -211,7 +211,7 @@ class Motor(JointDevice):
             case "enable":
                 self._enable(t)
             case "disable":
-                self._let_go(t, Status.DISABLED)
+                self._switch_off(t, Status.DISABLED)
             case "set_zero":
                 self._zero = self._shaft.position(t)
                 self._goal = 0.0
@@ -228,7 +228,7 @@ class Motor(JointDevice):
             if self.mode in {Mode.POSITION_VELOCITY, Mode.FORCE_POSITION}:
                 self._go(self._goal, self.ranges.velocity_rad_s, t)
 
-    def _let_go(self, t: float, status: Status) -> None:
+    def _switch_off(self, t: float, status: Status) -> None:
         if self._enabled:
             self.note("torque_off", t)
             self._shaft.forget(t)
@@ -237,7 +237,7 @@ class Motor(JointDevice):
 
     def _fail(self, status: Status, t: float) -> None:
         self.note("error", t, status.name)
-        self._let_go(t, status)
+        self._switch_off(t, status)
 
     def _target(self, name: str, mode: Mode, data: bytes, t: float) -> None:
         if self.mode != mode:
@@ -312,7 +312,7 @@ class Motor(JointDevice):
         self._registers[Register.POSITION_MAX] = float(number)
 
     def _restart(self, t: float) -> None:
-        self._let_go(t, Status.DISABLED)
+        self._switch_off(t, Status.DISABLED)
         self._power_on()
 
     def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:

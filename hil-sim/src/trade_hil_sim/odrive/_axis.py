@@ -144,7 +144,7 @@ class Axis(JointDevice):
             case Command.REBOOT:
                 self._restart(t)
             case _:
-                self._motor.told(command, values, t, armed=self._armed)
+                self._motor.command(command, values, t, armed=self._armed)
 
     def _go_to(self, state: int, t: float) -> None:
         if state == State.IDLE:

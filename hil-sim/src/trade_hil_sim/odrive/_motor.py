@@ -53,7 +53,7 @@ class Motor:
 
     # commands
 
-    def told(self, command: Command, values: tuple[float, ...], t: float, *, armed: bool) -> None:
+    def command(self, command: Command, values: tuple[float, ...], t: float, *, armed: bool) -> None:
         """Apply settings and inputs."""
         match command:
             case Command.SET_CONTROLLER_MODE:

@@ -129,19 +129,19 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
         addressed = self._addressed(writing.device_id)
         registers = self._touched([(servo, writing) for servo in addressed or self._devices])
         moves = bool(self.motion & set(registers))
-        told = addressed[0] if moves and len(addressed) == 1 else None
+        mover = addressed[0] if moves and len(addressed) == 1 else None
         entry = Entry(
             t,
             self.name,
             "instruction",
             name,
             writing.device_id,
-            joint="" if told is None else told.joint,
+            joint="" if mover is None else mover.joint,
             hex=writing.data.hex(),
             address=writing.address,
             registers=registers,
             moves=moves,
-            position_counts=None if told is None else told.counts(t),
+            position_counts=None if mover is None else mover.counts(t),
         )
         self.log.add(entry)
 
