@@ -5,12 +5,11 @@ A vendor that a rule does not apply to names it in its rig, with the reason.
 
 import signal
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from tests.contract.rigs.base import SafetyRig
+from tests.contract.rigs.base import SafetyRig, answers
 from tests.contract.rigs.joints import FIRST, SECOND, JointRig
 from tests.contract.rigs.vendors import RIGS, RULES
 from tests.support.waiting import wait_until
@@ -31,14 +30,6 @@ from trade_hil_sim import Mute, Replug, Unplug
 
 def pass_s(seconds: float) -> None:
     sleep_past(time.monotonic_ns() + round(seconds * 1e9))
-
-
-def answers(act: Callable[[], object]) -> bool:
-    try:
-        act()
-    except TradeError:
-        return False
-    return True
 
 
 def test_every_rule_that_a_vendor_lacks_is_a_rule_and_has_a_reason() -> None:
@@ -70,12 +61,13 @@ def test_S01_a_move_of_an_enabled_joint_that_expires_meanwhile_is_never_written(
     rig.ready()
     gate.hold_up()
     mark = written_now()
-    late = Outcome(rig.move, deadline_s=0.05)
-    with call(0.05) as expires_ns:
+    late = [Outcome(command, deadline_s=0.05) for command in rig.queued_when_ready()]
+    with call(0.1) as expires_ns:
         sleep_past(expires_ns)
     gate.let_go()
-    assert isinstance(late.wait().error, DeadlineExceeded)
-    assert not rig.sent_away(mark)
+    for command in late:
+        assert isinstance(command.wait().error, DeadlineExceeded)
+    assert not rig.ordered(mark)
     assert not rig.events("motion_started", mark)
 
 
@@ -295,7 +287,8 @@ def test_S18_enabling_aims_at_the_measured_position(rig: JointRig) -> None:
     wait_until(lambda: rig.device.state().position_rad == pytest.approx(there_rad, abs=2e-3), "it is measured")
     mark = written_now()
     rig.device.enable()
-    assert all(target == pytest.approx(there_rad, abs=2e-3) for target in rig.targets_rad(mark))
+    assert all(target == pytest.approx(there_rad, abs=rig.exactly_rad) for target in rig.targets_rad(mark))
+    assert not rig.sent_away(mark)
     assert rig.truth().torque
     assert rig.truth().position_rad == pytest.approx(there_rad, abs=2e-3)
     assert not rig.events("motion_started", mark)
@@ -304,11 +297,13 @@ def test_S18_enabling_aims_at_the_measured_position(rig: JointRig) -> None:
 def test_S18_replugging_never_enables_and_never_commands(rig: Any) -> None:
     rig.attach()
     rig.ready()
+    rig.move()
+    mark = written_now()
     rig.bench.sim.do(Unplug())
     wait_until(lambda: not answers(rig.device.state), "the driver noticed")
-    mark = written_now()
     rig.bench.sim.do(Replug())
     wait_until(lambda: answers(rig.device.state), "the driver is back")
+    rig.judge_return()
     assert not rig.commanded(mark)
     assert not rig.events("motion_started", mark)
     assert not rig.events("torque_on", mark)

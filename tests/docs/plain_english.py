@@ -21,7 +21,7 @@ SEARCHED = (
 AVOIDED = {
     r"told|tells|telling": "notify, report, inform, say",
     r"nobody|no one": "no client, no container, none",
-    r"somebody|someone|everybody|everyone": "a client, a user, each container, all",
+    r"somebody|everybody": "a client, a user, each container, all",
     r"whoever|whosoever": "the client, the caller, anyone who",
     r"anew": "again",
     r"stands(?! for)": "is",

@@ -12,9 +12,23 @@ from typing import Any, ClassVar
 from tests.support.waiting import wait_until
 from tests.unit import drivers
 from tests.unit.drivers.conftest import Outcome
+from trade import Container, Handle, where
+from trade.errors import TradeError
 from trade_hil_sim import Entry, received
 
 PROCESSES = Path(next(iter(drivers.__path__)))
+
+
+Request = Sequence[Any]
+"""The name of a service and its arguments."""
+
+
+def answers(act: Callable[[], object]) -> bool:
+    try:
+        act()
+    except TradeError:
+        return False
+    return True
 
 
 class DriverProcess:
@@ -51,6 +65,8 @@ class SafetyRig(ABC):
     """Parts of the error of a driver that was frozen."""
     stops_without_driver: ClassVar[bool] = True
     """Whether the device stops when its driver falls silent; if not, it ends the move that it was sent last."""
+    resource: ClassVar[str]
+    """What is locked before the device is moved."""
     robot: Any
     device: Any
 
@@ -106,6 +122,52 @@ class SafetyRig(ABC):
     def set_off(self) -> Outcome:
         """Start a slow and long move; return once the device is under way."""
 
+    def service(self, container: Container, name: str, group: str = "") -> Handle:
+        return container.find(where(name=name, group=group or self.resource), wait_s=20).with_(deadline_s=60)
+
+    def asked(self, container: Container, request: Request) -> Any:
+        """What the service of the device answers."""
+        name, *values = request
+        return self.service(container, name)(*values)
+
+    def started(self, container: Container, request: Request) -> Any:
+        name, *values = request
+        return self.service(container, name).start(*values)
+
+    @property
+    @abstractmethod
+    def far(self) -> Request:
+        """Move far."""
+
+    @property
+    @abstractmethod
+    def slowly(self) -> Request:
+        """The same, in a time in which a test can interfere."""
+
+    set_point: ClassVar[Request] = ()
+    """Move until the time given with it is over."""
+    readying: ClassVar[Request]
+    """Become able to move."""
+    harmless: ClassVar[Request] = ("state",)
+    """Use the device without disturbing its motion."""
+
+    @abstractmethod
+    def requests(self, container: Container) -> Iterable[Callable[[], object]]:
+        """Every service that needs the lock of the device."""
+
+    @abstractmethod
+    def moves_back(self, container: Container) -> bool:
+        """Whether a short move succeeds."""
+
+    drift: ClassVar[float]
+    """How much of the long move the set-point takes when nothing ends it earlier."""
+
+    def judge_return(self) -> None:  # noqa: B027 - most devices have nothing to add
+        """What else holds once the device has been away and is back."""
+
+    def judge_ended(self) -> None:  # noqa: B027 - most devices have nothing to add
+        """What the wire must show of a motion that has ended before its goal."""
+
     @abstractmethod
     def outside(self) -> Iterable[Callable[[], object]]:
         """Commands beyond the limits, or with values that are not numbers."""
@@ -113,6 +175,10 @@ class SafetyRig(ABC):
     @abstractmethod
     def commanded(self, since: float = 0.0) -> Sequence[object]:
         """Everything sent that moves the device, or switches its torque."""
+
+    def ordered(self, since: float) -> Sequence[object]:
+        """Everything sent to a device that is able to move that changes what it does."""
+        return self.commanded(since)
 
     @abstractmethod
     def sent_away(self, since: float, within_rad: float = 0.002) -> Sequence[object]:
@@ -133,6 +199,10 @@ class SafetyRig(ABC):
     def queued(self) -> Iterable[Callable[[], object]]:
         """The commands that the bus thread takes up, once the device is able to take them."""
         return self.commands()
+
+    def queued_when_ready(self) -> Iterable[Callable[[], object]]:
+        """Those of them that change something at a device that is able to move."""
+        return self.queued()
 
     def at_rest(self) -> bool:
         return not self.moving

@@ -3,21 +3,51 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import pytest
+
+from tests.contract.rigs.base import answers
 from tests.contract.rigs.joints import FIRST, SECOND, JointRig
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
+from trade.errors import DeviceFault
 from trade_hil_sim import Entry
 
+_NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
+_QUICK_STOP = 0x02
+"""Of bits 1, 2 and 7 of the controlword only the first (CiA 402-2, device control commands)."""
 
-class Cia402Rig(JointRig):
+
+class CanJointRig(JointRig):
+    """Joints that are asked for their state all the time."""
+
+    max_rad, too_slow_rad_s = 1.0, 0.0
+    says_on_return: ClassVar[str | None] = None
+
+    def judge_return(self) -> None:
+        wait_until(lambda: answers(self.robot.motor(self.second).state), "the other joint is back")
+        back = self.device.state().measured_at
+        wait_until(lambda: self.device.state().measured_at > back + 0.3, "it had time")
+        with pytest.raises(DeviceFault, match=self.says_on_return):
+            self.device.move_to(0.0)
+        assert not self.bench.events("motion_started", SECOND)
+        assert "operation_enabled" not in [entry.detail for entry in self.bench.events("state", SECOND)]
+
+    def heard(self, since: float) -> Sequence[Entry]:
+        return [entry for entry in self.bench.frames(since=since) if entry.direction == "in"]
+
+
+class Cia402Rig(CanJointRig):
     """A leg of two drives."""
 
     column = "CiA 402"
     bus, joint, group = "legs", "leg.hip", "leg"
-    max_rad, too_slow_rad_s = 1.0, 0.0
+    within_rad, exactly_rad = 0.01, 1e-5
     patience = (PATIENT,)
+    others = (("home",),)
+    says_on_return = "it was away"
+    lacks: ClassVar = {"test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT}
 
     def on_the_bench(self) -> Any:
         return Leg(self.undo)
@@ -35,7 +65,8 @@ class Cia402Rig(JointRig):
         return self.bench.goals(FIRST, since)
 
     def targets_rad(self, since: float) -> Sequence[float]:
-        return [goal / COUNTS_PER_RAD for goal in self.bench.goals(FIRST, since)]
+        frames = self.bench.frames("rpdo1", FIRST, since)
+        return [int.from_bytes(e.data[2:], "little", signed=True) / COUNTS_PER_RAD for e in frames]
 
     def counts(self, position_rad: float) -> int:
         return round(position_rad * COUNTS_PER_RAD)
@@ -57,10 +88,22 @@ class Cia402Rig(JointRig):
     def falls_silent(self) -> float:
         wait_until(lambda: self.bench.controlwords(FIRST)[-1] & HALT, "it was halted")
         wait_until(lambda: "quick_stop_active" in self.states(0.0), "the drive's own watchdog has its say")
-        return written_now()
+        expired = self.bench.wait_for("watchdog_expired", FIRST)
+        wait_until(lambda: len(self.bench.frames("heartbeat", FIRST, expired.t)) > 3, "the drive goes on")
+        return self._halted()
 
-    def heard(self, since: float) -> Sequence[Entry]:
-        return [entry for entry in self.bench.frames(since=since) if entry.direction == "in"]
+    def _halted(self) -> float:
+        """When it was at rest, which a halt, or a quick stop in modes without one, has brought it to."""
+        began = self.bench.wait_for("motion_started", FIRST).t
+        rest = self.bench.wait_for("at_rest", FIRST, began)
+        sent = [e for e in self.bench.frames("rpdo1", FIRST, began) if e.t <= rest.t]
+        words = [int.from_bytes(e.data[:2], "little") for e in sent]
+        assert any(word & HALT or word & 0x86 == _QUICK_STOP for word in words)
+        return float(rest.t)
+
+    def judge_ended(self) -> None:
+        self._halted()
+        assert self.truth().position_rad < 0.8
 
     def _heartbeats(self) -> list[Entry]:
         return [entry for entry in self.bench.frames("heartbeat") if entry.can_id == 0x77F]
@@ -86,7 +129,7 @@ class Cia402Rig(JointRig):
         assert self.bench.controlwords(FIRST, asked)[-1] & HALT
 
 
-class OdriveRig(JointRig):
+class OdriveRig(CanJointRig):
     """A tail of two ODrives."""
 
     kind: ClassVar[str] = "odrive"
@@ -96,9 +139,9 @@ class OdriveRig(JointRig):
         "test_motor.py: an ODrive that does not is not enabled, and a Damiao is watched from attaching on",
         "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it can only relax: "
         "without its driver it lets go",
+        "test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT,
     }
     bus, joint, group = "tail", "tail.root", "tail"
-    max_rad, too_slow_rad_s = 1.0, 0.0
     patience = (("watchdog_s = 0.4", "watchdog_s = 0.5"),)
     bench: MotorRig
 
@@ -127,9 +170,6 @@ class OdriveRig(JointRig):
         self.bench.wait_for("watchdog_expired", FIRST)
         return written_now()
 
-    def heard(self, since: float) -> Sequence[Entry]:
-        return [entry for entry in self.bench.frames(since=since) if entry.direction == "in"]
-
     def leaves(self, leave: str) -> None:
         assert leave == "relax", "as its robot file says"
 
@@ -138,3 +178,8 @@ class DamiaoRig(OdriveRig):
     """A tail of two Damiao motors."""
 
     kind = "damiao"
+
+    def ordered(self, since: float) -> Sequence[object]:
+        """Every cycle sends an enabled motor to where it is."""
+        orders = [entry for entry in self.bench.commanded(FIRST, since) if entry.name != self.bench.target]
+        return [*orders, *self.sent_away(since)]

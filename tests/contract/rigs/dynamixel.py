@@ -71,6 +71,13 @@ class DynamixelRig(SerialJointRig):
         last_heard = max(entry.t for entry in instructions(self.bench.log) if entry.t <= expired.t)
         assert expired.t - last_heard == pytest.approx(_WATCHDOG_S, abs=0.05)
 
+    def judge_ended(self) -> None:
+        """A goal short of the one of the move was written before it rested."""
+        began = self.bench.wait_for("motion_started", FIRST).t
+        rest = self.bench.wait_for("at_rest", FIRST, began)
+        held = [e for e in self.bench.goals(FIRST, began) if self.goal_of(e) < self.counts(1.25)]
+        assert held[0].t <= rest.t
+
     def disarmed(self) -> bool:
         return bool(self.truth().watchdog == 0)
 

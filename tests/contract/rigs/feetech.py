@@ -21,12 +21,17 @@ class FeetechRig(SerialJointRig):
     robot_file_driver = "feetech"
     counts_per_rad = COUNTS_PER_RAD
     text = TAIL
+    patience = (('driver = "feetech"', 'driver = "feetech"\nstale_after_s = 1'),)  # a busy machine is no silence
 
     def on_the_bench(self) -> Any:
         return TailRig(self.folder, self.undo)
 
     def goal_of(self, entry: Entry) -> int:
         return goal_of(entry)
+
+    def judge_ended(self) -> None:
+        self.bench.wait_for("at_rest", FIRST)
+        assert all(goal_of(entry) < self.counts(1.2) for entry in self.bench.goals(FIRST))
 
     def stopped_by_itself(self, since: float) -> float:
         return float(self.bench.wait_for("at_rest", FIRST, since).t)

@@ -3,11 +3,13 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
-from tests.contract.rigs.base import DriverProcess, SafetyRig
+from tests.contract.rigs.base import DriverProcess, Request, SafetyRig
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome
+from trade import Container
 from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Place
@@ -27,6 +29,44 @@ class JointRig(SafetyRig):
     group: ClassVar[str]
     max_rad: ClassVar[float]
     too_slow_rad_s: ClassVar[float]
+    within_rad: ClassVar[float] = 0.03
+    """How near to its goal a move ends."""
+    exactly_rad: ClassVar[float] = 2e-3
+    """How near to the measured position the targets of an enabled joint are."""
+    set_point = ("set_velocity", 0.3, 1.0)
+    readying = harmless = ("enable",)
+
+    @property
+    def resource(self) -> str:  # type: ignore[override]
+        return f"rosie.{self.joint}"
+
+    @property
+    def second(self) -> str:
+        """The other joint of the group."""
+        return str(self.bench.robot.joints[1].name)
+
+    @property
+    def far(self) -> Request:
+        return ("move_to", 0.93 * self.max_rad)
+
+    @property
+    def slowly(self) -> Request:
+        return (*self.far, 0.1)
+
+    @property
+    def drift(self) -> float:  # type: ignore[override]
+        return 0.3 / self.far[1]
+
+    others: ClassVar[Sequence[Request]] = ()
+    """Services that other vendors do not have."""
+
+    def requests(self, container: Container) -> Iterable[Callable[[], object]]:
+        for request in (("move_to", 0.3), ("set_velocity", 0.3), ("enable",), ("relax",), *self.others):
+            yield partial(self.asked, container, request)
+        yield lambda: self.service(container, "servo", f"rosie.{self.group}")([0.3, 0.3])
+
+    def moves_back(self, container: Container) -> bool:
+        return abs(self.asked(container, ("move_to", 0.1)) - 0.1) < self.within_rad
 
     @property
     def text(self) -> str:
@@ -41,7 +81,10 @@ class JointRig(SafetyRig):
         self.device.enable()
 
     def commands(self) -> Iterable[Callable[[], object]]:
-        return (self.move, self.device.enable, self.device.relax)
+        return (*self.queued_when_ready(), self.device.enable)
+
+    def queued_when_ready(self) -> Iterable[Callable[[], object]]:
+        return (self.move, lambda: self.device.set_velocity(0.5, 0.05), self.device.relax)
 
     def move(self) -> object:
         return self.device.move_to(0.5)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import pytest
@@ -11,11 +12,13 @@ from tests.support.simulated_robots import HAND
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.gripper_rig import HandRig, silent
+from trade import Container
 from trade_hil_sim import Entry, events
 
 _SLOW_M_S = 0.02
 _OPEN_M = 0.085
 _ONE_DEVICE = "there is one gripper on its line"
+_NO_SET_POINT = "a gripper follows no set-points"
 _NO_JOINT = "a gripper has no joint"
 
 
@@ -23,6 +26,8 @@ class RobotiqRig(SafetyRig):
     """A hand; its fingers begin open."""
 
     column = "2F-85"
+    resource = "rosie.left.hand"
+    far, slowly, readying = ("close",), ("close", _SLOW_M_S), ("activate",)
     stops_without_driver = False
     lacks: ClassVar = {
         "test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why": "the move has ended by then: the device "
@@ -30,8 +35,12 @@ class RobotiqRig(SafetyRig):
         "test_S06_every_enabled_joint_has_its_watchdog_armed": "the device has no watchdog",
         "test_S07_a_stop_gets_through_while_another_joint_is_silent": _ONE_DEVICE,
         "test_S08_a_stop_halts_every_joint_of_a_group_that_moves": _ONE_DEVICE,
-        "test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire": "unit/drivers/test_robotiq_safety.py "
-        "breaks the lock while the command waits",
+        "test_S11_a_set_point_ends_with_the_lock_it_was_admitted_under": _NO_SET_POINT,
+        "test_S13_a_lock_is_granted_once_what_was_left_moving_rests": _NO_SET_POINT,
+        "test_S16_a_group_with_a_missing_member_is_not_locked": _ONE_DEVICE,
+        "test_S16_coupled_joints_are_locked_together": _ONE_DEVICE,
+        "test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire": "it is judged in test_fences.py: "
+        "a lock is broken while the command waits",
         "test_S18_enabling_aims_at_the_measured_position": _NO_JOINT,
         "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it keeps what it holds: "
         "unit/drivers/test_robotiq_attached.py",
@@ -73,6 +82,16 @@ class RobotiqRig(SafetyRig):
         moving = Outcome(lambda: self.device.close(_SLOW_M_S))
         self.bench.under_way()
         return moving
+
+    def requests(self, container: Container) -> Iterable[Callable[[], object]]:
+        for request in (("close",), ("open",), ("move_to", 0.05), ("activate",), ("clear_fault",)):
+            yield partial(self.asked, container, request)
+
+    def moves_back(self, container: Container) -> bool:
+        return abs(self.asked(container, ("open",)).width_m - _OPEN_M) < 0.001
+
+    def judge_ended(self) -> None:
+        assert self.bench.truth.width_m > 0.03
 
     def under_way(self) -> None:
         self.bench.under_way()

@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import psutil
 
 from tests.contract.rigs.base import DriverProcess, SafetyRig
 from tests.support.waiting import wait_until
-from tests.unit.drivers.arm_rig import FAR, ArmRig
+from tests.unit.drivers.arm_rig import FAR, SLOW, ArmRig, answers
 from tests.unit.drivers.attached_arm import ARM, AT_HOME
-from tests.unit.drivers.conftest import Outcome
-from trade_hil_sim import Entry, events
+from tests.unit.drivers.conftest import Outcome, written_now
+from trade import Container
+from trade_hil_sim import Entry, events, instructions
 
 _ONE_DEVICE = "an arm has a controller of its own"
 _LIMITS = "unit/drivers/test_ur_way.py has the limits of arms"
@@ -21,6 +23,10 @@ class UrRig(SafetyRig):
     """A UR5e; its base is turned."""
 
     column = "UR"
+    resource = "ada.right"
+    far, slowly, set_point = ("move_joints", FAR), ("move_joints", FAR, SLOW), ("servo", FAR, 1.0)
+    drift = 0.83
+    readying = ("freedrive", True)
     lacks: ClassVar = {
         "test_S01_a_plain_call_waits_one_second_for_its_turn_at_most": "the controller's states that nobody reads "
         "for a second end the connection, and the call with it",
@@ -30,13 +36,16 @@ class UrRig(SafetyRig):
         "commands, when it takes control; unit/drivers/test_ur_safety.py kills it",
         "test_S07_a_stop_gets_through_while_another_joint_is_silent": _ONE_DEVICE,
         "test_S08_a_stop_halts_every_joint_of_a_group_that_moves": _ONE_DEVICE,
-        "test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire": "unit/drivers/test_ur_safety.py has a "
-        "lock that ends",
+        "test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire": "test_fences.py has a lock that is lost",
+        "test_S16_a_group_with_a_missing_member_is_not_locked": _ONE_DEVICE,
+        "test_S16_coupled_joints_are_locked_together": _ONE_DEVICE,
         "test_S18_enabling_aims_at_the_measured_position": "power and brakes are switched by request only",
         "test_S18_replugging_never_enables_and_never_commands": "unit/drivers/test_ur_attach.py: a controller "
         "that comes back is read and not commanded",
         "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "an arm always holds",
         "test_S19_leaving_with_relax_switches_torque_off": "an arm always holds",
+        "test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": "unit/drivers/test_ur_attach.py "
+        "has two drivers of an arm",
         "test_S22_a_goal_outside_is_refused_with_its_limits": _LIMITS,
         "test_S22_the_ends_of_the_range_belong_to_it": _LIMITS,
         "test_S22_a_move_back_inside_is_allowed_from_outside": _LIMITS,
@@ -66,6 +75,21 @@ class UrRig(SafetyRig):
     def set_off(self) -> Outcome:
         moving: Outcome = self.bench.set_off()
         return moving
+
+    def requests(self, container: Container) -> Iterable[Callable[[], object]]:
+        for request in (self.far, self.set_point, self.readying):
+            yield partial(self.asked, container, request)
+
+    def moves_back(self, container: Container) -> bool:
+        return abs(self.asked(container, ("move_joints", AT_HOME))[0]) < 0.01
+
+    def judge_ended(self) -> None:
+        rested = written_now()
+        self.bench.stands()
+        ended = [*instructions(self.bench.log, "stop_j"), *instructions(self.bench.log, "servo_stop")]
+        assert ended
+        wait_until(lambda: answers(self.device, rested + 0.5), "time has passed")
+        assert not self.bench.moves(max(rested, ended[-1].t))
 
     def under_way(self) -> None:
         wait_until(lambda: self.bench.base_rad > 0.05, "it is under way")

@@ -20,9 +20,11 @@ RIGS: dict[str, type[SafetyRig]] = {
     "ur": UrRig,
 }
 
-RULES: list[str] = re.findall(
-    r"^def (test_S\w+)", Path(__file__).parents[1].joinpath("test_safety.py").read_text(encoding="utf-8"), re.MULTILINE
-)
+RULES: list[str] = [
+    rule
+    for module in sorted(Path(__file__).parents[1].glob("test_*.py"))
+    for rule in re.findall(r"^def (test_S\w+)", module.read_text(encoding="utf-8"), re.MULTILINE)
+]
 
 
 def rules_of(made: type[SafetyRig]) -> set[str]:

@@ -5,12 +5,15 @@ They have no watchdog: what S06 asks of the device is missing, and these tests s
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import trade_hil_sim
-from tests.unit.drivers.conftest import written_now
+from tests.support.waiting import wait_until
+from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, tail_rig
+from trade.errors import LockedByOther
 
 SLOWLY_RAD_S = 0.3
 
@@ -63,6 +66,26 @@ def test_S08_a_stop_of_a_relaxed_joint_sends_it_no_goal(tail: TailRig) -> None:
     robot.motor("tail.root").stop()
     robot.group("tail").stop()
     assert not tail.moves()
+
+
+# --- S11 locks
+
+
+def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: TailRig) -> None:
+    root = tail.root()
+    root.enable()
+    moving = Outcome(lambda: root.move_to(1.3, 0.2))
+    wait_until(lambda: tail.truth().position_rad > 0.1 or moving.error, "it is under way")
+
+    def gone() -> None:
+        raise LockedByOther(resources=["rosie.tail.root"], owner="another")
+
+    [axis] = root._axes  # type: ignore[attr-defined]
+    axis.motion.permit = SimpleNamespace(gate=gone)
+    assert isinstance(moving.wait().error, LockedByOther)
+    mark = written_now()
+    tail.wait_for("at_rest", 1)
+    assert all(goal_of(entry) <= tail.truth().position_counts + 1 for entry in tail.goals(1, mark))
 
 
 # --- S18 attach moves and resets nothing

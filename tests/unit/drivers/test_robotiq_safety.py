@@ -11,15 +11,11 @@ from tests.unit.drivers.gate import Gate
 from tests.unit.drivers.gripper_rig import HandRig, made_rig, silent
 from trade import Container, Handle, where
 from trade.errors import (
-    ConfigurationError,
     DeadlineExceeded,
     DeviceError,
     DeviceSilent,
-    LockedByOther,
-    LockLost,
     MotionStopped,
     OutcomeUnknown,
-    Stopped,
 )
 from trade_drivers import Gripper
 from trade_hil_sim import Heal, Mute, Put, instructions, received
@@ -186,43 +182,6 @@ def service(container: Container, name: str) -> Handle:
     return container.find(where(name=name, group="rosie.left.hand"), wait_s=20).with_(deadline_s=60)
 
 
-def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire(
-    hand: HandRig, gate: Gate, gripper: Gripper, planner: Container, operator: Container
-) -> None:
-    close = service(planner, "close")
-    lock = planner.lock(HAND_SERVICES).acquire()
-    with lock.use():
-        gate.hold_up()
-        mark = written_now()
-        run = close.start()
-        wait_until(lambda: gripper._exchange._inbox, "it is admitted")  # type: ignore[attr-defined]
-        assert operator.locking.break_lock(HAND_SERVICES, "it is mine")
-        gate.let_go()
-        with pytest.raises((LockLost, MotionStopped)):
-            run.result()
-    lock.release()
-    assert not hand.moves(mark)
-
-
-def test_S11_who_has_no_lock_writes_nothing(
-    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
-) -> None:
-    with planner.lock(HAND_SERVICES):
-        mark = written_now()
-        for act in (
-            service(operator, "close"),
-            service(operator, "open"),
-            lambda: service(operator, "move_to")(0.05),
-            service(operator, "activate"),
-            service(operator, "clear_fault"),
-            gripper.close,  # a plain call of the method, without the middleware (S15)
-        ):
-            with pytest.raises(LockedByOther):
-                act()
-        assert service(operator, "state")().name == "rosie.left.hand"
-    assert not hand.writes(mark)
-
-
 def test_S09_what_an_estop_ended_tells_of_the_estop_and_after_it_a_plain_stop_does_not(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:
@@ -251,31 +210,9 @@ def test_S14_what_is_withdrawn_while_it_moves_says_so(
         run.result()
 
 
-def test_S08_a_foreign_stop_holds_until_somebody_resumes(
-    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+def test_S05_what_is_held_when_its_session_ends_stays_held(
+    hand: HandRig, gripper: Gripper, operator: Container
 ) -> None:
-    run = service(planner, "close").start(SLOW_M_S)
-    hand.under_way()
-    service(operator, "stop")()
-    with pytest.raises(MotionStopped):
-        run.result()
-    mark = written_now()
-    for act in (service(planner, "close"), service(operator, "activate"), gripper.open):
-        with pytest.raises(Stopped):
-            act()
-    assert not hand.moves(mark)
-    assert operator.locking.resume(HAND_SERVICES) == ["rosie.left.hand"]
-    assert service(planner, "open")().width_m == pytest.approx(0.085, abs=0.001)
-
-
-def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
-    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
-) -> None:
-    service(planner, "close").start(SLOW_M_S)
-    hand.under_way()
-    planner.close()
-    wait_until(lambda: not hand.truth.moving, "it stands")
-    assert hand.truth.width_m > 0.03
     hand.sim.do(Put(width_m=0.02))
     service(operator, "close")()
     mark = written_now()
@@ -287,18 +224,3 @@ def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
 
 
 # --- S20
-
-
-def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(hand: HandRig, gate: Gate) -> None:
-    gripper = hand.active(healthy=gate)
-    gate.hold_up()
-    mark = written_now()
-    with pytest.raises(ConfigurationError, match="another driver owns this port"):
-        hand.attach()
-    assert not received(hand.log, since=mark)
-    gate.let_go()
-    moving = Outcome(lambda: gripper.move_to(0.02, SLOW_M_S))
-    hand.under_way()
-    with pytest.raises(ConfigurationError, match="another driver owns this port"):
-        hand.attach()
-    assert moving.wait().result.width_m == pytest.approx(0.02, abs=0.001)

@@ -7,13 +7,11 @@ import pytest
 import trade_hil_sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, is_silent, written_now
-from tests.unit.drivers.gate import Gate
 from trade.errors import (
-    ConfigurationError,
     DeviceFault,
     MotionStopped,
 )
-from trade_hil_sim import DynamixelBus, received
+from trade_hil_sim import DynamixelBus
 
 # --- S18 attach moves and resets nothing
 
@@ -120,23 +118,6 @@ def test_S19_a_joint_that_cannot_be_heard_keeps_its_watchdog(head: Rig) -> None:
 
 
 # --- S20 never twice
-
-
-def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(head: Rig, gate: Gate) -> None:
-    first = head.attach(healthy=gate).motor("neck.pan")
-    first.enable()
-    gate.hold_up()
-    mark = written_now()
-    with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
-        head.attach()
-    assert str(head.sim.port) in str(refused.value)
-    assert not received(head.log, since=mark)
-    gate.let_go()
-    moving = Outcome(lambda: first.move_to(0.5, 0.5))
-    head.wait_for("motion_started", 1, mark)
-    with pytest.raises(ConfigurationError, match="another driver owns this port"):
-        head.attach()
-    assert moving.wait().result == pytest.approx(0.5, abs=0.01)
 
 
 def test_S20_the_port_is_free_again_after_close(head: Rig) -> None:

@@ -22,9 +22,7 @@ from trade.errors import (
     DeadlineExceeded,
     DeviceFault,
     DeviceSilent,
-    LockedByOther,
     MotionStopped,
-    Stopped,
     TradeError,
 )
 from trade_drivers import Arm, Tolerances, Trajectory, TrajectoryPoint
@@ -260,55 +258,11 @@ def other(start_container: Callable[..., Container]) -> Container:
     return start_container("other")
 
 
-def test_S08_a_foreign_stop_holds_until_somebody_resumes(shared: ArmRig, planner: Container, other: Container) -> None:
-    move = planner.find(where(name="move_joints", group="ada.right"))
-    run = move.with_(deadline_s=30).start(FAR, SLOW)
-    wait_until(lambda: shared.base_rad > 0.05, "it is under way")
-    other.find(where(name="stop", group="ada.right"))()
-    with pytest.raises(MotionStopped):
-        run.result()
-    mark = written_now()
-    with pytest.raises(Stopped):
-        move(AT_HOME)
-    assert not shared.moves(mark)
-    other.resume(where(group="ada.right"))
-    assert move.with_(deadline_s=30)(AT_HOME)[0] == pytest.approx(0.0, abs=0.01)
-
-
-def test_S11_who_has_no_lock_moves_nothing_while_somebody_has(
-    shared: ArmRig, planner: Container, other: Container
-) -> None:
-    stranger = other.find(where(name="move_joints", group="ada.right"))
-    with planner.lock(where(group="ada.right")):
-        for act in (lambda: stranger(FAR), lambda: shared.arm.move_joints(FAR), lambda: shared.arm.freedrive(True)):
-            with pytest.raises(LockedByOther):
-                act()
-        assert not shared.moves()
-        move = planner.find(where(name="move_joints", group="ada.right"))
-        move.with_(deadline_s=30)([0.1, *AT_HOME[1:]])
-    assert len(instructions(shared.log, "move_j")) == 1
-
-
-def test_S11_a_set_point_ends_with_the_lock_it_was_admitted_under(shared: ArmRig, planner: Container) -> None:
-    servo = planner.find(where(name="servo", group="ada.right"))
-    with planner.lock(where(group="ada.right")):
-        servo.with_(deadline_s=20)(FAR, 1.0)
-        wait_until(lambda: shared.base_rad > 0.02, "it is under way")
-    unlocked = written_now()
-    wait_until(lambda: not shared.moving, "it stands")
-    stopped = instructions(shared.log, "servo_stop")[-1]
-    assert not shared.moves(max(unlocked, stopped.t))
-    assert shared.base_rad < FAR[0] - 0.5
-
-
-@pytest.mark.parametrize("service", ["move_joints", "servo"])
-def test_S05_a_motion_ends_with_its_session(
-    shared: ArmRig, planner: Container, start_container: Callable[..., Container], service: str
+def test_S05_set_points_end_with_their_session(
+    shared: ArmRig, planner: Container, start_container: Callable[..., Container]
 ) -> None:
     guide = start_container("guide")
-    handle = guide.find(where(name=service, group="ada.right")).with_(deadline_s=60)
-    lasting = {"move_joints": SLOW, "servo": 1.0}[service]
-    handle.start(FAR, lasting)
+    guide.find(where(name="servo", group="ada.right")).with_(deadline_s=60).start(FAR, 1.0)
     wait_until(lambda: shared.base_rad > 0.03, "it is under way")
     guide.close()
     closed = written_now()
