@@ -92,7 +92,7 @@ class JointRig(SafetyRig):
     def set_off(self, speed_rad_s: float = _SLOWLY_RAD_S) -> Outcome:
         moving = Outcome(lambda: self.device.move_to(0.93 * self.max_rad, speed_rad_s))
         wait_until(lambda: moving.error or self.travelled() > _UNDER_WAY, "it is under way")
-        assert moving.error is None
+        assert moving.error is None, moving.error
         return moving
 
     def under_way(self) -> None:

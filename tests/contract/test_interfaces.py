@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.simulated_robots import HAND, HEAD
+from tests.support.simulated_robots import HAND, HEAD, TAIL
+from tests.unit.drivers import test_across
 from tests.unit.drivers.legs import LEG
-from tests.unit.drivers.test_across import LEGS
+from tests.unit.drivers.motor_rig import DAMIAO, ODRIVE
 from trade import where
 from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
 from trade_drivers.robotfile import Bus
@@ -24,62 +25,57 @@ from trade_hil_sim.robot._robot import buses_of
 FILES = {
     "head": HEAD,
     "fast": HEAD.replace('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'),
-    "legs": LEGS,
+    "legs": test_across.LEGS,
     "body": HEAD
     + "".join(text[text.index("[bus.") :] for text in (LEG, HAND))
     + '\n[group.body]\njoints = ["neck.tilt", "leg.hip", "neck.pan", "leg.knee"]\n',
+    "feetech": TAIL,
+    **{name: text.replace("stale_after_s = 0.4\n", "") for name, text in (("odrive", ODRIVE), ("damiao", DAMIAO))},
 }
 """Robot files by name."""
-MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")]
+TAILS = ("feetech", "odrive", "damiao")
+MOTORS = [
+    *(("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")),
+    *((tail, joint) for tail in TAILS for joint in ("tail.root", "tail.tip")),
+]
 ELSEWHERE = {
-    "damiao": "test_motor_contracts.py",
-    "feetech": "test_feetech_contracts.py",
-    "odrive": "test_motor_contracts.py",
     "robotiq": "test_robotiq_gripper.py",
     "snapshot": "test_senses.py",
     "ur": "test_ur_contract.py",
 }
 """Drivers whose contracts are run in modules of their own."""
-GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body")]
+GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body"), *((tail, "tail") for tail in TAILS)]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, AttachedRobot]]:
-    """The robots of the files, on simulated buses in this process: a starved one of its own looks like silence."""
+@pytest.fixture(scope="module")
+def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttachedRobot]:
+    """The robot of a file, on simulated buses in this process: a starved one of its own looks like silence."""
+    name = request.param
+    # a computer that stands still for a moment is no silence
+    file = parse(re.sub("(?m)^driver = .*", r"\g<0>\nstale_after_s = 1", FILES[name]), f"{name}.toml")
     with ExitStack() as undo:
-        made: dict[str, AttachedRobot] = {}
-        for name, text in FILES.items():
-            # a computer that stands still for a moment is no silence
-            robot = parse(re.sub("(?m)^driver = .*", r"\g<0>\nstale_after_s = 1", text), f"{name}.toml")
-            buses = buses_of(robot, tmp_path_factory.mktemp(name), log=ByteLog(keep=False), paced=False)
-            for bus in buses:
-                undo.callback(bus.close)
-                bus.open()
-            ports = {bus.name: str(bus.port) for bus in buses}
-            made[name] = undo.enter_context(
-                attach(robot, register=lambda *_: None, deregister=lambda _: None, ports=ports)
-            )
-        yield made
+        buses = buses_of(file, tmp_path_factory.mktemp(name), log=ByteLog(keep=False), paced=False)
+        for bus in buses:
+            undo.callback(bus.close)
+            bus.open()
+        ports = {bus.name: str(bus.port) for bus in buses}
+        yield undo.enter_context(attach(file, register=lambda *_: None, deregister=lambda _: None, ports=ports))
 
 
-def _ids(cases: list[tuple[str, str]]) -> list[str]:
-    return [" ".join(case) for case in cases]
-
-
+@pytest.mark.parametrize(("robot", "joint"), MOTORS, indirect=["robot"], scope="module")
 class TestMotor(MotorContract):
-    @pytest.fixture(params=MOTORS, ids=_ids(MOTORS))
-    def motor(self, request: pytest.FixtureRequest, robots: dict[str, AttachedRobot]) -> Iterator[Motor]:
-        file, joint = request.param
-        motor = robots[file].motor(joint)
+    @pytest.fixture
+    def motor(self, robot: AttachedRobot, joint: str) -> Iterator[Motor]:
+        motor = robot.motor(joint)
         yield motor
         motor.relax()
 
 
+@pytest.mark.parametrize(("robot", "name"), GROUPS, indirect=["robot"], scope="module")
 class TestJointGroup(JointGroupContract):
-    @pytest.fixture(params=GROUPS, ids=_ids(GROUPS))
-    def group(self, request: pytest.FixtureRequest, robots: dict[str, AttachedRobot]) -> Iterator[JointGroup]:
-        file, name = request.param
-        group = robots[file].group(name)
+    @pytest.fixture
+    def group(self, robot: AttachedRobot, name: str) -> Iterator[JointGroup]:
+        group = robot.group(name)
         yield group
         group.relax()
 
@@ -89,18 +85,18 @@ def test_every_simulator_has_its_contracts() -> None:
     drivers = {bus.driver for file, joint in MOTORS for bus in files[file].buses if _is_on(files[file], bus, joint)}
     assert drivers | ELSEWHERE.keys() == {simulator.name for simulator in entry_points(group="trade.sims")}
     for module in ELSEWHERE.values():
-        assert "Contract):" in Path(__file__).with_name(module).read_text(), module
+        assert "Contract):" in Path(test_across.__file__).with_name(module).read_text(), module
 
 
 def _is_on(robot: Robot, bus: Bus, joint: str) -> bool:
     return any(record.name == joint for record in robot.joints_on(bus.name))
 
 
-def test_servos_drives_and_grippers_are_one_robot(robots: dict[str, AttachedRobot]) -> None:
-    body = robots["body"]
-    assert body.group("body").joints() == ["rosie.neck.tilt", "rosie.leg.hip", "rosie.neck.pan", "rosie.leg.knee"]
-    assert [state.enabled for state in body.group("body").state()] == 4 * [False]
-    assert body.gripper("left.hand").state().fault == ""
+@pytest.mark.parametrize("robot", ["body"], indirect=True, scope="module")
+def test_servos_drives_and_grippers_are_one_robot(robot: AttachedRobot) -> None:
+    assert robot.group("body").joints() == ["rosie.neck.tilt", "rosie.leg.hip", "rosie.neck.pan", "rosie.leg.knee"]
+    assert [state.enabled for state in robot.group("body").state()] == 4 * [False]
+    assert robot.gripper("left.hand").state().fault == ""
 
 
 # --- on hardware
