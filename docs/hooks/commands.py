@@ -59,6 +59,6 @@ def _options(command: Any) -> Iterator[str]:
 
 
 def _plain(text: str | None) -> str:
-    """Help as Markdown: brackets that its own markup escaped, and lines that the terminal wraps anew."""
+    """Help as Markdown: brackets that its own markup escaped, and lines that the terminal wraps."""
     text = re.sub(r"\\(?=\[)", "", text or "").replace("\b", "")
     return re.sub(r"(?<!\n)\n(?!\n)", " ", text).strip().replace("|", "\\|").replace("<", "&lt;")

@@ -18,7 +18,7 @@ from mkdocs.structure.pages import Page
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = ROOT / "docs"
 FIRST: Final = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
-"""Pages outside of docs/ that are on the site whoever links to them."""
+"""Pages outside of docs/ that are also on the site."""
 _LINK: Final = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(?=\))")
 _CODE: Final = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 

@@ -37,7 +37,7 @@ STEPS: Final = (
     Step("What does she offer at her head, and what does the house?", "trade services --group rosie.head"),
     Step("", "trade services --group home"),
     Step("What has been asked to happen by itself?", "trade notifications", numbers=False),
-    Step("Who is told of calls, and of which?", "trade hooks"),
+    Step("Which hooks are attached to which services?", "trade hooks"),
     Step("From now on calls are noted.", "trade tracing on"),
     Step("She looks to the left, and down.", "trade call rosie.head.move_to '[0.3, -0.2]'"),
     Step("Which calls were there, and what happened in this one?", "trade trace"),
@@ -47,7 +47,7 @@ STEPS: Final = (
     Step("They stand:", "trade rules list"),
     Step("Who may do what, by a policy?", "trade policy check planner call rosie.head --policy examples/policy.toml"),
     Step("", "trade policy check ann call rosie.head --policy examples/policy.toml"),
-    Step("The lamp of the hall goes on in the attic, as bright as it was.", "trade migrate home.hall --to attic"),
+    Step("The lamp of the hall moves to the attic, with its brightness.", "trade migrate home.hall --to attic"),
     Step("", "trade call home.hall.level"),
     Step("The end; what was started last is ended first.", "trade system down examples/system.toml"),
 )
