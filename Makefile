@@ -77,11 +77,13 @@ soak-registry: $(UV) ## three containers on two hosts register at the same momen
 soak-relocation: $(UV) ## a host is lost 100 times, with random trouble between; never two (SEED=..; root, iproute2; 45 min)
 	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:tests.support.rerun $(ARGS)
 
-check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
+check: $(UV) ## lint, formatting, types, import rules, spelling, plain English, isolated install of the core
 	@$(RUN) ruff check
 	@$(RUN) ruff format --check
 	@$(RUN) basedpyright
 	@$(RUN) lint-imports
+	@$(RUN) codespell
+	@$(RUN) python -m tests.docs.plain_english
 	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
 	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers", "opentelemetry"} & set(sys.modules); \
 	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
