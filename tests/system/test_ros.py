@@ -372,7 +372,7 @@ def test_P08_c_python_ros_1_and_ros_2_are_side_by_side_in_one_system(run: Run, t
             undo.callback(ros.close)
             ros.start_core()
             (tmp_path / f"{name}.toml").write_text(text.format(ros=ros.settings))
-        assert "rosie.hand is there" in run(c_gripper).line()
+        assert "rosie.hand is registered" in run(c_gripper).line()
         for name in ("one", "two"):
             program = run("-m", "trade_gateway", "ros", tmp_path / f"{name}.toml", "--name", name)
             while "bridged:" not in program.line():
