@@ -186,4 +186,4 @@ def test_it_leaves_no_handler_of_logs_behind(live: Live) -> None:
 def test_without_its_library_the_command_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     done = CliRunner().invoke(app, ["foxglove"])
-    assert 'needs foxglove; pip install "trade-gateway[foxglove]"' in str(done.exception)
+    assert 'needs foxglove. Run `pip install "trade-gateway[foxglove]"`' in str(done.exception)

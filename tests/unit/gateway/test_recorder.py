@@ -332,4 +332,4 @@ def test_a_recording_goes_to_a_file_or_is_kept_for_a_fault(words: list[str]) -> 
 def test_without_its_library_the_commands_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mcap", None)
     done = CliRunner().invoke(app, ["record", "a.mcap"])
-    assert 'needs mcap; pip install "trade-gateway[record]"' in str(done.exception)
+    assert 'needs mcap. Run `pip install "trade-gateway[record]"`' in str(done.exception)

@@ -166,4 +166,4 @@ def test_a_scan_that_finds_a_problem_tells_its_exit_code(tmp_path: Path) -> None
 def test_a_port_that_is_none_is_named_without_a_key_that_nobody_wrote(tmp_path: Path, words: tuple[str, ...]) -> None:
     (tmp_path / "no").write_text("no port", encoding="utf-8")
     error = trade(*words, "--port", tmp_path / "no").exception
-    assert str(error).startswith(f"{tmp_path / 'no'}: is no serial port")
+    assert str(error).startswith(f"{tmp_path / 'no'}: is not a serial port")

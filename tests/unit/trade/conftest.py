@@ -16,6 +16,7 @@ import hypothesis
 import pytest
 
 from tests.support.two_joint_robot import Robot
+from tests.support.waiting import wait_until
 from tests.unit.trade.lamp_provider import Lamp, Pair, found
 from tests.unit.trade.moving_providers import Scene, migration_scene
 from tests.unit.trade.rules_fixture import Desk, Engine
@@ -68,7 +69,10 @@ class Program:
         self.process.stdin.flush()
 
     def freeze(self) -> None:
+        """Stops the program, and waits until each of its threads stands still: the signal reaches them one by one."""
         self.process.send_signal(signal.SIGSTOP)
+        tasks = Path(f"/proc/{self.process.pid}/task")
+        wait_until(lambda: all(" T " in (task / "stat").read_text() for task in tasks.iterdir()))
 
     def thaw(self) -> None:
         self.process.send_signal(signal.SIGCONT)

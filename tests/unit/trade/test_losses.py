@@ -45,7 +45,7 @@ def test_a_call_in_flight_ends_when_its_callee_is_killed(here: Container, driver
     assert [driver.heard() for _ in range(3)] == ["inside"] * 3
     driver.kill()
     for run in runs:
-        with pytest.raises(ContainerLost, match=r"container driver was lost during a call of robot.hang; whether it"):
+        with pytest.raises(ContainerLost, match=r"container driver was lost during a call of robot.hang. Whether it"):
             run.result()
 
 

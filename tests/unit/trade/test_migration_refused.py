@@ -389,7 +389,7 @@ def test_what_nobody_fetches_is_closed_by_itself(scene: Scene, monkeypatch: pyte
     monkeypatch.setattr(target, "TICKET_S", 0.05)
     ticket = prepare(scene).ticket
     wait_until(lambda: scene.module.events == ["made 1", "close 0"])
-    with pytest.raises(CannotMigrate, match="not there any more"):
+    with pytest.raises(CannotMigrate, match="the prepared provider has expired"):
         ask(scene, "arrive")(ticket)
 
 

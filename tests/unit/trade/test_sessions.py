@@ -61,7 +61,7 @@ def test_S03_a_client_that_is_gone_moves_nothing_any_more(robot: Robot) -> None:
     session = robot.me.open_session("page")
     session.close()
     session.close()
-    with session.use(), pytest.raises(SessionEnded, match="open another one"):
+    with session.use(), pytest.raises(SessionEnded, match="Open another one"):
         move(1.0)
     assert robot.joints["a"].written == []
 
