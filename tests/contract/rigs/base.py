@@ -14,7 +14,7 @@ from tests.unit import drivers
 from tests.unit.drivers.conftest import Outcome
 from trade import Container, Handle, where
 from trade.errors import TradeError
-from trade_hil_sim import Entry, received
+from trade_hil_sim import Absent, Entry, received
 
 PROCESSES = Path(next(iter(drivers.__path__)))
 
@@ -65,6 +65,10 @@ class SafetyRig(ABC):
     """Parts of the error of a driver that was frozen."""
     stops_without_driver: ClassVar[bool] = True
     """Whether the device stops when its driver falls silent; if not, it ends the move that it was sent last."""
+    absent: ClassVar[Absent] = Absent()
+    """Takes a device away before the driver is attached."""
+    says_absent: ClassVar[Sequence[str]]
+    """Parts of the refusal: the key of the device and what to check."""
     resource: ClassVar[str]
     """What is locked before the device is moved."""
     robot: Any
@@ -179,6 +183,10 @@ class SafetyRig(ABC):
     def ordered(self, since: float) -> Sequence[object]:
         """Everything sent to a device that is able to move that changes what it does."""
         return self.commanded(since)
+
+    def written(self) -> Sequence[object]:
+        """Everything that must not be sent to a device that is refused."""
+        return self.commanded()
 
     @abstractmethod
     def sent_away(self, since: float, within_rad: float = 0.002) -> Sequence[object]:

@@ -47,6 +47,7 @@ class Cia402Rig(CanJointRig):
     patience = (PATIENT,)
     others = (("home",),)
     says_on_return = "it was away"
+    says_absent = ('leg.toml: joint."leg.knee"', "node 2", "power", "bit rate", "terminations")
     lacks: ClassVar = {"test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT}
 
     def on_the_bench(self) -> Any:
@@ -143,6 +144,7 @@ class OdriveRig(CanJointRig):
     }
     bus, joint, group = "tail", "tail.root", "tail"
     patience = (("watchdog_s = 0.4", "watchdog_s = 0.5"),)
+    says_absent = ('tail.toml: joint."tail.tip": no motor answers as 2',)
     bench: MotorRig
 
     def on_the_bench(self) -> Any:

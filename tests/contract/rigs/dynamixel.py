@@ -8,7 +8,7 @@ import pytest
 from tests.contract.rigs.joints import FIRST, JointRig
 from tests.support.simulated_robots import HEAD
 from tests.unit.drivers.conftest import Rig, goal_counts
-from trade_hil_sim import Entry, instructions
+from trade_hil_sim import Entry, instructions, writes
 
 _COUNTS_PER_RAD = 4096 / 6.283185307179586
 _WATCHDOG_S = 0.3
@@ -24,6 +24,9 @@ class SerialJointRig(JointRig):
 
     def commanded(self, since: float = 0.0) -> Sequence[Entry]:
         return self.bench.moves(since=since)
+
+    def written(self) -> Sequence[Entry]:
+        return writes(self.bench.log)
 
     def targets_rad(self, since: float) -> Sequence[float]:
         return [(self.goal_of(entry) - 2048) / self.counts_per_rad for entry in self.bench.goals(FIRST, since)]
@@ -59,6 +62,7 @@ class DynamixelRig(SerialJointRig):
     robot_file_driver = "dynamixel"
     counts_per_rad = _COUNTS_PER_RAD
     says_on_waking = ("held up for 1.", "watchdog")
+    says_absent = ('head.toml: joint."neck.tilt"', "id 2", "'neck'", "1000000 baud", "power")
     text = HEAD
 
     def on_the_bench(self) -> Any:

@@ -21,6 +21,10 @@ class FeetechRig(SerialJointRig):
     robot_file_driver = "feetech"
     counts_per_rad = COUNTS_PER_RAD
     text = TAIL
+    says_absent = (
+        'joint."tail.tip": no device answers to id 2',
+        "its id (register 5) and its baud rate (register 6)",
+    )
     patience = (('driver = "feetech"', 'driver = "feetech"\nstale_after_s = 1'),)  # a busy machine is no silence
 
     def on_the_bench(self) -> Any:

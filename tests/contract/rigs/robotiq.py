@@ -29,6 +29,7 @@ class RobotiqRig(SafetyRig):
     resource = "rosie.left.hand"
     far, slowly, readying = ("close",), ("close", _SLOW_M_S), ("activate",)
     stops_without_driver = False
+    says_absent = ('gripper."left.hand": no gripper answers to id 9',)
     lacks: ClassVar = {
         "test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why": "the move has ended by then: the device "
         "has no watchdog",

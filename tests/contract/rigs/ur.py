@@ -26,6 +26,7 @@ class UrRig(SafetyRig):
     resource = "ada.right"
     far, slowly, set_point = ("move_joints", FAR), ("move_joints", FAR, SLOW), ("servo", FAR, 1.0)
     drift = 0.83
+    says_absent = ("arm.toml: bus.ur.host",)
     readying = ("freedrive", True)
     lacks: ClassVar = {
         "test_S01_a_plain_call_waits_one_second_for_its_turn_at_most": "the controller's states that nobody reads "

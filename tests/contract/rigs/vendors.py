@@ -23,7 +23,7 @@ RIGS: dict[str, type[SafetyRig]] = {
 RULES: list[str] = [
     rule
     for module in sorted(Path(__file__).parents[1].glob("test_*.py"))
-    for rule in re.findall(r"^def (test_S\w+)", module.read_text(encoding="utf-8"), re.MULTILINE)
+    for rule in re.findall(r"^def (test_\w+)", module.read_text(encoding="utf-8"), re.MULTILINE)
 ]
 
 

@@ -38,13 +38,6 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
 # --- who is there
 
 
-def test_an_absent_device_is_named_with_what_to_check(rig: Rig) -> None:
-    rig.plug(Servo(1))
-    text = refused(rig)
-    for part in ('head.toml: joint."neck.tilt"', "id 2", "'neck'", str(rig.sim.port), "1000000 baud", "power"):
-        assert part in text
-
-
 def test_another_model_is_named_beside_the_one_expected(head: Rig) -> None:
     head.sim.do(sim.WrongModel(ids=(1,), number=1020))
     assert "is 'XL430-W250', but id 1 is XM430-W350 (model number 1020)" in refused(head)
@@ -247,11 +240,6 @@ def test_nothing_is_announced_and_the_port_is_free_when_announcing_fails(head: R
         attach(head.robot, register=register, deregister=announced.remove, ports={"neck": str(head.sim.port)})
     assert not announced
     head.attach()
-
-
-def test_every_device_is_attached_before_any_service_is_announced(rig: Rig) -> None:
-    rig.plug(Servo(1))
-    refused(rig)
 
 
 def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> None:

@@ -13,7 +13,7 @@ from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.legs import HIP, KNEE, Leg, leg, rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
-from trade_hil_sim import Absent, Mute, Unplug
+from trade_hil_sim import Mute, Unplug
 from trade_hil_sim.cia402 import Cia402Bus
 
 __all__ = ["leg", "rig"]
@@ -34,13 +34,6 @@ def objects(**values: int) -> Callable[[Cia402Bus], None]:
             next(device for device in bus.devices if device.device_id == HIP).store.set(name, value)  # type: ignore[attr-defined]
 
     return change
-
-
-def test_an_absent_drive_is_named_with_what_to_check(leg: Leg) -> None:
-    leg.sim.do(Absent(ids=(HIP,)))
-    text = refused(leg)
-    for part in ('leg.toml: joint."leg.hip"', "node 1", leg.sim.port, "power", "bit rate", "terminations"):
-        assert part in text
 
 
 def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -> None:

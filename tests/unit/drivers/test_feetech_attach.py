@@ -49,12 +49,6 @@ def test_a_servo_that_is_set_up_otherwise_is_refused_and_the_register_named(
     assert 'joint."tail.root"' in text
 
 
-def test_who_is_absent_is_named(rig: TailRig) -> None:
-    rig.plug(Servo(1))
-    assert "no device answers to id 2" in (text := refused(rig))
-    assert "its id (register 5) and its baud rate (register 6)" in text
-
-
 def test_another_baud_rate_is_silence(rig: TailRig) -> None:
     rig.plug(Servo(1, baud=115_200), Servo(2, baud=115_200))
     assert "no device answers to id 1" in refused(rig)

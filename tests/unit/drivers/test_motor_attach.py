@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError, DeviceFault
 from trade_drivers import load
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
-from trade_hil_sim import Absent, WrongModel
+from trade_hil_sim import WrongModel
 
 __all__ = ["motor_rig", "wag"]
 
@@ -76,12 +76,6 @@ def test_a_damiao_is_refused_for_what_the_file_says(damiaos: MotorRig, change: t
     with pytest.raises(ConfigurationError, match=says):
         damiaos.attach()
     assert not [e for e in damiaos.frames() if e.direction == "in"]
-
-
-def test_a_motor_that_is_not_there_is_named(wag: MotorRig) -> None:
-    wag.sim.do(Absent(ids=(TIP,)))
-    with pytest.raises(ConfigurationError, match="no motor answers as 2"):
-        wag.attach()
 
 
 def test_an_odrive_of_another_kind_is_refused(odrives: MotorRig) -> None:

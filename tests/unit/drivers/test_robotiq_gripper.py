@@ -13,7 +13,7 @@ from trade.errors import ConfigurationError, DeviceFault, MotionStopped
 from trade_drivers import Gripper, SerialBus, attach, parse
 from trade_drivers.testing import GripperContract
 from trade_drivers.vendors.robotiq import _table as table
-from trade_hil_sim import Absent, DynamixelBus, Put
+from trade_hil_sim import DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 
 
@@ -158,12 +158,6 @@ def test_a_mistake_in_the_file_is_answered_with_what_would_be_right(
     with pytest.raises(ConfigurationError) as refused:
         hand.attach()
     assert problem in str(refused.value)
-
-
-def test_an_absent_gripper_is_named(hand: HandRig) -> None:
-    hand.sim.do(Absent())
-    with pytest.raises(ConfigurationError, match=r'gripper."left.hand": no gripper answers to id 9'):
-        hand.attach()
 
 
 def test_a_port_that_is_not_there_is_named(hand: HandRig, tmp_path: Path) -> None:
