@@ -24,3 +24,8 @@ def test_an_absent_device_is_named_with_what_to_check(rig: SafetyRig) -> None:
     said = refused(rig)
     for part in (*rig.says_absent, str(rig.bench.sim.port)):
         assert part in said
+
+
+def test_another_model_is_named_beside_the_one_expected(rig: SafetyRig) -> None:
+    rig.swap()
+    assert rig.says_model in refused(rig)

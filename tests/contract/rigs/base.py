@@ -69,6 +69,10 @@ class SafetyRig(ABC):
     """Takes a device away before the driver is attached."""
     says_absent: ClassVar[Sequence[str]]
     """Parts of the refusal: the key of the device and what to check."""
+    swapped: ClassVar[Any]
+    """Puts a device of another model in the place of the one in the robot file."""
+    says_model: ClassVar[str]
+    """The part of the refusal that names both models."""
     resource: ClassVar[str]
     """What is locked before the device is moved."""
     robot: Any
@@ -97,6 +101,10 @@ class SafetyRig(ABC):
         if not self._plugged:
             self.bench.plug()
             self._plugged = True
+
+    def swap(self) -> None:
+        self.plug()
+        self.bench.sim.do(self.swapped)
 
     @abstractmethod
     def attach(self, **options: Any) -> None:

@@ -12,7 +12,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
 from trade.errors import DeviceFault
-from trade_hil_sim import Entry
+from trade_hil_sim import Entry, WrongModel
 
 _NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
 _QUICK_STOP = 0x02
@@ -47,11 +47,16 @@ class Cia402Rig(CanJointRig):
     patience = (PATIENT,)
     others = (("home",),)
     says_on_return = "it was away"
+    says_model = "joint.\"leg.hip\".model: is 'ACME-EC45', but node 1 says it is 'ACME-EC60' (1008h)"
     says_absent = ('leg.toml: joint."leg.knee"', "node 2", "power", "bit rate", "terminations")
     lacks: ClassVar = {"test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT}
 
     def on_the_bench(self) -> Any:
         return Leg(self.undo)
+
+    def swap(self) -> None:
+        self.plug()
+        self.configure(("ACME-EC60", "ACME-EC45"))
 
     def states(self, since: float) -> list[str]:
         return [entry.detail for entry in self.events("state", since)]
@@ -144,6 +149,7 @@ class OdriveRig(CanJointRig):
     }
     bus, joint, group = "tail", "tail.root", "tail"
     patience = (("watchdog_s = 0.4", "watchdog_s = 0.5"),)
+    swapped, says_model = WrongModel(ids=(SECOND,), number=4), "product line 4"
     says_absent = ('tail.toml: joint."tail.tip": no motor answers as 2',)
     bench: MotorRig
 
@@ -152,6 +158,9 @@ class OdriveRig(CanJointRig):
 
     def commanded(self, since: float = 0.0) -> Sequence[object]:
         return self.bench.commanded(FIRST, since)
+
+    def written(self) -> Sequence[object]:
+        return self.bench.commanded()
 
     def targets_rad(self, since: float) -> Sequence[float]:
         gear = self.bench.robot.joints[0].gear
@@ -180,6 +189,11 @@ class DamiaoRig(OdriveRig):
     """A tail of two Damiao motors."""
 
     kind = "damiao"
+    says_model = "velocity of a DM4340 goes to 10, but motor 1 is set to 30"
+
+    def swap(self) -> None:
+        self.plug()
+        self.configure(('model = "DM4310"', 'model = "DM4340"'))
 
     def ordered(self, since: float) -> Sequence[object]:
         """Every cycle sends an enabled motor to where it is."""

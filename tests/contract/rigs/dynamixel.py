@@ -8,7 +8,7 @@ import pytest
 from tests.contract.rigs.joints import FIRST, JointRig
 from tests.support.simulated_robots import HEAD
 from tests.unit.drivers.conftest import Rig, goal_counts
-from trade_hil_sim import Entry, instructions, writes
+from trade_hil_sim import Entry, WrongModel, instructions, writes
 
 _COUNTS_PER_RAD = 4096 / 6.283185307179586
 _WATCHDOG_S = 0.3
@@ -62,6 +62,8 @@ class DynamixelRig(SerialJointRig):
     robot_file_driver = "dynamixel"
     counts_per_rad = _COUNTS_PER_RAD
     says_on_waking = ("held up for 1.", "watchdog")
+    swapped = WrongModel(ids=(FIRST,), number=1020)
+    says_model = "is 'XL430-W250', but id 1 is XM430-W350 (model number 1020)"
     says_absent = ('head.toml: joint."neck.tilt"', "id 2", "'neck'", "1000000 baud", "power")
     text = HEAD
 

@@ -3,10 +3,10 @@
 from typing import Any, ClassVar
 
 from tests.contract.rigs.dynamixel import SerialJointRig
-from tests.contract.rigs.joints import FIRST
+from tests.contract.rigs.joints import FIRST, SECOND
 from tests.support.simulated_robots import TAIL
 from tests.unit.drivers.tail_rig import COUNTS_PER_RAD, TailRig, goal_of, lead_counts, measured_before
-from trade_hil_sim import Entry
+from trade_hil_sim import Entry, WrongModel
 
 
 class FeetechRig(SerialJointRig):
@@ -21,6 +21,8 @@ class FeetechRig(SerialJointRig):
     robot_file_driver = "feetech"
     counts_per_rad = COUNTS_PER_RAD
     text = TAIL
+    swapped = WrongModel(ids=(SECOND,), number=1285)
+    says_model = "'STS3215', but id 2 is a model this driver does not know (model number 1285)"
     says_absent = (
         'joint."tail.tip": no device answers to id 2',
         "its id (register 5) and its baud rate (register 6)",

@@ -13,7 +13,7 @@ from tests.unit.drivers.arm_rig import FAR, SLOW, ArmRig, answers
 from tests.unit.drivers.attached_arm import ARM, AT_HOME
 from tests.unit.drivers.conftest import Outcome, written_now
 from trade import Container
-from trade_hil_sim import Entry, events, instructions
+from trade_hil_sim import Arm, Entry, events, instructions
 
 _ONE_DEVICE = "an arm has a controller of its own"
 _LIMITS = "unit/drivers/test_ur_way.py has the limits of arms"
@@ -26,6 +26,7 @@ class UrRig(SafetyRig):
     resource = "ada.right"
     far, slowly, set_point = ("move_joints", FAR), ("move_joints", FAR, SLOW), ("servo", FAR, 1.0)
     drift = 0.83
+    says_model = "has a UR10, not a UR5e"
     says_absent = ("arm.toml: bus.ur.host",)
     readying = ("freedrive", True)
     lacks: ClassVar = {
@@ -58,6 +59,9 @@ class UrRig(SafetyRig):
 
     def plug(self) -> None:
         """The controller is there."""
+
+    def swap(self) -> None:
+        self.bench = ArmRig(self.undo, Arm("UR10e", name="right"))
 
     def attach(self, **options: Any) -> None:
         self.robot = self.bench.attach(**options)

@@ -38,11 +38,6 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
 # --- who is there
 
 
-def test_another_model_is_named_beside_the_one_expected(head: Rig) -> None:
-    head.sim.do(sim.WrongModel(ids=(1,), number=1020))
-    assert "is 'XL430-W250', but id 1 is XM430-W350 (model number 1020)" in refused(head)
-
-
 def test_a_model_nobody_knows_is_named_by_its_number(head: Rig) -> None:
     head.sim.do(sim.WrongModel(ids=(1,), number=4711))
     assert "model number 4711" in refused(head)

@@ -48,12 +48,6 @@ def test_a_single_lost_answer_is_forgiven(leg: Leg) -> None:
     leg.attach()
 
 
-def test_another_model_is_named_beside_the_one_expected(leg: Leg) -> None:
-    leg.configure(("ACME-EC60", "ACME-EC45"))
-    text = refused(leg)
-    assert "joint.\"leg.hip\".model: is 'ACME-EC45', but node 1 says it is 'ACME-EC60' (1008h)" in text
-
-
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [

@@ -54,11 +54,6 @@ def test_another_baud_rate_is_silence(rig: TailRig) -> None:
     assert "no device answers to id 1" in refused(rig)
 
 
-def test_another_model_is_refused(rig: TailRig) -> None:
-    rig.plug(prepare=lambda sim: sim.do(trade_hil_sim.WrongModel(ids=(2,), number=1285)))
-    assert "'STS3215', but id 2 is a model this driver does not know (model number 1285)" in refused(rig)
-
-
 def test_two_of_one_id_are_told_of(rig: TailRig) -> None:
     rig.plug(Servo(1), Servo(1), Servo(2))
     assert "two devices may share this id" in refused(rig)

@@ -14,7 +14,6 @@ from trade.errors import ConfigurationError, DeviceFault
 from trade_drivers import load
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
-from trade_hil_sim import WrongModel
 
 __all__ = ["motor_rig", "wag"]
 
@@ -76,20 +75,6 @@ def test_a_damiao_is_refused_for_what_the_file_says(damiaos: MotorRig, change: t
     with pytest.raises(ConfigurationError, match=says):
         damiaos.attach()
     assert not [e for e in damiaos.frames() if e.direction == "in"]
-
-
-def test_an_odrive_of_another_kind_is_refused(odrives: MotorRig) -> None:
-    odrives.plug().do(WrongModel(ids=(TIP,), number=4))
-    with pytest.raises(ConfigurationError, match="product line 4"):
-        odrives.attach()
-
-
-def test_a_damiao_with_other_ranges_than_its_model_is_refused(damiaos: MotorRig) -> None:
-    damiaos.plug()
-    damiaos.configure(('model = "DM4310"', 'model = "DM4340"'))
-    with pytest.raises(ConfigurationError, match="velocity of a DM4340 goes to 10, but motor 1 is set to 30"):
-        damiaos.attach()
-    assert not damiaos.commanded()
 
 
 def test_an_odrive_without_a_watchdog_is_not_enabled(odrives: MotorRig) -> None:

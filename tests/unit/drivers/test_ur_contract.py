@@ -48,11 +48,6 @@ def test_a_stream_has_the_rate_of_the_controller(model: str, text: str, most: in
         assert len(streamed) <= most * (streamed[-1] - streamed[0]) * 1.1 + 2
 
 
-def test_an_arm_of_another_model_is_not_taken() -> None:
-    with ExitStack() as undo, pytest.raises(ConfigurationError, match="has a UR10, not a UR5e"):
-        ArmRig(undo, SimArm("UR10e", name="right")).attach()
-
-
 def test_an_address_where_nobody_is_is_named() -> None:
     with ExitStack() as undo, pytest.raises(ConfigurationError, match=r"127\.0\.0\.213"):
         attached(undo, "127.0.0.213")
