@@ -29,3 +29,10 @@ def test_an_absent_device_is_named_with_what_to_check(rig: SafetyRig) -> None:
 def test_another_model_is_named_beside_the_one_expected(rig: SafetyRig) -> None:
     rig.swap()
     assert rig.says_model in refused(rig)
+
+
+def test_a_lost_answer_is_forgiven(rig: SafetyRig) -> None:
+    rig.plug()
+    for fault in rig.lost:
+        rig.bench.sim.do(fault)
+    rig.attach()

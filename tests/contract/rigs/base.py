@@ -73,6 +73,8 @@ class SafetyRig(ABC):
     """Puts a device of another model in the place of the one in the robot file."""
     says_model: ClassVar[str]
     """The part of the refusal that names both models."""
+    lost: ClassVar[Sequence[Any]]
+    """Faults that lose or damage an answer."""
     resource: ClassVar[str]
     """What is locked before the device is moved."""
     robot: Any

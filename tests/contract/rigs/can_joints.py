@@ -12,7 +12,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
 from trade.errors import DeviceFault
-from trade_hil_sim import Entry, WrongModel
+from trade_hil_sim import Entry, Mute, WrongModel
 
 _NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
 _QUICK_STOP = 0x02
@@ -48,6 +48,7 @@ class Cia402Rig(CanJointRig):
     others = (("home",),)
     says_on_return = "it was away"
     says_model = "joint.\"leg.hip\".model: is 'ACME-EC45', but node 1 says it is 'ACME-EC60' (1008h)"
+    lost = (Mute(ids=(FIRST,), instruction="sdo_reply", count=2),)
     says_absent = ('leg.toml: joint."leg.knee"', "node 2", "power", "bit rate", "terminations")
     lacks: ClassVar = {"test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT}
 

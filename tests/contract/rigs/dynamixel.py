@@ -5,10 +5,10 @@ from typing import Any, ClassVar
 
 import pytest
 
-from tests.contract.rigs.joints import FIRST, JointRig
+from tests.contract.rigs.joints import FIRST, SECOND, JointRig
 from tests.support.simulated_robots import HEAD
 from tests.unit.drivers.conftest import Rig, goal_counts
-from trade_hil_sim import Entry, WrongModel, instructions, writes
+from trade_hil_sim import BadCrc, Entry, Mute, WrongModel, instructions, writes
 
 _COUNTS_PER_RAD = 4096 / 6.283185307179586
 _WATCHDOG_S = 0.3
@@ -18,6 +18,7 @@ class SerialJointRig(JointRig):
     """Servos that are written to only when there is something new."""
 
     says_on_waking: ClassVar = ("held up",)
+    lost = (BadCrc(ids=(FIRST,), count=1), Mute(ids=(SECOND,), count=1, instruction="read"))
 
     def goal_of(self, entry: Entry) -> int:
         return goal_counts(entry)

@@ -12,7 +12,7 @@ from tests.unit.drivers.conftest import Outcome
 from trade import Container
 from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._motion import Move
-from trade_hil_sim import Absent, Entry, Place
+from trade_hil_sim import Absent, Entry, Mute, Place
 
 __all__ = ["FIRST", "SECOND", "JointRig"]
 
@@ -33,6 +33,7 @@ class JointRig(SafetyRig):
     """How near to its goal a move ends."""
     exactly_rad: ClassVar[float] = 2e-3
     """How near to the measured position the targets of an enabled joint are."""
+    lost = (Mute(ids=(FIRST,), count=1),)
     absent = Absent(ids=(SECOND,))
     set_point = ("set_velocity", 0.3, 1.0)
     readying = harmless = ("enable",)

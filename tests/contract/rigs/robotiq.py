@@ -13,7 +13,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.gripper_rig import HandRig, silent
 from trade import Container
-from trade_hil_sim import Entry, WrongModel, events
+from trade_hil_sim import Entry, Mute, WrongModel, events
 
 _SLOW_M_S = 0.02
 _OPEN_M = 0.085
@@ -30,6 +30,7 @@ class RobotiqRig(SafetyRig):
     far, slowly, readying = ("close",), ("close", _SLOW_M_S), ("activate",)
     stops_without_driver = False
     swapped, says_model = WrongModel(number=0), "gripper.\"left.hand\": what answers on bus 'hand' is no 2F-85"
+    lost = (Mute(count=1),)
     says_absent = ('gripper."left.hand": no gripper answers to id 9',)
     lacks: ClassVar = {
         "test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why": "the move has ended by then: the device "

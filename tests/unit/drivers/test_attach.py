@@ -53,12 +53,6 @@ def test_an_answer_that_comes_twice_is_found_out(head: Rig) -> None:
     assert "two devices may share this id" in refused(head)
 
 
-def test_a_single_lost_or_damaged_answer_is_forgiven(head: Rig) -> None:
-    head.sim.do(sim.BadCrc(ids=(1,), count=1))
-    head.sim.do(sim.Mute(ids=(2,), count=1, instruction="read"))
-    head.attach()
-
-
 def test_another_baud_rate_looks_like_absence(rig: Rig) -> None:
     rig.plug(Servo(1, baud=57600), Servo(2, baud=57600))
     assert "baud rate (register 8)" in refused(rig)

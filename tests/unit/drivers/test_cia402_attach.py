@@ -43,11 +43,6 @@ def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -
     assert not leg.frames("rpdo1")
 
 
-def test_a_single_lost_answer_is_forgiven(leg: Leg) -> None:
-    leg.sim.do(Mute(ids=(HIP,), instruction="sdo_reply", count=2))
-    leg.attach()
-
-
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [
