@@ -3,6 +3,8 @@
 A vendor that a rule does not apply to names it in its rig, with the reason.
 """
 
+import sys
+
 import pytest
 
 from tests.contract.rigs.base import SafetyRig
@@ -36,3 +38,17 @@ def test_a_lost_answer_is_forgiven(rig: SafetyRig) -> None:
     for fault in rig.lost:
         rig.bench.sim.do(fault)
     rig.attach()
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it(
+    rig: SafetyRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.plug()
+    package, library = rig.library
+    for name in [name for name in sys.modules if name.startswith(f"{library}.")] + [library]:
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in rig.importing:
+        monkeypatch.delitem(sys.modules, f"trade_drivers.{name}", raising=False)
+    said = refused(rig)
+    assert f"needs {package} " in said
+    assert f'pip install "trade-drivers[{rig.vendor}]"' in said

@@ -57,6 +57,8 @@ class DriverProcess:
 class SafetyRig(ABC):
     """A simulated device of one vendor and its driver."""
 
+    vendor: ClassVar[str]
+    """The name of its driver."""
     column: ClassVar[str]
     """The column of docs/safety.md that this device belongs to."""
     lacks: ClassVar[Mapping[str, str]] = {}
@@ -75,6 +77,10 @@ class SafetyRig(ABC):
     """The part of the refusal that names both models."""
     lost: ClassVar[Sequence[Any]]
     """Faults that lose or damage an answer."""
+    library: ClassVar[tuple[str, str]]
+    """The library that the driver needs: its package and its module."""
+    importing: ClassVar[Sequence[str]] = ()
+    """Modules of the drivers on the way to the import of the library."""
     resource: ClassVar[str]
     """What is locked before the device is moved."""
     robot: Any

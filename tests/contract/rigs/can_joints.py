@@ -41,7 +41,9 @@ class CanJointRig(JointRig):
 class Cia402Rig(CanJointRig):
     """A leg of two drives."""
 
-    column = "CiA 402"
+    vendor, column = "cia402", "CiA 402"
+    library = "canopen", "canopen"
+    importing = tuple(f"vendors.cia402.{name}" for name in ("_cycle", "_inspect", "_net"))
     bus, joint, group = "legs", "leg.hip", "leg"
     within_rad, exactly_rad = 0.01, 1e-5
     patience = (PATIENT,)
@@ -139,7 +141,8 @@ class Cia402Rig(CanJointRig):
 class OdriveRig(CanJointRig):
     """A tail of two ODrives."""
 
-    kind: ClassVar[str] = "odrive"
+    vendor = "odrive"
+    library, importing = ("python-can", "can"), ("bus.can", "bus.can._port")
     column = "ODrive, Damiao"
     lacks: ClassVar = {
         "test_S06_every_enabled_joint_has_its_watchdog_armed": "the motor is configured to watch; unit/drivers/"
@@ -155,7 +158,7 @@ class OdriveRig(CanJointRig):
     bench: MotorRig
 
     def on_the_bench(self) -> Any:
-        return KINDS[self.kind](self.undo)
+        return KINDS[self.vendor](self.undo)
 
     def commanded(self, since: float = 0.0) -> Sequence[object]:
         return self.bench.commanded(FIRST, since)
@@ -189,7 +192,7 @@ class OdriveRig(CanJointRig):
 class DamiaoRig(OdriveRig):
     """A tail of two Damiao motors."""
 
-    kind = "damiao"
+    vendor = "damiao"
     says_model = "velocity of a DM4340 goes to 10, but motor 1 is set to 30"
 
     def swap(self) -> None:

@@ -41,10 +41,8 @@ class SerialJointRig(JointRig):
         return float(self.bench.goals(FIRST)[-1].t) + 0.01
 
     def leaves(self, leave: str) -> None:
-        driver = f'driver = "{self.robot_file_driver}"'
+        driver = f'driver = "{self.vendor}"'
         self.configure((driver, f'{driver}\nleave = "{leave}"'))
-
-    robot_file_driver: ClassVar[str]
 
     def judge_stop(self, asked: float) -> None:
         """No more than one exchange, the one under way, goes out before the stop."""
@@ -60,7 +58,8 @@ class DynamixelRig(SerialJointRig):
     column = "Dynamixel"
     bus, joint, group = "neck", "neck.pan", "head"
     max_rad, too_slow_rad_s = 1.4, 0.001
-    robot_file_driver = "dynamixel"
+    vendor = "dynamixel"
+    library, importing = ("dynamixel-sdk", "dynamixel_sdk"), ("vendors.dynamixel._wire",)
     counts_per_rad = _COUNTS_PER_RAD
     says_on_waking = ("held up for 1.", "watchdog")
     swapped = WrongModel(ids=(FIRST,), number=1020)

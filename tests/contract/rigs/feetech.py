@@ -18,7 +18,9 @@ class FeetechRig(SerialJointRig):
     }
     bus, joint, group = "tail", "tail.root", "tail"
     max_rad, too_slow_rad_s = 1.4, 0.01
-    robot_file_driver = "feetech"
+    vendor = "feetech"
+    library = "pyserial", "serial"
+    importing = ("vendors.feetech._wire", "joints.serial._wire", "bus._serial_port")
     counts_per_rad = COUNTS_PER_RAD
     text = TAIL
     swapped = WrongModel(ids=(SECOND,), number=1285)

@@ -25,7 +25,8 @@ _NO_JOINT = "a gripper has no joint"
 class RobotiqRig(SafetyRig):
     """A hand; its fingers begin open."""
 
-    column = "2F-85"
+    vendor, column = "robotiq", "2F-85"
+    library, importing = ("pymodbus", "pymodbus"), ("vendors.robotiq._wire",)
     resource = "rosie.left.hand"
     far, slowly, readying = ("close",), ("close", _SLOW_M_S), ("activate",)
     stops_without_driver = False

@@ -22,7 +22,8 @@ _LIMITS = "unit/drivers/test_ur_way.py has the limits of arms"
 class UrRig(SafetyRig):
     """A UR5e; its base is turned."""
 
-    column = "UR"
+    vendor, column = "ur", "UR"
+    library = "ur-rtde", "rtde_control"
     resource = "ada.right"
     far, slowly, set_point = ("move_joints", FAR), ("move_joints", FAR, SLOW), ("servo", FAR, 1.0)
     drift = 0.83

@@ -1,7 +1,5 @@
 """Attaching: every mistake of wiring, setting and installation is named with what would be right."""
 
-import builtins
-import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint
@@ -176,22 +174,6 @@ def test_a_group_over_two_buses_is_a_provider_like_any_other(rig: Rig) -> None:
 
 
 # --- what is installed
-
-
-def test_a_missing_vendor_library_is_named_with_the_command_that_installs_it(
-    head: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("dynamixel_sdk"):
-            raise ModuleNotFoundError("No module named 'dynamixel_sdk'")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.delitem(sys.modules, "trade_drivers.vendors.dynamixel._wire", raising=False)
-    monkeypatch.setattr(builtins, "__import__", without)
-    assert "needs dynamixel-sdk" in (text := refused(head))
-    assert 'pip install "trade-drivers[dynamixel]"' in text
 
 
 def test_the_installed_drivers_are_listed_by_name() -> None:

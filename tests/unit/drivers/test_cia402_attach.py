@@ -1,8 +1,6 @@
 """Attaching drives: every mistake of wiring, setting and installation is named with what would be right."""
 
-import builtins
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -105,21 +103,6 @@ def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
     assert len(leg.announced) == first
     assert not [name for name in ("nmt", "sdo_request") if leg.frames(name, since=mark)]
     assert moving.wait().result == pytest.approx(0.3, abs=0.01)
-
-
-def test_a_missing_library_is_named_with_its_remedy(leg: Leg, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without_canopen(name: str, *rest: Any) -> Any:
-        if name.partition(".")[0] == "canopen":
-            raise ImportError(f"No module named {name!r}")
-        return real(name, *rest)
-
-    for module in [name for name in sys.modules if name.startswith(("trade_drivers.vendors.cia402._", "canopen"))]:
-        if module != "trade_drivers.vendors.cia402._driver":
-            monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setattr(builtins, "__import__", without_canopen)
-    assert 'pip install "trade-drivers[cia402]"' in refused(leg)
 
 
 def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
