@@ -52,3 +52,17 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     said = refused(rig)
     assert f"needs {package} " in said
     assert f'pip install "trade-drivers[{rig.vendor}]"' in said
+
+
+def test_nothing_is_announced_and_the_port_is_free_when_announcing_fails(rig: SafetyRig) -> None:
+    announced: list[object] = []
+
+    def register(provider: object, _: object) -> None:
+        if announced:
+            raise ConfigurationError(problem="it is full")
+        announced.append(provider)
+
+    with pytest.raises(ConfigurationError, match="it is full"):
+        rig.attach(register=register, deregister=announced.remove)
+    assert not announced
+    rig.attach()

@@ -1,7 +1,7 @@
 """Attaching: every mistake of wiring, setting and installation is named with what would be right."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -195,22 +195,6 @@ def test_a_driver_that_cannot_be_imported_or_is_none_is_refused(head: Rig, monke
 
 
 # --- together or not at all
-
-
-def test_nothing_is_announced_and_the_port_is_free_when_announcing_fails(head: Rig) -> None:
-    from trade_drivers import attach
-
-    announced: list[object] = []
-
-    def register(provider: object, groups: Sequence[str]) -> None:
-        if "rosie.head" in groups:
-            raise ConfigurationError(problem="no")
-        announced.append(provider)
-
-    with pytest.raises(ConfigurationError, match="no"):
-        attach(head.robot, register=register, deregister=announced.remove, ports={"neck": str(head.sim.port)})
-    assert not announced
-    head.attach()
 
 
 def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> None:
