@@ -276,7 +276,7 @@ def test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire(rig: JointRig, lo
 
 def test_S18_attaching_commands_nothing(rig: SafetyRig) -> None:
     rig.attach()
-    assert not rig.commanded()
+    assert not rig.written()
     assert not rig.events("motion_started", 0.0)
 
 

@@ -201,7 +201,7 @@ class SafetyRig(ABC):
         return self.commanded(since)
 
     def written(self) -> Sequence[object]:
-        """Everything that must not be sent to a device that is refused."""
+        """Everything sent that attaching to a device at rest must not send."""
         return self.commanded()
 
     @abstractmethod

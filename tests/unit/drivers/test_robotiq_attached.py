@@ -30,12 +30,6 @@ def tell(bus: RobotiqBus, *values: int) -> None:
     bus._line.nudge()
 
 
-def test_S18_attaching_to_a_gripper_at_rest_writes_nothing(hand: HandRig) -> None:
-    gripper = hand.gripper()
-    assert not gripper.state().activated
-    assert not hand.writes()
-
-
 def test_S18_attaching_to_a_gripper_that_holds_something_leaves_it_so(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04))
     tell(hand.sim, 0x0100, 0, 0)

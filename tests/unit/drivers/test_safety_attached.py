@@ -23,11 +23,6 @@ def _enable(sim: DynamixelBus, device_id: int = 1, **goal: int) -> None:
         servo.write(112, (5).to_bytes(4, "little") + counts.to_bytes(4, "little"), time.monotonic())
 
 
-def test_S18_attaching_to_relaxed_servos_writes_nothing_at_all(head: Rig) -> None:
-    head.attach()
-    assert not trade_hil_sim.writes(head.log)
-
-
 def test_S18_attaching_to_enabled_servos_writes_no_motion(rig: Rig) -> None:
     rig.plug(prepare=_enable)
     robot = rig.attach()
