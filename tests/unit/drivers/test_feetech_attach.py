@@ -68,7 +68,7 @@ def test_two_of_one_id_are_told_of(rig: TailRig) -> None:
         ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 40.0", "above 38.96, the most an STS3215"),
         ("max_speed_rad_s = 2.5", "max_speed_rad_s = 60.0\n", "takes 3 s"),
         ("max_speed_rad_s = 2.5", "max_speed_rad_s = 0.01", "below 0.0153"),
-        ('model = "STS3215"', 'model = "STS9999"', "it knows STS3215"),
+        ('model = "STS3215"', 'model = "STS9999"', "it supports STS3215"),
         ("id = 1", "id = 1\ngear = 2", "are for other devices"),
     ],
 )
