@@ -11,7 +11,7 @@ from trade_drivers.joints import Axis, Exchange, Ramp
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
-from trade_drivers.joints.serial import told
+from trade_drivers.joints.serial import written
 from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 from trade_drivers.vendors.dynamixel import _table as dynamixel
 from trade_drivers.vendors.feetech import _table as feetech
@@ -56,7 +56,7 @@ def the_last_speed_holds_for_ever(patch: pytest.MonkeyPatch) -> None:
 
 def _torque_alone(register: Any) -> Callable[..., Iterator[None]]:
     def enabling(bus: Any, job: Any, axis: Any) -> Iterator[None]:
-        yield from told(bus, job, axis, register, 1)
+        yield from written(bus, job, axis, register, 1)
         axis.fault, axis.ready = "", True
 
     return enabling
