@@ -114,7 +114,7 @@ class Member:
         self.container = Container(
             Settings.read(system=system, container=self.name, listen=listen, connect=connect or None)
         )
-        return self.container.reach._links._door()
+        return self.container.reach._links._main_endpoint()
 
     def find_each_other(self) -> None:
         self.up.system.set_broadcast(True)
