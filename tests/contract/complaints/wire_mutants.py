@@ -84,7 +84,7 @@ def a_feetech_that_is_silent_reads_zero(patch: pytest.MonkeyPatch) -> None:
 def a_write_is_done_when_it_is_sent(patch: pytest.MonkeyPatch) -> None:
     def write(self: Net, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Iterator[None]:
         gate()
-        self.port.send(table.SDO_REQUEST + node, next(sdo.download(entry.index, entry.sub, entry.encode(value))).data)
+        self._port.send(table.SDO_REQUEST + node, next(sdo.download(entry.index, entry.sub, entry.encode(value))).data)
         yield
 
     patch.setattr(Net, "write", write)

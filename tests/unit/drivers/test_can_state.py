@@ -128,7 +128,7 @@ def test_the_state_of_a_controller_is_read_out_of_what_the_system_tells(number: 
 
 @pytest.mark.parametrize("text", [b"", bytes(36), answer(1)[:20]], ids=["nothing", "an error", "cut short"])
 def test_what_is_no_answer_is_refused(text: bytes) -> None:
-    with pytest.raises(OSError, match="does not tell"):
+    with pytest.raises(OSError, match="the system reports nothing about"):
         parse_link(text)
 
 
