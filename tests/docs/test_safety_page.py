@@ -110,6 +110,7 @@ def test_tests_without_a_number_exist() -> None:
 def test_the_appendix_lists_the_tests_of_each_rule() -> None:
     """With WRITE_TABLES=1 in the environment it is written again."""
     text = HEAD + "".join(f"\n## {rule} {title}\n\n{_table(rule)}" for rule, title in RULES)
+    text += f"\n## Rules that do not apply\n\n{_lacking()}"
     if os.environ.get("WRITE_TABLES"):
         APPENDIX.write_text(text, encoding="utf-8")
     assert APPENDIX.read_text(encoding="utf-8") == text
@@ -119,4 +120,13 @@ def _table(rule: str) -> str:
     rows = sorted({shown[1:] for shown in TESTS if shown.rule == rule})
     return "| test | file | wire |\n|---|---|---|\n" + "".join(
         f"| `{name}` | {module} | {', '.join(wires)} |\n" for name, module, wires in rows
+    )
+
+
+def _lacking() -> str:
+    """The rules of the contract that a vendor's device cannot keep or break, each with the reason."""
+    return "| driver | test | reason |\n|---|---|---|\n" + "".join(
+        f"| {vendor} | `{rule}` | {reason} |\n"
+        for vendor, made in VENDORS.items()
+        for rule, reason in sorted(made.lacks.items())
     )

@@ -60,7 +60,7 @@ class SafetyRig(ABC):
     vendor: ClassVar[str]
     """The name of its driver."""
     column: ClassVar[str]
-    """The column of docs/safety.md that this device belongs to."""
+    """The name of its wire in docs/safety-tests.md."""
     lacks: ClassVar[Mapping[str, str]] = {}
     """Rules that do not apply to this device, each with the reason."""
     says_on_waking: ClassVar[Sequence[str]] = ()
