@@ -47,10 +47,7 @@ class FaultDetector:
                     seen.link, seen.refusing = False, None
                     self._say(device, "link", None)
             elif not seen.link or (refusing is not None and refusing != seen.refusing):
-                seen.link, seen.refusing = (
-                    True,
-                    refusing,
-                )  # until it answers, only this cause is reported
+                seen.link, seen.refusing = True, refusing  # until it answers, only this cause is reported
                 self._say(device, "link", device.deaf(now_ns) if refusing is None else refusing(device))
 
     def _say(self, device: BusDevice[Any], respect: Respect, error: TradeError | None) -> None:

@@ -221,9 +221,7 @@ class Supervisor:
         if unit is None or unit.leaving:
             return
         if unit.lease is not None and not unit.may_be_up():
-            self._do(
-                unit, unit.life.stop(self._clock(), unit.lease.why)
-            )  # one that was given up requests its lease again
+            self._do(unit, unit.life.stop(self._clock(), unit.lease.why))  # also if given up: it asks for its lease
         else:
             self._report(unit, f"{name} is restarted at the request of {who}")
             unit.begun = True

@@ -47,9 +47,8 @@ class Hook:
         if refusal is not None:
             self.detach()
             raise refusal
-        self._later = self._home.notifying.joined(
-            everywhere, self._join, existing=True
-        )  # a second attachment of the same hook has no effect
+        # Present containers are reported, too: a second attachment of the same hook has no effect.
+        self._later = self._home.notifying.joined(everywhere, self._join, existing=True)
 
     def _attach(self, handle: Handle) -> Run:
         if isinstance(self.target, Handle):
