@@ -35,7 +35,7 @@ def _anybody_may(patch: Patch) -> None:
 def _never_late(patch: Patch) -> None:
     """Calls and commands run however late they come."""
     from trade._services.local_service import LocalService
-    from trade_drivers.bus._jobs import Command
+    from trade_drivers.bus._gate import Command
 
     patch(LocalService, "too_late", lambda self, _: False)
     patch(Command, "gate", lambda self: self.permit.gate())

@@ -19,7 +19,7 @@ from tests.support.waiting import wait_until
 from tests.system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
-from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.http import add_token
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes

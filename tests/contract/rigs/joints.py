@@ -10,7 +10,7 @@ from tests.contract.rigs.base import DriverProcess, Request, SafetyRig
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome
 from trade import Container
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Absent, Entry, Mute, Place
 

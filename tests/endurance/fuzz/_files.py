@@ -17,7 +17,7 @@ from trade_gateway.cli.operation._archive import read_archive
 from trade_gateway.cli.operation._file_closure import named_files
 from trade_gateway.cli.watching._audit import _noted as read_notes
 from trade_gateway.cli.watching._audit import _verified as verified
-from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._system import read_system_file
 from trade_gateway.http._authentication import Tokens
 from trade_gateway.language import read_lexicon

@@ -12,7 +12,7 @@ from tests.unit.drivers.conftest import Outcome, sleep_past, written_now
 from tests.unit.drivers.legs import HALT, HIP, KNEE, PATIENT, Leg, leg, rig
 from trade import Container, where
 from trade.errors import DeviceFault, LockedByOther, MotionStopped
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry
 

@@ -14,7 +14,7 @@ from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._jobs import Enable, Relax
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 

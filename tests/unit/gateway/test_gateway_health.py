@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from trade_gateway.cli.robots._gateway import Gateway
-from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._gateway_file import read_gateway_file
 
 
 @pytest.fixture

@@ -18,9 +18,10 @@ import pytest
 import zenoh
 
 from trade import Container, Settings, service, where
+from trade._security.network_crossings import crossings
 from trade._security.policy import Policy, Role
 from trade._security.policy_file import read_policy
-from trade._security.zenoh_acl import acl, crossings
+from trade._security.zenoh_acl import acl
 from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 

@@ -4,9 +4,10 @@ Containers read their own: see `trade.Settings.policy` and `trade.Container.load
 """
 
 from trade._security.authorizer import decide_call
+from trade._security.network_crossings import Crossing, crossings
 from trade._security.policy import EVERYTHING, VERBS, Decision, Policy, Role
 from trade._security.policy_file import read_policy
-from trade._security.zenoh_acl import Crossing, acl, crossings
+from trade._security.zenoh_acl import acl
 
 __all__ = [
     "EVERYTHING",

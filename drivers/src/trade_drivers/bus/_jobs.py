@@ -1,21 +1,16 @@
-"""Jobs of services for the thread that owns a bus, and the gate that a command must pass."""
+"""Jobs of services for the thread that owns a bus, and the errors of its wire."""
 
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 from trade import current_call
-from trade.errors import DeadlineExceeded, DeviceFault, TradeError
-
-if TYPE_CHECKING:
-    from trade_drivers.bus._cycle import BusCycle
-    from trade_drivers.bus._deadlines import Terms
+from trade.errors import DeviceFault, TradeError
 
 __all__ = [
     "TAKEN",
     "BadAnswer",
-    "Command",
     "Device",
     "Gate",
     "NoAnswer",
@@ -97,14 +92,13 @@ class Device(Protocol):
         ...
 
 
-_Device_co = TypeVar("_Device_co", bound=Device, covariant=True)
-_Cycle_co = TypeVar("_Cycle_co", bound="BusCycle[Any]", covariant=True)
+DeviceT_co = TypeVar("DeviceT_co", bound=Device, covariant=True)
 
 
-class Work(Generic[_Device_co]):
+class Work(Generic[DeviceT_co]):
     """A job with a waiting service. The base class needs no permit: it is for jobs that end motion."""
 
-    def __init__(self, devices: Sequence[_Device_co]) -> None:
+    def __init__(self, devices: Sequence[DeviceT_co]) -> None:
         self.devices = tuple(devices)
         """The devices that it accesses or waits for; at least one."""
         self._call = current_call()
@@ -165,34 +159,3 @@ class Work(Generic[_Device_co]):
                 self.finish(self.devices[0].faulty("the thread of its bus has ended"))
         if self._error is not None:
             raise self._error
-
-
-class Command(Work[_Device_co], Generic[_Device_co, _Cycle_co]):
-    """A command that may start motion. It expires, and its call was admitted under a permit."""
-
-    def __init__(self, exchange: _Cycle_co, devices: Sequence[_Device_co], terms: "Terms") -> None:
-        super().__init__(devices)
-        self._exchange = exchange
-        self.service, self.expires_ns, self.until_ns, self.permit = terms
-        self._admitted_ns = exchange.clock()
-
-    @property
-    def exchange(self) -> _Cycle_co:
-        """Returns the exchange of its bus."""
-        return self._exchange
-
-    def gate(self) -> None:
-        """Runs the last checks before the bytes are sent.
-
-        Raises:
-            DeadlineExceeded: the command has expired.
-            MotionStopped, LockLost, LockedByOther: a stop or another lock owner voided its permit.
-        """
-        if self._exchange.clock() >= self.expires_ns:
-            raise self.expired()
-        self.permit.gate()
-
-    def expired(self) -> DeadlineExceeded:
-        """Returns the error for an expired command."""
-        patience_s = max(0.0, (self.expires_ns - self._admitted_ns) / 1e9)
-        return DeadlineExceeded(service=self.service, deadline_s=patience_s)

@@ -5,7 +5,8 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from trade.errors import TradeError
-from trade_drivers.bus._jobs import Command, Steps, Work
+from trade_drivers.bus._gate import Command
+from trade_drivers.bus._jobs import Steps, Work
 from trade_drivers.joints._axis import AxisT
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 
 from trade.errors import MotionStopped, TradeError
-from trade_drivers.bus._deadlines import Terms
-from trade_drivers.bus._jobs import Command, Steps
+from trade_drivers.bus._gate import Command, Terms
+from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._profile import Leg, together

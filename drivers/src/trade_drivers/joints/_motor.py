@@ -6,8 +6,7 @@ from typing import Any, Generic, TypeVar
 from trade import Resource
 from trade.errors import DeviceSilent, LimitExceeded
 from trade_drivers._validation import finite, one_each, valid, within
-from trade_drivers.bus._deadlines import admitted, at_once, span
-from trade_drivers.bus._jobs import Command
+from trade_drivers.bus._gate import Command, admitted, at_once, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis, AxisT

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from trade.errors import TradeError
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner

@@ -12,7 +12,7 @@ from trade._security.policy_file import policy_files
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
-from trade_gateway.config._gateway import Plan
+from trade_gateway.config._gateway_file import Plan
 
 __all__ = ["Named", "digest", "named_by"]
 

@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
-from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, at, converted, line_of, read_toml
 
 __all__ = ["SystemPlan", "read_system_file"]

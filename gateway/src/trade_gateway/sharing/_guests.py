@@ -7,7 +7,7 @@ from typing import Final
 from trade import Container, Settings
 from trade.errors import TradeError
 from trade.sharing import Border
-from trade_gateway.config._gateway import Plan, Share
+from trade_gateway.config._gateway_file import Plan, Share
 
 _TRIES: Final = 5
 _AGAIN_S: Final = 0.2

@@ -2,7 +2,7 @@
 
 from trade import current_call, service
 from trade.errors import ConfigurationError
-from trade_gateway.supervisor._child import ChildInfo
+from trade_gateway.supervisor._child_state import ChildInfo
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._supervisor import Supervisor
 

@@ -19,7 +19,7 @@ from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
-from trade_gateway.supervisor._child import ChildInfo, News, Unit
+from trade_gateway.supervisor._child_state import ChildInfo, News, Unit
 from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
 from trade_gateway.supervisor._objects import CreatedObjects, furnish, save
 from trade_gateway.supervisor._process import Process, rss_mb

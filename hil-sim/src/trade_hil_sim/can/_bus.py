@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import msgspec
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._answer_faults import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._device import DeviceModel

@@ -8,8 +8,9 @@ from typing import Any, Final
 
 from trade._discovery.host_folder import HostFolder
 from trade._security.certificates import Certificate, ExpiryWatch
+from trade._security.network_crossings import crossings
 from trade._security.policy_file import read_policy
-from trade._security.zenoh_acl import acl, crossings
+from trade._security.zenoh_acl import acl
 from trade._settings import Settings
 from trade._transport.credentials import user_secret
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
-from trade_drivers.bus._deadlines import Terms
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints import Motion, Steps
 from trade_drivers.vendors.cia402 import _jobs as jobs
 from trade_drivers.vendors.cia402 import _machine as machine

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from trade import Meta, service
 from trade_drivers._validation import within
-from trade_drivers.bus._deadlines import admitted, span
+from trade_drivers.bus._gate import admitted, span
 from trade_drivers.joints import BusMotor
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.cia402._cycle import DriveExchange

@@ -3,7 +3,7 @@
 from trade import Resource
 from trade.errors import DeviceSilent
 from trade_drivers._validation import finite, within
-from trade_drivers.bus._deadlines import admitted, at_once, span
+from trade_drivers.bus._gate import admitted, at_once, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState
 from trade_drivers.vendors.robotiq import _table as table

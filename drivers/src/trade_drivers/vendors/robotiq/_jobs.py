@@ -4,8 +4,8 @@ from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
-from trade_drivers.bus._deadlines import Terms
-from trade_drivers.bus._jobs import Command, Gate, NoAnswer, Refused, Steps
+from trade_drivers.bus._gate import Command, Terms
+from trade_drivers.bus._jobs import Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._table import Contact, Status

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
-from trade_drivers.bus._deadlines import Terms
-from trade_drivers.bus._jobs import Command, Steps
+from trade_drivers.bus._gate import Command, Terms
+from trade_drivers.bus._jobs import Steps
 from trade_drivers.motion._plan import Plan
 from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._line_path import poses_on

@@ -7,7 +7,7 @@ from typing import Final
 from trade import Permit, Resource, permit
 from trade.errors import DeadlineExceeded, DeviceSilent, InvalidArgument
 from trade_drivers._validation import finite, one_each, valid, within
-from trade_drivers.bus._deadlines import admitted, expiry, span
+from trade_drivers.bus._gate import admitted, expiry, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.motion._plan import JointLimits, Plan

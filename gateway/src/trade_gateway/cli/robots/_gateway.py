@@ -17,7 +17,7 @@ from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.config._changes import Named, digest, named_by
-from trade_gateway.config._gateway import Plan, read_gateway_file
+from trade_gateway.config._gateway_file import Plan, read_gateway_file
 from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
 from trade_gateway.sharing._guests import Guests, opened

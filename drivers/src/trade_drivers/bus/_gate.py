@@ -1,12 +1,19 @@
-"""Deadlines of commands, from their call: the latest start, and the end of the motion."""
+"""The gate of a command, checked immediately before its bytes are sent: its deadlines and its permit."""
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from trade import Permit, Resource, current_call, permit
+from trade.errors import DeadlineExceeded
+from trade_drivers.bus._jobs import DeviceT_co, Work
 
-__all__ = ["Terms", "admitted", "at_once", "expiry", "span"]
+if TYPE_CHECKING:
+    from trade_drivers.bus._cycle import BusCycle
+
+__all__ = ["Command", "Terms", "admitted", "at_once", "expiry", "span"]
+
+_Cycle_co = TypeVar("_Cycle_co", bound="BusCycle[Any]", covariant=True)
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
 """The longest wait of a plain Python call for its turn on the bus."""
@@ -59,3 +66,34 @@ def span(clock: Callable[[], int]) -> tuple[int, int | None]:
         return expires_ns, None
     expires_ns -= min(_ANSWER_NS, max(0, expires_ns - clock()) // 5)
     return expires_ns, expires_ns
+
+
+class Command(Work[DeviceT_co], Generic[DeviceT_co, _Cycle_co]):
+    """A command that may start motion. It expires, and its call was admitted under a permit."""
+
+    def __init__(self, exchange: _Cycle_co, devices: Sequence[DeviceT_co], terms: Terms) -> None:
+        super().__init__(devices)
+        self._exchange = exchange
+        self.service, self.expires_ns, self.until_ns, self.permit = terms
+        self._admitted_ns = exchange.clock()
+
+    @property
+    def exchange(self) -> _Cycle_co:
+        """Returns the exchange of its bus."""
+        return self._exchange
+
+    def gate(self) -> None:
+        """Runs the last checks before the bytes are sent.
+
+        Raises:
+            DeadlineExceeded: the command has expired.
+            MotionStopped, LockLost, LockedByOther: a stop or another lock owner voided its permit.
+        """
+        if self._exchange.clock() >= self.expires_ns:
+            raise self.expired()
+        self.permit.gate()
+
+    def expired(self) -> DeadlineExceeded:
+        """Returns the error for an expired command."""
+        patience_s = max(0.0, (self.expires_ns - self._admitted_ns) / 1e9)
+        return DeadlineExceeded(service=self.service, deadline_s=patience_s)
