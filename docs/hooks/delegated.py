@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import griffe
 
-_MAKERS: Final = {"delegated", "of_default"}
+_MAKERS: Final = {"delegated", "adelegated", "of_default", "aof_default"}
 
 
 class Delegated(griffe.Extension):

@@ -12,6 +12,7 @@ from trade._calls.batch import Outcome
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 from trade._container.container import Container
+from trade._container.default import aof_default as _aof_default
 from trade._container.default import close, container, start
 from trade._container.default import of_default as _of_default
 from trade._container.hooking import Hook
@@ -154,9 +155,9 @@ find = _of_default(Container.find)
 call = _of_default(Container.call)
 call_all = _of_default(Container.call_all)
 call_sequence = _of_default(Container.call_sequence)
-acall = _of_default(Container.acall)
-acall_all = _of_default(Container.acall_all)
-acall_sequence = _of_default(Container.acall_sequence)
+acall = _aof_default(Container.acall)
+acall_all = _aof_default(Container.acall_all)
+acall_sequence = _aof_default(Container.acall_sequence)
 containers = _of_default(Container.containers)
 joined = _of_default(Container.joined)
 left = _of_default(Container.left)

@@ -163,7 +163,7 @@ class NoSuchService(CallerError, LookupError):
         if self.groups:
             return f"This system has {_some(self.groups)}; `trade services` lists their services"
         if self.apart:
-            return f"This container has no link to another one: {_unanswered(self.apart)}"
+            return f"This container has found no other one: {_unanswered(self.apart)}"
         return "No services are registered in this system. Is the provider running with the same TRADE_SYSTEM?"
 
 

@@ -122,7 +122,7 @@ class BusCycle(ABC, Generic[_Device]):
         self.period_ns = int(1e9 / bus.rate_hz)
         self.watchdog_ns = int(bus.watchdog_s * 1e9)
         self.refusing: Callable[[Device], TradeError] | None = None
-        """Returns the error with which new work is refused at present."""
+        """Makes the error with which new work is refused at present; None while it is accepted."""
         self.missed_answers = 0
         """Number since the start."""
         self._devices = tuple(devices)
@@ -157,7 +157,7 @@ class BusCycle(ABC, Generic[_Device]):
 
     @property
     def devices(self) -> tuple[_Device, ...]:
-        """Returns the devices on this bus."""
+        """The devices on this bus."""
         return self._devices
 
     # --- from any thread

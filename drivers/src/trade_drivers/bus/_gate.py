@@ -79,7 +79,7 @@ class Command(Work[DeviceT_co], Generic[DeviceT_co, _Cycle_co]):
 
     @property
     def exchange(self) -> _Cycle_co:
-        """Returns the exchange of its bus."""
+        """The exchange of its bus."""
         return self._exchange
 
     def gate(self) -> None:

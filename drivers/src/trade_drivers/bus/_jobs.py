@@ -108,7 +108,7 @@ class Work(Generic[DeviceT_co]):
 
     @property
     def ended(self) -> bool:
-        """Returns whether the outcome is known."""
+        """Whether the outcome is known."""
         return self._ended.is_set()
 
     def gate(self) -> None:

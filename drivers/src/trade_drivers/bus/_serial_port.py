@@ -50,7 +50,7 @@ class SerialLine:
 
     @property
     def is_open(self) -> bool:
-        """Returns whether the port is open."""
+        """Whether the port is open."""
         return self._port is not None
 
     def open(self) -> None:

@@ -69,7 +69,7 @@ class BusThread(Generic[_Exchange_co]):
 
     @property
     def exchange(self) -> _Exchange_co:
-        """Returns the exchange that the thread runs."""
+        """The exchange that the thread runs."""
         return self._exchange
 
     def start(self) -> None:

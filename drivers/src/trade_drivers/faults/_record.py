@@ -60,7 +60,7 @@ class FaultInfo(Struct, frozen=True, kw_only=True):
 
     @property
     def said(self) -> str:
-        """Returns the kind with the numbers of the latest occurrence."""
+        """The kind with the numbers of the latest occurrence."""
         text = self.text.removeprefix(f"{self.device}: ")
         return text if kind_of(text) == self.kind else self.kind
 

@@ -122,7 +122,7 @@ class Axis(BusDevice[Sample]):
     @property
     @abstractmethod
     def may_hold_torque(self) -> bool:
-        """Returns True if torque is on or unknown."""
+        """True if torque is on or unknown."""
 
     @abstractmethod
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
@@ -140,7 +140,7 @@ class Axis(BusDevice[Sample]):
 
     @property
     def moved_since_held(self) -> bool:
-        """Returns whether a measurement after the last hold command shows motion."""
+        """Whether a measurement after the last hold command shows motion."""
         return not self.silent and not self.still and self.sample is not None and self.sample.at_ns > self.held_ns
 
     def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
@@ -184,6 +184,7 @@ class Axis(BusDevice[Sample]):
         return self.fresh(now_ns, stale_after_ns)
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
+        """Returns the last measurement. Its age alone decides: a joint just found silent has one that is recent."""
         if self.sample is None or self.age_ns(now_ns) > stale_after_ns:
             raise self.deaf(now_ns)
         return self.sample

@@ -75,7 +75,7 @@ class Curve:
 
     @property
     def duration_s(self) -> float:
-        """Returns the duration in seconds."""
+        """The duration in seconds."""
         last = self.pieces[-1]
         return last.begins_s + last.duration_s
 
@@ -117,13 +117,13 @@ class Way(NamedTuple):
 
     @property
     def braking_s(self) -> float:
-        """Returns the time to come to rest; less than a millisecond counts as zero."""
+        """The time to come to rest; less than a millisecond counts as zero."""
         braking_s = abs(self.velocity_rad_s) / self.accel_rad_s2
         return braking_s if braking_s > _SHORT_S else 0.0
 
     @property
     def rest_rad(self) -> float:
-        """Returns the angle where the joint comes to rest."""
+        """The angle where the joint comes to rest."""
         return self.start_rad + self.velocity_rad_s * self.braking_s / 2
 
 

@@ -80,7 +80,7 @@ class CanBus(Bus, frozen=True, kw_only=True):
 
     @property
     def port(self) -> str:
-        """Returns interface and channel as one text, such as ``socketcan:can0``."""
+        """Interface and channel as one text, such as ``socketcan:can0``."""
         return f"{self.interface}:{self.channel}"
 
 
@@ -94,7 +94,7 @@ class UrBus(Bus, frozen=True, kw_only=True):
 
     @property
     def port(self) -> str:
-        """Returns the host."""
+        """The host."""
         return self.host
 
 

@@ -42,7 +42,7 @@ class FakeJointGroup(JointGroup):
 
     @property
     def resources(self) -> tuple[Resource, ...]:
-        """Returns the resources of the joints."""
+        """The resources of the joints."""
         return self._resources
 
     def joints(self) -> list[str]:

@@ -212,7 +212,7 @@ class Plan(NamedTuple):
 
     @property
     def unnamed(self) -> str:
-        """Returns the problem of a policy that does not name the gateway, or an empty text.
+        """The problem of a policy that does not name the gateway, or an empty text.
 
         Raises:
             ConfigurationError: the policy has an error.

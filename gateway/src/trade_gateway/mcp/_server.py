@@ -19,7 +19,6 @@ from mcp.shared.message import SessionMessage
 from trade import Container
 from trade_gateway.clients import ClientApi
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.clients._problems import problem_of
 from trade_gateway.language import Lexicon
 from trade_gateway.mcp._approvals import Approvals
 from trade_gateway.mcp._simulation_twin import Twin
@@ -104,8 +103,7 @@ def _server_of(tools: Tools) -> "Server[Any, Any]":
             try:
                 return _content(await tools.use(name, arguments, progress))
             except Exception as error:
-                problem = problem_of(error)
-                raise RuntimeError(f"{problem.title}: {problem.detail}") from error
+                raise RuntimeError(f"{type(error).__name__}: {error}") from error
 
     server.list_tools()(listed)
     server.call_tool(validate_input=False)(used)

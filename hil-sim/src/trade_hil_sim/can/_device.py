@@ -126,6 +126,8 @@ class JointDevice(JointModel):
 
     def do(self, command: faults.Command, t: float) -> None:
         """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
+        if isinstance(command, faults.Absent):  # the bus disconnects its station
+            raise self._refusal(command)
         super().do(command, t)
         self._plan(t)
 

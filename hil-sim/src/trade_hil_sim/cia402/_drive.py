@@ -117,7 +117,7 @@ class Drive(JointDevice):
         self._plan(t)
 
     def _plan(self, t: float) -> None:
-        """Publish changes, and return when to be called next."""
+        """Publish changes, and set when it is due next."""
         self._note_motion(t)
         self._show(t)
         self.node.changed(t)

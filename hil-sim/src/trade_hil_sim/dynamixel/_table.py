@@ -97,7 +97,7 @@ class Model(registers.Model[Register]):
 
     @property
     def full_effort_counts(self) -> int:
-        """The register at address 126 in its full form."""
+        """The value of the register at address 126 at full effort."""
         return self.by_name["current_limit"].default if "current_limit" in self.by_name else FULL_LOAD
 
     @property

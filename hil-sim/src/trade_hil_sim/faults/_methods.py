@@ -44,7 +44,9 @@ def _generated(
 
     @wraps(declared)
     def method(self: "FaultMethods", /, *args: _P.args, **kwargs: _P.kwargs) -> None:
-        given = signature.bind(self, *args, **kwargs).arguments
+        bound = signature.bind(self, *args, **kwargs)
+        bound.apply_defaults()
+        given = bound.arguments
         del given["self"]
         if given.get("ids") is not None:
             given["ids"] = tuple(given["ids"])

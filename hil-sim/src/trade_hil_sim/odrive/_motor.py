@@ -46,7 +46,7 @@ class Motor:
         self._velocity = self._torque = 0.0
 
     def amperes(self, t: float) -> float:
-        """The torque for this acceleration, or against a jam."""
+        """The current for this acceleration, or against a jam."""
         if self.shaft.jammed and self.shaft.parted:
             return copysign(QUICK * AMPERES, self.shaft.behind(t))
         return self.shaft.actual.at(t)[2] * AMPERES

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
@@ -100,8 +101,7 @@ class Mailbox:
         """Let the thread make a call, and wait for its result; not to be called in the thread itself.
 
         Raises:
-            SimulationError: the thread no longer listens.
-            TimeoutError: the thread is busy.
+            SimulationError: the thread is busy, or no longer listens.
         """
         done: Future[_T] = Future()
 
@@ -116,7 +116,10 @@ class Mailbox:
                 raise self._closed()
             self._asked.append((carry_out, done.set_exception))
             self._ring()
-        return done.result(self._answer_s)
+        try:
+            return done.result(self._answer_s)
+        except FutureTimeout:
+            raise SimulationError(f"{self._who} is busy") from None
 
     def ring(self) -> None:
         """Wake the thread."""

@@ -44,7 +44,7 @@ class Register(ABC):
 
     @abstractmethod
     def encode(self, value: int) -> bytes:
-        """Its bytes; surplus bits are cut off."""
+        """Its bytes. A value that is too large is cut off or limited, as the device does."""
 
 
 _Register = TypeVar("_Register", bound=Register)

@@ -4,7 +4,7 @@ import functools
 import itertools
 import secrets
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Concatenate, Final, Literal, ParamSpec, TypeVar
 
@@ -57,6 +57,19 @@ def delegated(part: str, method: Callable[Concatenate[Any, _P], _R]) -> "Callabl
     def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         self._check_open()
         return method(getattr(self, part), *args, **kwargs)
+
+    return call
+
+
+def adelegated(
+    part: str, method: Callable[Concatenate[Any, _P], Coroutine[Any, Any, _R]]
+) -> "Callable[Concatenate[Container, _P], Coroutine[Any, Any, _R]]":
+    """The same of a coroutine function."""
+
+    @functools.wraps(method)
+    async def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        self._check_open()
+        return await method(getattr(self, part), *args, **kwargs)
 
     return call
 
@@ -144,9 +157,9 @@ class Container:
     call = delegated("_lookup", Lookup.call)
     call_all = delegated("_lookup", Lookup.call_all)
     call_sequence = delegated("_lookup", Lookup.call_sequence)
-    acall = delegated("_lookup", Lookup.acall)
-    acall_all = delegated("_lookup", Lookup.acall_all)
-    acall_sequence = delegated("_lookup", Lookup.acall_sequence)
+    acall = adelegated("_lookup", Lookup.acall)
+    acall_all = adelegated("_lookup", Lookup.acall_all)
+    acall_sequence = adelegated("_lookup", Lookup.acall_sequence)
 
     # --- locks and stops
 

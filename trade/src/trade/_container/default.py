@@ -3,8 +3,8 @@
 import functools
 import inspect
 import threading
-from collections.abc import Callable
-from typing import Concatenate, ParamSpec, TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from trade._container.container import Container
 from trade._settings import Settings
@@ -58,6 +58,22 @@ def of_default(method: Callable[Concatenate[Container, _P], _R]) -> Callable[_P,
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         return method(container(), *args, **kwargs)
 
+    return _presented(call, method)
+
+
+def aof_default(
+    method: Callable[Concatenate[Container, _P], Coroutine[Any, Any, _R]],
+) -> Callable[_P, Coroutine[Any, Any, _R]]:
+    """The same of a coroutine function."""
+
+    async def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        return await method(container(), *args, **kwargs)
+
+    return _presented(call, method)
+
+
+def _presented(call: Callable[_P, _R], method: Callable[..., object]) -> Callable[_P, _R]:
+    """Gives a function of ``trade`` the name, signature and docstring of a method."""
     functools.update_wrapper(call, method)
     own = inspect.signature(method)
     call.__signature__ = own.replace(parameters=list(own.parameters.values())[1:])

@@ -200,7 +200,9 @@ class Links:
         try:
             return open_session(settings)
         except zenoh.ZError as bad:
-            raise ConfigurationError(where="links of the container", problem=f"cannot be opened: {bad}") from None
+            raise ConfigurationError(
+                where="the extra session for discovery and joining", problem=f"cannot be opened: {bad}"
+            ) from None
 
     def _scouting(self) -> dict[str, Any]:
         return {

@@ -31,7 +31,7 @@ class ErrorState(IntEnum):
 
     @property
     def word(self) -> ErrorWord:
-        """Returns the name in ISO 11898-1."""
+        """The name in ISO 11898-1."""
         return _WORDS[self]
 
 

@@ -27,7 +27,7 @@ class Talk:
 
     @property
     def canopen(self) -> frozenset[int]:
-        """Returns the CANopen nodes that send heartbeats."""
+        """The CANopen nodes that send heartbeats."""
         return frozenset(
             can_id & _NODE
             for can_id, frames in self.frames.items()
@@ -36,7 +36,7 @@ class Talk:
 
     @property
     def odrives(self) -> dict[int, bytes]:
-        """Returns the nodes of ODrives with the last heartbeat of each.
+        """The nodes of ODrives with the last heartbeat of each.
 
         Measurements of a CANopen node may have the same identifier and form. If that node has sent a heartbeat, the
         frames are attributed to it.

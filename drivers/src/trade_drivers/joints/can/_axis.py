@@ -54,7 +54,7 @@ class MotorAxis(Axis):
     @property
     @abstractmethod
     def torque(self) -> bool | None:
-        """Returns whether torque is on; None if unknown."""
+        """Whether torque is on; None if unknown."""
 
     @property
     def may_hold_torque(self) -> bool:

@@ -100,7 +100,7 @@ class MotorExchange(Exchange[_Axis]):
         self.net.take_in(0.0)  # a late frame must not answer the next request
         self.measure(began_ns)
         self._listen(began_ns)
-        self.settle(began_ns)
+        self.after_measuring(began_ns)
         self.admit()
         self.work(began_ns + self.period_ns // 2)
         self.watch()
@@ -128,8 +128,11 @@ class MotorExchange(Exchange[_Axis]):
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns
 
-    def settle(self, now_ns: int) -> None:
-        """Makes motors hold that were moving when they were accepted, since no client owns that motion."""
+    def after_measuring(self, now_ns: int) -> None:
+        """Makes motors hold that were moving when they were accepted, since no client owns that motion.
+
+        An exchange that detects such motion elsewhere may do other work here, once per cycle.
+        """
         for axis in self.devices:
             if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
                 axis.stranger = False

@@ -110,12 +110,12 @@ class ServoAxis(Axis, Generic[_Health]):
 
     @property
     def in_doubt(self) -> bool:
-        """Returns whether its torque is unread since a missed exchange."""
+        """Whether its torque is unread since a missed exchange."""
         return self.doubted or self.silent
 
     @property
     def may_hold_torque(self) -> bool:
-        """Returns True if torque is on or unknown."""
+        """True if torque is on or unknown."""
         return self.health is None or self.health.torque
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:

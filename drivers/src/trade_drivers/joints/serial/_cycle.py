@@ -54,7 +54,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
 
     @property
     def wire(self) -> _Wire_co:
-        """Returns the line, for the bus thread only."""
+        """The line, for the bus thread only."""
         return self._wire
 
     # --- parts that differ between vendors

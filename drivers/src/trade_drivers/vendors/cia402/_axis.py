@@ -165,24 +165,24 @@ class DriveAxis(MotorAxis):
 
     @property
     def unheard(self) -> str:
-        """Returns the frame that it has not sent since set-up."""
+        """The frame that it has not sent since set-up."""
         if self.beat_ns <= self.set_up_ns:
             return "no heartbeat (1017h)"
         return "" if self.answered_ns > self.set_up_ns else "no TPDO1 (1800h) after a SYNC"
 
     @property
     def acknowledged(self) -> bool:
-        """Returns whether it acknowledges a set-point."""
+        """Whether it acknowledges a set-point."""
         return bool(self.statusword & machine.ACKNOWLEDGED)
 
     @property
     def can_take_goal(self) -> bool:
-        """Returns whether the handshake of the last set-point is over."""
+        """Whether the handshake of the last set-point is over."""
         return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
 
     @property
     def turning_mode(self) -> int:
-        """Returns the mode for velocities; profile position, with the end of the range as goal, if there is none."""
+        """The mode for velocities; profile position, with the end of the range as goal, if there is none."""
         for mode in (table.CYCLIC_VELOCITY, table.PROFILE_VELOCITY_MODE):
             if mode in self.modes:
                 return mode

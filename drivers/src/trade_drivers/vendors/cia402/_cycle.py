@@ -49,7 +49,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self._synced_ns = clock()
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         self.rival = False
-        """Detects another driver by its heartbeats."""
+        """True if the heartbeats of another driver were received."""
         self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
         for axis in axes:
             self._listen_to(axis)
@@ -222,7 +222,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.asked_ns for axis in asked))
 
-    def settle(self, now_ns: int) -> None:  # noqa: ARG002 - the same at any time
+    def after_measuring(self, now_ns: int) -> None:  # noqa: ARG002 - the same at any time
         """Lowers the bit of an acknowledged set-point, so that the next one has an edge."""
         for axis in self.devices:
             if axis.raised_ns and axis.acknowledged and axis.state_now is State.ENABLED:

@@ -20,7 +20,7 @@ class State(Enum):
 
     @property
     def torque(self) -> bool:
-        """Returns whether torque is on: the motor holds, moves or brakes."""
+        """Whether torque is on: the motor holds, moves or brakes."""
         return self in {State.ENABLED, State.QUICK_STOP, State.FAULT_REACTION}
 
 

@@ -68,7 +68,7 @@ class Net:
         self._listeners = listeners
         self._port = listeners.port
         self._answers: dict[int, deque[bytes]] = {}
-        """Handles a frame of a node's SDO server."""
+        """The received frames of each node's SDO server."""
 
     def command(self, node: int, word: int) -> None:
         """Sends a network management command, such as start; it has no confirmation."""

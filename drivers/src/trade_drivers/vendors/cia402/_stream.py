@@ -23,7 +23,7 @@ class Following(Ramp):
 
     @property
     def target(self) -> int:
-        """Returns the last set-point."""
+        """The last set-point."""
         return round(self.position)
 
 

@@ -15,7 +15,7 @@ from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Sta
 __all__ = ["COUNTS_PER_RAD", "DamiaoAxis"]
 
 COUNTS_PER_RAD: Final = (1 << 16) / tau
-"""Counts per turn of the motor's shaft in this driver; frames contain radians."""
+"""Counts per radian of the motor's shaft in this driver; frames contain radians."""
 _STILL_RAD_S: Final = 0.01
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
@@ -99,12 +99,12 @@ class DamiaoAxis(MotorAxis):
 
     @property
     def failed(self) -> bool:
-        """Returns whether it reports an error, and so has switched its torque off."""
+        """Whether it reports an error, and so has switched its torque off."""
         return self.status not in {None, Status.DISABLED, Status.ENABLED}
 
     @property
     def complaint(self) -> str:
-        """Returns the reported error."""
+        """The reported error."""
         known = {status.value: status.name.lower().replace("_", " ") for status in Status}
         return f"status {self.status:X}h: {known.get(self.status or 0, 'unknown')}"
 

@@ -49,7 +49,7 @@ class Register(IntEnum):
 
     @property
     def is_float(self) -> bool:
-        """Returns whether the register is a float; otherwise it is an integer."""
+        """Whether the register is a float; otherwise it is an integer."""
         return self in {Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX}
 
 

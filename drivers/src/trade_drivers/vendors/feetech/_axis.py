@@ -70,7 +70,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         super().__init__(name, bus, joint, GRAIN, coupled, model_number=number, full_effort_counts=table.FULL_LOAD)
         self._lead_s = lead_s
         self.unload = 0
-        """Returns the error bits for which the servo is set to switch its torque off."""
+        """The error bits for which the servo is set to switch its torque off."""
         self.aim: Goal | None = None
         self.sent, self.sent_ns = 0, 0
         self._at_rest_ns = int((lead_s + joint.max_speed_rad_s / joint.max_accel_rad_s2) * 1e9)

@@ -126,12 +126,12 @@ class OdriveAxis(MotorAxis):
 
     @property
     def armed(self) -> bool:
-        """Returns whether it follows its inputs."""
+        """Whether it follows its inputs."""
         return self.state_now == State.CLOSED_LOOP
 
     @property
     def refusal(self) -> str:
-        """Returns why it does not arm."""
+        """Why it does not arm."""
         if self.errors:
             return self.errors.text
         known = {result.value: result.name.lower().replace("_", " ") for result in Result}

@@ -136,7 +136,7 @@ class Errors(IntFlag):
 
     @property
     def text(self) -> str:
-        """Returns the names of the bits; unknown bits as numbers."""
+        """The names of the bits; unknown bits as numbers."""
         known = [flag for flag in Errors if flag & self]
         rest = int(self) & ~sum(known)
         names = [flag.name.lower().replace("_", " ") for flag in known if flag.name]

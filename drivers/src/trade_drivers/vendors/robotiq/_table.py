@@ -120,7 +120,7 @@ class Status(Struct, frozen=True, gc=False):
     reset: bool
     """True if it is neither activated nor activating."""
     plausible: bool
-    """Returns False for values that a 2F-85 never sends."""
+    """False for values that a 2F-85 never sends."""
     at_ns: int
 
     @classmethod
@@ -145,7 +145,7 @@ class Status(Struct, frozen=True, gc=False):
 
     @property
     def under_way(self) -> bool:
-        """Returns whether it reports motion."""
+        """Whether it reports motion."""
         return self.activating or (self.activated and self.going and self.contact == Contact.MOVING)
 
 

@@ -79,22 +79,22 @@ class ArmStatus(BusDevice[Sample]):
 
     @property
     def safety(self) -> Safety:
-        """Returns the state of its safety system."""
+        """The state of its safety system."""
         return "fault" if self.sample is None else _SAFETY.get(self.sample.safety_mode, "fault")
 
     @property
     def enabled(self) -> bool:
-        """Returns whether its brakes are released."""
+        """Whether its brakes are released."""
         return self.sample is not None and self.sample.robot_mode == RUNNING
 
     @property
     def powered(self) -> bool:
-        """Returns whether it has power."""
+        """Whether it has power."""
         return self.sample is not None and bool(self.sample.robot_status & _POWERED)
 
     @property
     def fault(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride] - nothing latches it
-        """Returns why it cannot be moved; empty if it can."""
+        """Why it cannot be moved; empty if it can."""
         if self.safety not in {"normal", "reduced"}:
             return f"its safety system says: {self.safety}"
         if not self.powered:
@@ -103,7 +103,7 @@ class ArmStatus(BusDevice[Sample]):
 
     @property
     def remedy(self) -> str:
-        """Returns the remedy for the fault."""
+        """The remedy for the fault."""
         if self.safety == "protective stop":
             return "remove the cause, then call unlock_protective_stop()"
         if self.safety not in {"normal", "reduced"}:

@@ -46,7 +46,7 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Returns the process id."""
+        """The process id."""
         return self._process.pid
 
     def number(self) -> int:
