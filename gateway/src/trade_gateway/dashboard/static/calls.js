@@ -27,7 +27,7 @@ export function readCalls() {
 export function showCalls() {
   for (const button of [$("note-calls"), $("note-no-calls")]) button.disabled = !(door.me?.instruments && door.connected);
   if (!door.me?.reads) {
-    table($("call-list"), "", [], [], "They are for who may read the system (group trade).");
+    table($("call-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
   const wanted = $("call-search").value.toLowerCase();

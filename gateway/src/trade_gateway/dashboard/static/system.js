@@ -31,7 +31,7 @@ export async function lookAtContainers() {
 
 export async function lookAtWatchers() {
   if (!door.me.reads) {
-    table($("watcher-list"), "", [], [], "They are for who may read the system (group trade).");
+    table($("watcher-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
   const [standing, hooks] = await Promise.all([door.get("/notifications"), door.get("/hooks")]);
