@@ -69,7 +69,7 @@ def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     if reason := why_not():
         pytest.skip(reason)
     demo = run(DEMO)
-    story = told(demo, "agrees with what the devices did")
+    story = told(demo, "confirms every line above")
     assert demo.wait() == 0, demo.errors
     assert "The networks are network namespaces" in story
     assert "has the legs, for 'walk'" in story
@@ -85,7 +85,7 @@ def test_rosie_walks_through_gateways_on_loopback_addresses_and_all_of_it_is_rec
 ) -> None:
     file = tmp_path / "demo.mcap"
     demo = run(DEMO, "--loopback", "--record", file)
-    story = told(demo, "agrees with what the devices did")
+    story = told(demo, "confirms every line above")
     assert demo.wait() == 0, demo.errors
     assert "loopback addresses of this host, as you said --loopback" in story
     assert "has the legs, for 'walk'" in story
