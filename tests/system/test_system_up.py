@@ -156,7 +156,11 @@ def test_what_is_in_use_is_not_ended_unless_by_force(home: Deployment) -> None:
     [
         ('host = "robot"', 'host = "nobody.invalid"', "unknown host"),
         (str(TRADE), "/nowhere/trade", "no trade there"),
-        ('providers = [{ class = "sight:Eye", groups = ["rosie.eyes"] }]', 'rules = "no.toml"', "robot has no readable no.toml"),
+        (
+            'providers = [{ class = "sight:Eye", groups = ["rosie.eyes"] }]',
+            'rules = "no.toml"',
+            "robot has no readable no.toml",
+        ),
     ],
 )
 def test_a_host_that_lacks_something_is_told_before_anything_starts(
