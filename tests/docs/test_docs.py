@@ -52,6 +52,24 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if ROOT / "docs" in page.parents and page.parent.name != "decisions"],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_each_page_names_its_reader_and_what_they_can_do_after_it(page: Path) -> None:
+    title, reader, *_ = page.read_text(encoding="utf-8").split("\n\n")
+    assert title.startswith("# ")
+    assert re.fullmatch(r"For .*\.\s(It takes \d+ minutes\.\s)?After reading, you (can|know) .*\.", reader, re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_cells_of_tables_are_short(page: Path) -> None:
+    prose = re.sub(r"\]\([^)]*\)", "]", page.read_text(encoding="utf-8"))
+    rows = [line for line in prose.splitlines() if line.startswith("|")]
+    assert not [cell for row in rows for cell in row.split("|") if len(cell.strip()) > 200]
+
+
 def test_tests_named_in_the_pages_exist() -> None:
     tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     tests += "\n".join(
