@@ -1,6 +1,8 @@
-"""What ``trade --help`` promises: each command has an example, and shells can complete its words."""
+"""What ``trade --help`` promises: summaries, examples and panels of commands, and completion by shells."""
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -8,27 +10,69 @@ from typing import Any
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from trade_gateway.cli import build
 
+_WIDTH = 80
+_MOST_UNGROUPED = 5
+"""The most options of a command that need no panel."""
+_THEN = re.compile(r", and (?:then|later) ")
 
-def _leaves(command: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Commands that do something themselves."""
+
+def _tree(command: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yields a command and all its subcommands with their full names."""
+    yield name, command
     for word, inner in getattr(command, "commands", {}).items():
-        yield from _leaves(inner, f"{name} {word}")
-    if not getattr(command, "commands", {}) or command.invoke_without_command:
-        yield name, command
+        yield from _tree(inner, f"{name} {word}")
 
 
-COMMANDS = dict(_leaves(typer.main.get_command(build()), "trade"))
-COMMANDS.pop("trade", None)
+ROOT = typer.main.get_command(build())
+COMMANDS = dict(_tree(ROOT, "trade"))
+
+
+def _parse(words: list[str]) -> None:
+    """Parses a command line without running it. Raises UsageError of click for unknown commands and options."""
+    command: Any = ROOT
+    context = command.make_context("trade", words)
+    while getattr(command, "commands", {}) and (rest := [*context._protected_args, *context.args]):
+        name, command, rest = command.resolve_command(context, rest)
+        context = command.make_context(name, rest, parent=context)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_each_command_has_an_example_of_itself(name: str) -> None:
+def test_the_summary_of_each_command_is_one_sentence_in_one_line(name: str) -> None:
+    summary = (COMMANDS[name].help or "").partition("\n\n")[0]
+    assert 0 < len(summary) <= _WIDTH
+    assert "\n" not in summary
+    assert summary.endswith(".")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_an_example_of_itself_that_parses(name: str) -> None:
     _, found, example = (COMMANDS[name].help or "").partition("For example: ")
     assert found, f"the docstring of {name} has no line 'For example: {name} ...'"
     assert " ".join(name.split()[:2]) in example
+    steps = [step.removeprefix("sudo ").partition(" > ")[0] for step in _THEN.split(example.strip().partition("\n")[0])]
+    lines = [shlex.split(step) for step in steps if step.startswith("trade ")]
+    assert lines
+    for line in lines:
+        _parse(line[1:])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_more_than_five_options_are_grouped_in_panels(name: str) -> None:
+    options = [one for one in COMMANDS[name].params if one.param_type_name == "option" and not one.hidden]
+    ungrouped = [one.opts[0] for one in options if one.rich_help_panel is None]
+    assert len(ungrouped) <= _MOST_UNGROUPED, f"{name}: give some of {ungrouped} a rich_help_panel"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_each_command_fits_a_narrow_terminal(name: str) -> None:
+    shown = CliRunner().invoke(build(), [*name.split()[1:], "--help"], env={"COLUMNS": str(_WIDTH)})
+    assert shown.exit_code == 0
+    assert "For example: trade" in shown.output.replace("sudo ", "")
+    assert [line for line in shown.output.splitlines() if len(line) > _WIDTH] == []
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def build(only: str | None = None) -> typer.Typer:
         name="trade",
         no_args_is_help=True,
         rich_markup_mode="rich",
-        help="Start robots, show their services and call them.",
+        help="Start robots, show their services and call them.\n\nFor example: trade up examples/rosie.toml --sim",
         epilog="Without hardware: run trade up examples/rosie.toml --sim, and trade services in another terminal.",
         context_settings={"help_option_names": ["-h", "--help"]},
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, Final, Protocol, TypeVar
 
 import typer
 from typer.core import TyperGroup
@@ -10,7 +10,13 @@ from typer.core import TyperGroup
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+SELECT: Final = "What to select"
+CONNECTION: Final = "Connection"
+SECURITY: Final = "Security"
+TIMING: Final = "Timing"
+OUTPUT: Final = "Output"
+
+Json = Annotated[bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print JSON.")]
 Groups = Annotated[
     list[str] | None, typer.Option("--group", help="Select this group and the groups beneath it. Repeatable.")
 ]

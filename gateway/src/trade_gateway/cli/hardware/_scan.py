@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError
 from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import CONNECTION, OUTPUT, SELECT, Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.hardware._robot_file_template import first_file
 
@@ -27,10 +27,15 @@ _CAN_KIND: Final = "280"
 """ARPHRD_CAN of linux/if_arp.h."""
 _COLUMNS: Final = ("PORT", "BAUD", "ID", "MODEL", "FIRMWARE", "DRIVER", "PROBLEM")
 
-Port = Annotated[str, typer.Option(help="Serial port of the device.")]
-DriverName = Annotated[str | None, typer.Option("--driver", help="Consider only devices of this driver.")]
-Baud = Annotated[int | None, typer.Option(help="Current rate of the device, in baud; by default searched for.")]
-Model = Annotated[str | None, typer.Option(help="Refuse if the device is of another model.")]
+Port = Annotated[str, typer.Option(rich_help_panel=CONNECTION, help="Serial port of the device.")]
+DriverName = Annotated[
+    str | None, typer.Option("--driver", rich_help_panel=SELECT, help="Consider only devices of this driver.")
+]
+Baud = Annotated[
+    int | None,
+    typer.Option(rich_help_panel=CONNECTION, help="Current rate of the device, in baud; by default searched for."),
+]
+Model = Annotated[str | None, typer.Option(rich_help_panel=SELECT, help="Refuse if the device is of another model.")]
 
 
 class Here(Found, frozen=True, kw_only=True):
@@ -42,13 +47,22 @@ class Here(Found, frozen=True, kw_only=True):
 def scan(
     port: Annotated[
         list[str] | None,
-        typer.Option(help="Serial port, or socketcan:can0. Repeatable. Default: list the ports."),
+        typer.Option(
+            rich_help_panel=CONNECTION, help="Serial port, or socketcan:can0. Repeatable. Default: list the ports."
+        ),
     ] = None,
-    host: Annotated[list[str] | None, typer.Option(help="Host of an arm's controller. Repeatable.")] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="Host of an arm's controller. Repeatable.")
+    ] = None,
     driver: DriverName = None,
-    bauds: Annotated[str | None, typer.Option(help="Rates to try, in baud: 57600,1000000. Default: all.")] = None,
-    ids: Annotated[str | None, typer.Option(help="Ids to ask: 1-20,100. Default: all.")] = None,
-    write: Annotated[Path | None, typer.Option(metavar="ROBOT.toml", help="Write a template of a robot file.")] = None,
+    bauds: Annotated[
+        str | None, typer.Option(rich_help_panel=SELECT, help="Rates to try, in baud: 57600,1000000. Default: all.")
+    ] = None,
+    ids: Annotated[str | None, typer.Option(rich_help_panel=SELECT, help="Ids to ask: 1-20,100. Default: all.")] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option(metavar="ROBOT.toml", rich_help_panel=OUTPUT, help="Write a template of a robot file."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Find devices on a serial line or a CAN bus: ids, models, rates.
@@ -89,7 +103,7 @@ def scan(
 
 def set_id(
     port: Port,
-    old: Annotated[int, typer.Option("--from", help="Current id of the device.")],
+    old: Annotated[int, typer.Option("--from", rich_help_panel=SELECT, help="Current id of the device.")],
     new: Annotated[int, typer.Option("--to", help="New id of the device.")],
     baud: Baud = None,
     driver: DriverName = None,
@@ -111,7 +125,7 @@ def set_id(
 
 def set_baud(
     port: Port,
-    device_id: Annotated[int, typer.Option("--id", help="Id of the device.")],
+    device_id: Annotated[int, typer.Option("--id", rich_help_panel=SELECT, help="Id of the device.")],
     to: Annotated[int, typer.Option(help="New rate, in baud.")],
     baud: Baud = None,
     driver: DriverName = None,

@@ -16,6 +16,7 @@ from typer.core import TyperCommand
 from trade import Constraint
 from trade.errors import LockLost
 from trade_gateway._usage import UsageError, asked_for
+from trade_gateway.cli._options import SELECT, TIMING
 from trade_gateway.cli._system_choice import SystemChoice, choice_of, visitor_among_others
 
 _COMMAND: Final = "trade_gateway.command"
@@ -45,18 +46,29 @@ def lock(
     context: typer.Context,
     group: Annotated[str | None, typer.Argument(help="Group to lock, with the groups beneath it: rosie.head.")] = None,
     name: Annotated[
-        list[str] | None, typer.Option(help="Lock only services of this name; * and ? are wildcards. Repeatable.")
+        list[str] | None,
+        typer.Option(
+            rich_help_panel=SELECT, help="Lock only services of this name; * and ? are wildcards. Repeatable."
+        ),
     ] = None,
     purpose: Annotated[str | None, typer.Option(help="Purpose, shown to other clients. Default: the command.")] = None,
     wait: Annotated[
         float,
-        typer.Option(min=0.0, help="Time to wait for owners and missing services, in seconds."),
+        typer.Option(min=0.0, rich_help_panel=TIMING, help="Time to wait for owners and missing services, in seconds."),
     ] = 10.0,
     lease: Annotated[
-        float, typer.Option(min=0.1, max=60.0, help="Time that the lock survives if this command dies, in seconds.")
+        float,
+        typer.Option(
+            min=0.1,
+            max=60.0,
+            rich_help_panel=TIMING,
+            help="Time that the lock survives if this command dies, in seconds.",
+        ),
     ] = 2.0,
     priority: Annotated[int, typer.Option(help="Priority while waiting; the highest comes first.")] = 0,
-    partial: Annotated[bool, typer.Option("--partial", help="Lock even if members of the group are missing.")] = False,
+    partial: Annotated[
+        bool, typer.Option("--partial", rich_help_panel=SELECT, help="Lock even if members of the group are missing.")
+    ] = False,
 ) -> None:
     """Run a command under a lock on these services; end with its exit code.
 

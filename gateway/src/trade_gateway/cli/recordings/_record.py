@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Groups, Json, Readers
+from trade_gateway.cli._options import TIMING, Groups, Json, Readers
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._signals import leaving
@@ -33,7 +33,8 @@ def record(
         float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Rate of --services samples, in Hz.")
     ] = 10.0,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Duration, in seconds; by default until Ctrl-C.")
+        float | None,
+        typer.Option(min=0.1, rich_help_panel=TIMING, help="Duration, in seconds; by default until Ctrl-C."),
     ] = None,
     attach: Annotated[
         list[Path] | None, typer.Option(help="File to embed in the recording: rosie.toml. Repeatable.")

@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from trade import where
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import SELECT, TIMING, Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 from trade_gateway.recording import require
@@ -18,9 +18,14 @@ _WAIT_S: Final = 10.0
 def replay(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A recording.")],
-    group: Annotated[str | None, typer.Option(help="Group to move, if the recording has several.")] = None,
+    group: Annotated[
+        str | None, typer.Option(rich_help_panel=SELECT, help="Group to move, if the recording has several.")
+    ] = None,
     speed: Annotated[
-        float, typer.Option(min=0.05, max=2.0, help="Speed factor; 0.5 takes twice as long as the recording.")
+        float,
+        typer.Option(
+            min=0.05, max=2.0, rich_help_panel=TIMING, help="Speed factor; 0.5 takes twice as long as the recording."
+        ),
     ] = 1.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and move nothing.")] = False,
     go_to_start: Annotated[

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import CONNECTION, TIMING, Json
 from trade_gateway.cli._output import Output
 
 if TYPE_CHECKING:
@@ -21,7 +21,8 @@ _DEFAULT: Final = Path("pki")
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Issue, renew and revoke the certificates that prove identities.",
+    help="Issue, renew and revoke the certificates that prove identities.\n\n"
+    "For example: trade pki issue arm --address 192.168.1.5",
 )
 
 Name = Annotated[str, typer.Argument(help="Identity: letters, digits, _ - and .")]
@@ -52,13 +53,18 @@ def issue(
     purpose: Annotated[
         str | None, typer.Option("--for", help="container or gateway. A name's purpose cannot be changed later.")
     ] = None,
-    host: Annotated[list[str] | None, typer.Option(help="Host name in the certificate. Repeatable.")] = None,
-    address: Annotated[list[str] | None, typer.Option(help="IP address in the certificate. Repeatable.")] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="Host name in the certificate. Repeatable.")
+    ] = None,
+    address: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="IP address in the certificate. Repeatable.")
+    ] = None,
     hours: Annotated[
         float | None,
         typer.Option(
             min=0.1,
             max=_LONGEST_HOURS,
+            rich_help_panel=TIMING,
             help="Validity in hours, by default a week. Links cannot be revoked before it ends, so keep it short.",
         ),
     ] = None,

@@ -11,7 +11,10 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 
-app = typer.Typer(no_args_is_help=True, help="Show the rights that an access policy gives.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Show the rights that an access policy gives.\n\nFor example: trade policy show --policy policy.toml",
+)
 
 File = Annotated[Path | None, typer.Option("--policy", envvar="TRADE_POLICY", help="Policy file.")]
 

@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_gateway.cli._options import Json, room_of_extra
+from trade_gateway.cli._options import CONNECTION, SECURITY, Json, room_of_extra
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.cli.robots._detached import ready
@@ -24,24 +24,33 @@ app = typer.Typer(
     "For example: trade door token anna, and then trade door",
 )
 
-TokenFile = Annotated[Path, typer.Option("--tokens", help="File of tokens, which trade door token makes.")]
+TokenFile = Annotated[
+    Path, typer.Option("--tokens", rich_help_panel=SECURITY, help="File of tokens, which trade door token makes.")
+]
 
 
 @app.callback()
 def door(
     context: typer.Context,
-    listen: Annotated[str, typer.Option(help="HOST:PORT to listen on; other hosts need --tls and a policy.")] = (
-        "127.0.0.1:7080"
-    ),
+    listen: Annotated[
+        str,
+        typer.Option(rich_help_panel=CONNECTION, help="HOST:PORT to listen on; other hosts need --tls and a policy."),
+    ] = ("127.0.0.1:7080"),
     tokens: TokenFile = _TOKENS,
     tls: Annotated[
         Path | None,
-        typer.Option(help="Certificate folder of trade pki issue. Also accepts its authority's client certificates."),
+        typer.Option(
+            rich_help_panel=SECURITY,
+            help="Certificate folder of trade pki issue. Also accepts its authority's client certificates.",
+        ),
     ] = None,
     origin: Annotated[
-        list[str] | None, typer.Option(help="Allowed origin of web pages: http://localhost:5173. Repeatable.")
+        list[str] | None,
+        typer.Option(rich_help_panel=SECURITY, help="Allowed origin of web pages: http://localhost:5173. Repeatable."),
     ] = None,
-    host: Annotated[list[str] | None, typer.Option(help="Further host name of this server. Repeatable.")] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="Further host name of this server. Repeatable.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the gateway's container.")] = _NAME,
     as_json: Json = False,
 ) -> None:

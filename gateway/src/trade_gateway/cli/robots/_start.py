@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import CONNECTION, SECURITY, TIMING, Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 
@@ -15,11 +15,20 @@ def start(
     context: typer.Context,
     host: Annotated[str, typer.Argument(metavar="HOST", help="HOST or USER@HOST, as for ssh.")],
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the container.")],
-    allow: Annotated[list[str] | None, typer.Option(help="Classes it may create. Repeatable.")] = None,
-    dial: Annotated[list[str] | None, typer.Option(help="Endpoint to connect to from HOST. Repeatable.")] = None,
-    command: Annotated[str, typer.Option(help="Path of trade on HOST.")] = "trade",
-    ssh_config: Annotated[Path | None, typer.Option(help="Configuration of ssh instead of ~/.ssh/config.")] = None,
-    wait: Annotated[float, typer.Option(min=0.0, max=600.0, help="Time until it must be visible, in seconds.")] = 10.0,
+    allow: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=SECURITY, help="Classes it may create. Repeatable.")
+    ] = None,
+    dial: Annotated[
+        list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="Endpoint to connect to from HOST. Repeatable.")
+    ] = None,
+    command: Annotated[str, typer.Option(rich_help_panel=CONNECTION, help="Path of trade on HOST.")] = "trade",
+    ssh_config: Annotated[
+        Path | None, typer.Option(rich_help_panel=CONNECTION, help="Configuration of ssh instead of ~/.ssh/config.")
+    ] = None,
+    wait: Annotated[
+        float,
+        typer.Option(min=0.0, max=600.0, rich_help_panel=TIMING, help="Time until it must be visible, in seconds."),
+    ] = 10.0,
     as_json: Json = False,
 ) -> None:
     """Start an empty container on another host through ssh.

@@ -16,7 +16,11 @@ from trade_gateway.cli.robots._system_up import Bringing, Report, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
 
-app = typer.Typer(no_args_is_help=True, help="Start, show and end the system of a file, on all its hosts.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Start, show and end the system of a file, on all its hosts.\n\n"
+    "For example: trade system up examples/system.toml --check",
+)
 
 File = Annotated[Path, typer.Argument(metavar="SYSTEM.toml", help="The system file.")]
 SshConfig = Annotated[Path | None, typer.Option(help="Configuration of ssh instead of ~/.ssh/config.")]

@@ -16,7 +16,7 @@ from trade_drivers import AttachedRobot, FaultInfo, FaultLog, Gripper, Motor, at
 from trade_drivers import check as drivers_check
 from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import CONNECTION, SELECT, Json
 from trade_gateway.cli._output import Output, as_commands, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import choice_of
@@ -98,11 +98,17 @@ def up(
     ] = None,
     port: Annotated[
         list[str] | None,
-        typer.Option(metavar="PART=PORT", help="Port instead of the file's: neck=/dev/ttyUSB1. Repeatable."),
+        typer.Option(
+            metavar="PART=PORT",
+            rich_help_panel=CONNECTION,
+            help="Port instead of the file's: neck=/dev/ttyUSB1. Repeatable.",
+        ),
     ] = None,
     leave_out: Annotated[
         list[str] | None,
-        typer.Option("--without", metavar="PART", help="Bus, camera or sensor to leave out. Repeatable."),
+        typer.Option(
+            "--without", metavar="PART", rich_help_panel=SELECT, help="Bus, camera or sensor to leave out. Repeatable."
+        ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the container. Default: the robot's.")] = None,
     check: Annotated[bool, typer.Option("--check", help="Check the file with its drivers, and exit.")] = False,

@@ -9,7 +9,7 @@ import typer
 from trade import Sample
 from trade._timestamps import clock
 from trade_gateway._usage import find
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 
@@ -17,11 +17,22 @@ from trade_gateway.cli._system_choice import visitor
 def stream(
     context: typer.Context,
     service: Annotated[str, typer.Argument(help="Group and name of a read-only service: rosie.head.state.")],
-    hz: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Highest sample rate, in Hz.")] = 10.0,
-    on_change: Annotated[bool, typer.Option("--on-change", help="Print a sample only if it changed.")] = False,
-    count: Annotated[int | None, typer.Option(min=1, help="End after this many samples; by default at Ctrl-C.")] = None,
-    wait: Annotated[float, typer.Option(min=0.0, help="Time to wait for the service to appear, in seconds.")] = 2.0,
-    container: Annotated[str | None, typer.Option(help="Stream the service of this container.")] = None,
+    hz: Annotated[
+        float, typer.Option(min=0.001, max=1000.0, rich_help_panel=TIMING, help="Highest sample rate, in Hz.")
+    ] = 10.0,
+    on_change: Annotated[
+        bool, typer.Option("--on-change", rich_help_panel=OUTPUT, help="Print a sample only if it changed.")
+    ] = False,
+    count: Annotated[
+        int | None,
+        typer.Option(min=1, rich_help_panel=OUTPUT, help="End after this many samples; by default at Ctrl-C."),
+    ] = None,
+    wait: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="Time to wait for the service to appear, in seconds.")
+    ] = 2.0,
+    container: Annotated[
+        str | None, typer.Option(rich_help_panel=SELECT, help="Stream the service of this container.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Print the samples of a service as they arrive.

@@ -34,7 +34,7 @@ Folder = Annotated[
 
 app = typer.Typer(
     cls=FirstByDefault,
-    help="Show and verify the audit record. Default: show.",
+    help="Show and verify the audit record. Default: show.\n\nFor example: trade audit /var/lib/trade/audit --since 1h",
 )
 
 
@@ -131,7 +131,7 @@ def head(folder: Folder, as_json: Json = False) -> None:
 
     Keep them on another host: then `trade audit verify --against` detects changes of any row up to there.
 
-    For example: trade audit head --json > /media/stick/heads
+    For example: trade audit head /var/lib/trade/audit --json > /media/stick/heads
     """
     out = Output(as_json=as_json)
     for path in _records(folder):

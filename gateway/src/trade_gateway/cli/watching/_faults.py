@@ -26,7 +26,7 @@ Id = Annotated[str, typer.Argument(metavar="ID", help="Id of a fault, from trade
 
 app = typer.Typer(
     cls=FirstByDefault,
-    help="List, show and acknowledge faults of devices. Default: list.",
+    help="List, show and acknowledge faults of devices. Default: list.\n\nFor example: trade faults rosie --open",
 )
 
 

@@ -19,7 +19,11 @@ from trade_gateway.process._signals import hangups, leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
 
-app = typer.Typer(no_args_is_help=True, help="Run, test and list the rules by which the system configures itself.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Run, test and list the rules by which the system configures itself.\n\n"
+    "For example: trade rules test examples/rules.toml",
+)
 
 File = Annotated[Path, typer.Argument(metavar="RULES.toml", help="The rules file.")]
 
