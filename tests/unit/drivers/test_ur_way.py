@@ -46,6 +46,6 @@ def test_what_comes_late_is_as_old_as_it_is() -> None:
 def test_clocks_that_differ_a_little_make_nothing_old() -> None:
     age, oldest_ns = Age(), 0
     for k in range(10_000):
-        at_ns, theirs_ns = k * 10_000_000, int(k * 10_000_000 * 0.9998)
-        oldest_ns = max(oldest_ns, at_ns - age.measured_ns(at_ns, theirs_ns))
+        at_ns, stamp_ns = k * 10_000_000, int(k * 10_000_000 * 0.9998)
+        oldest_ns = max(oldest_ns, at_ns - age.measured_ns(at_ns, stamp_ns))
     assert oldest_ns < 10_000

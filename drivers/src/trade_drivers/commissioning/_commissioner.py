@@ -223,7 +223,7 @@ def scan(
     port: str,
     bauds: Sequence[int] = (),
     ids: Collection[int] = (),
-    told: Callable[[int, int], None] = lambda _baud, _found: None,
+    progress: Callable[[int, int], None] = lambda _baud, _found: None,
 ) -> list[Found]:
     """Finds the devices on a line. Writes nothing. Calls back after each rate, with it and the number of devices found.
 
@@ -241,7 +241,7 @@ def scan(
         with commissioner.at(port, baud) as bench:
             here = list(_looking(bench, ids or commissioner.ids, port)) if ids or bench.anybody() else []
         found += here
-        told(baud, len(here))
+        progress(baud, len(here))
     return found
 
 

@@ -18,7 +18,7 @@ __all__ = ["Follow"]
 
 _VALID_NS: Final = 200_000_000
 """The validity of a sent goal, as for a set-point; the trajectory ends if no goal is sent for longer."""
-_FOREVER_NS: Final = 2**63
+_NO_DEADLINE_NS: Final = 2**63
 
 
 class Follow(Motion[AxisT]):
@@ -71,7 +71,7 @@ class Follow(Motion[AxisT]):
         exchange.write_goals(whole, self.gate)
         self._goals = goals
         exchange.take_over(self)
-        self.expires_ns = _FOREVER_NS  # it started in time; its duration is checked separately
+        self.expires_ns = _NO_DEADLINE_NS  # it started in time; its duration is checked separately
         self._sent_ns = now_ns
         self._plan.course.ready(now_ns)
 

@@ -27,7 +27,7 @@ class DamiaoBus(JointBus):
         data = frame.data
         if frame.extended or frame.remote:
             return "", None
-        if frame.can_id == table.EVERYBODY:
+        if frame.can_id == table.BROADCAST:
             return (table.QUESTIONS.get(data[2], ""), data[0]) if len(data) > 3 else ("", None)
         base, motor = frame.can_id & 0x700, frame.can_id & 0xFF
         if base in table.TARGETS:

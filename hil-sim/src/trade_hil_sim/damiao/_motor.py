@@ -114,7 +114,7 @@ class Motor(JointDevice):
         if frame.extended or frame.remote or len(frame.data) < 4:
             return
         base, motor = frame.can_id & 0x700, frame.can_id & 0xFF
-        about = frame.can_id == table.EVERYBODY
+        about = frame.can_id == table.BROADCAST
         if about and frame.data[:2] != bytes((self.device_id, 0)):
             return
         if not about and (motor != self.device_id or base not in {0, *TARGETS}):

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 __all__ = ["MODELS", "Mode", "Ranges", "Register", "Status"]
 
-EVERYBODY: Final = 0x7FF
+BROADCAST: Final = 0x7FF
 POSITION_VELOCITY, VELOCITY, FORCE_POSITION = 0x100, 0x200, 0x300
 MASTER: Final = 0x10
 """Added to a motor's identifier it gives that of its answers, as the vendor's tool sets it."""

@@ -24,7 +24,7 @@ WRITING: Final = frozenset(
         *("teach_on", "freedrive_on"),
     }
 )
-EVERYBODY: Final = 254
+BROADCAST: Final = 254
 
 
 class Span(TypedDict, total=False):
@@ -136,4 +136,4 @@ def _of_kind(
 
 def _concerns(entry: Entry, device_id: int | None) -> bool:
     named: Sequence[int | None] = entry.ids or (entry.device_id,)
-    return device_id is None or device_id in named or (entry.device_id == EVERYBODY and not entry.ids)
+    return device_id is None or device_id in named or (entry.device_id == BROADCAST and not entry.ids)

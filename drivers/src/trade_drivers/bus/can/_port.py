@@ -58,7 +58,7 @@ def split_port(port: str, where: str) -> tuple[str, str]:
     return interface, channel
 
 
-def _nobody(_: Talk) -> Collection[int]:
+def _no_orders(_: Talk) -> Collection[int]:
     """Accepts any traffic."""
     return ()
 
@@ -80,7 +80,7 @@ class CanPort:
         bitrate: int,
         where: str = "bus",
         listen_s: float = 0.0,
-        orders: Callable[[Talk], Collection[int]] = _nobody,
+        orders: Callable[[Talk], Collection[int]] = _no_orders,
     ) -> None:
         self.path = path
         self.state = ErrorState.ACTIVE

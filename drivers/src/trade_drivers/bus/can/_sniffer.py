@@ -41,11 +41,11 @@ class Talk:
         Measurements of a CANopen node may have the same identifier and form. If that node has sent a heartbeat, the
         frames are attributed to it.
         """
-        theirs = self.canopen
+        canopen = self.canopen
         return {
             can_id >> 5: frames[-1]
             for can_id, frames in self.frames.items()
-            if can_id & 0x1F == _BEAT and can_id & _NODE not in theirs and len(frames) > 1 and all(map(_beats, frames))
+            if can_id & 0x1F == _BEAT and can_id & _NODE not in canopen and len(frames) > 1 and all(map(_beats, frames))
         }
 
 

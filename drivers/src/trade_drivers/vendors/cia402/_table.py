@@ -105,9 +105,9 @@ NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
 
 def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
     """Returns identifiers that only a driver sends, for these nodes or those that send heartbeats."""
-    everybody = {NMT, SYNC, HEARTBEAT + OUR_NODE}
+    network_wide = {NMT, SYNC, HEARTBEAT + OUR_NODE}
     bases = (SDO_REQUEST, *(pdo.base for pdo in (COMMAND, PROFILE, BRAKING, FOLLOWING)))
-    return talk.frames.keys() & (everybody | {base + node for base in bases for node in {*nodes, *talk.canopen}})
+    return talk.frames.keys() & (network_wide | {base + node for base in bases for node in {*nodes, *talk.canopen}})
 
 
 class Pdo(Struct, frozen=True):

@@ -50,7 +50,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def refresh(self, axis: DamiaoAxis) -> Frame:
         """Returns a request without a command."""
-        return Frame(frames.EVERYBODY, frames.refresh(axis.id))
+        return Frame(frames.BROADCAST, frames.refresh(axis.id))
 
     def stand(self, axis: DamiaoAxis) -> None:
         """Starts set-points at the measured position."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MODELS", "Feedback", "Ranges", "Register", "Status"]
 
-EVERYBODY: Final = 0x7FF
+BROADCAST: Final = 0x7FF
 """The identifier of register requests; the data contains the motor."""
 POSITION_VELOCITY: Final = 0x100
 """Added to a motor's identifier for frames with a position and a maximum speed."""
@@ -34,7 +34,7 @@ FULL: Final = 1000
 
 def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - identifiers are unique to such drivers
     """Returns the identifiers among the traffic that only a driver of such motors sends."""
-    return talk.frames.keys() & ({EVERYBODY} | {base + motor for base in _MODES for motor in range(1, MASTER)})
+    return talk.frames.keys() & ({BROADCAST} | {base + motor for base in _MODES for motor in range(1, MASTER)})
 
 
 class Register(IntEnum):

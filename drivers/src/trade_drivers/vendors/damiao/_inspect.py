@@ -90,13 +90,13 @@ def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
 def register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register) -> Steps:
     """Requests a register; ``answer`` is then its value."""
     axis.answer, axis.asks = None, number
-    question = Frame(frames.EVERYBODY, frames.read(axis.id, number))
+    question = Frame(frames.BROADCAST, frames.read(axis.id, number))
     yield from asked(bus, axis, [question], lambda: axis.asks is None)
 
 
 def set_register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: int) -> Steps:
     """Writes a register and reads it back."""
     axis.answer, axis.asks = None, number
-    order = Frame(frames.EVERYBODY, frames.write(axis.id, number, value))
+    order = Frame(frames.BROADCAST, frames.write(axis.id, number, value))
     yield from asked(bus, axis, [order], lambda: axis.asks is None)
     yield from register(bus, axis, number)

@@ -72,7 +72,7 @@ class DamiaoBench(CanBench):
         """Returns the identifiers and values of all answers. Raises ``_Silent``."""
 
         def decode(frame: Frame) -> tuple[int, float] | None:
-            value = frames.answer(frame.data, motor, number) if frame.id != frames.EVERYBODY else None
+            value = frames.answer(frame.data, motor, number) if frame.id != frames.BROADCAST else None
             return None if value is None else (frame.id, value)
 
         return self._asked(frames.read(motor, number), decode)
@@ -89,7 +89,7 @@ class DamiaoBench(CanBench):
         """Returns the answers, including a second one if there are two motors. Raises ``_Silent``."""
         answers: list[_Value] = []
         for _ in range(_ATTEMPTS):
-            self._port.send(frames.EVERYBODY, question)
+            self._port.send(frames.BROADCAST, question)
             until = time.monotonic() + _ANSWER_S
             while (left_s := until - time.monotonic()) > 0:
                 frame = self._port.receive(left_s)

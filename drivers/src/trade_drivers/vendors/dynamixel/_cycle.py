@@ -47,15 +47,15 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         self.wire.sync_write(table.GOAL_POSITION.address, data, gate)
 
     def write_holds(self, positions: Mapping[DynamixelAxis, int]) -> None:
-        ours: dict[int, bytes] = {}
+        ready: dict[int, bytes] = {}
         others: dict[int, bytes] = {}
         for axis, position in positions.items():
             if axis.ready:  # brakes at the joint's full acceleration, even in a slow move
-                ours[axis.id] = jobs.goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+                ready[axis.id] = jobs.goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
             else:
                 others[axis.id] = table.GOAL_POSITION.encode(position)
-        if ours:
-            self.wire.sync_write(table.PROFILE_ACCELERATION.address, ours)
+        if ready:
+            self.wire.sync_write(table.PROFILE_ACCELERATION.address, ready)
         if others:
             self.wire.sync_write(table.GOAL_POSITION.address, others)
 

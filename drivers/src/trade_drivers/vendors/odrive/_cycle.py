@@ -80,12 +80,12 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
 
     def write_positions(self, positions: Mapping[OdriveAxis, int], gate: Gate) -> None:
-        told = [
+        commands = [
             Frame(frame_id(axis.id, Command.SET_POSITION), frames.set_position(position / COUNTS_PER_TURN))
             for axis, position in positions.items()
         ]
         gate()
-        self.port.send_all(told)
+        self.port.send_all(commands)
 
     def write_holds(self, positions: Mapping[OdriveAxis, int]) -> None:
         """Sends a trajectory to the measured position at full deceleration, only to axes with torque."""

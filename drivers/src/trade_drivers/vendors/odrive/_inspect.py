@@ -95,11 +95,11 @@ def _check_version(axis: OdriveAxis) -> None:
         return
     if version.line != axis.model.line:
         raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} is of product line {version.line}", ".model")
-    told = ".".join(map(str, version.firmware))
+    firmware = ".".join(map(str, version.firmware))
     if version.firmware[:2] != _FIRMWARE:
-        raise Unfit(f"the firmware of node {axis.id} is {told}; this driver speaks CANSimple of 0.6")
-    if axis.joint.firmware is not None and axis.joint.firmware != told:
-        raise Another("firmware", axis.joint.firmware, told)
+        raise Unfit(f"the firmware of node {axis.id} is {firmware}; this driver speaks CANSimple of 0.6")
+    if axis.joint.firmware is not None and axis.joint.firmware != firmware:
+        raise Another("firmware", axis.joint.firmware, firmware)
     if axis.identity not in {None, version}:
         raise Unfit(f"another ODrive answers as node {axis.id}: {version}, not {axis.identity}")
     axis.identity = version

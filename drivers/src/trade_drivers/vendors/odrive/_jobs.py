@@ -85,7 +85,7 @@ def _try_watchdogs(bus: "OdriveExchange", job: Work[OdriveAxis], axes: Sequence[
             bus.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
         give_up_ns = bus.clock() + bus.watchdog_ns + _SLACK_NS
         for axis in axes:
-            yield from _see_it_let_go(bus, job, axis, give_up_ns)
+            yield from _await_watchdog(bus, job, axis, give_up_ns)
     except TradeError:
         for axis in axes:
             bus.tell(axis, Command.SET_STATE, frames.set_state(State.IDLE))
@@ -98,7 +98,7 @@ def _try_watchdogs(bus: "OdriveExchange", job: Work[OdriveAxis], axes: Sequence[
         axis.proven = True
 
 
-def _see_it_let_go(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis, give_up_ns: int) -> Steps:
+def _await_watchdog(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis, give_up_ns: int) -> Steps:
     while not axis.errors:
         job.gate()
         bus.require_answering(axis)

@@ -154,9 +154,9 @@ class Exchange(BusCycle[Hand]):
             hand.halting_since_ns = 0
             return
         sample = hand.sample
-        told = sample is not None and (sample.activating or (sample.going and sample.activated))
+        commanded = sample is not None and (sample.activating or (sample.going and sample.activated))
         seen = sample is not None and sample.at_ns > hand.held_ns + _TAKEN_NS
-        if told and seen and now_ns - hand.halting_since_ns <= HALT_NS:
+        if commanded and seen and now_ns - hand.halting_since_ns <= HALT_NS:
             self._stand(hand)  # the stop was not received
 
     def _halt(self, hands: Iterable[Hand], reason: str, *, grip: bool) -> None:

@@ -67,8 +67,8 @@ class Hand(BusDevice[Status]):
 
     def standing(self, now_ns: int, stale_after_ns: int) -> bool:
         """Returns whether it is at rest and has no goal."""
-        told = self.sample is not None and self.sample.going and self.sample.activated
-        return self.at_rest(now_ns, stale_after_ns) and not told
+        commanded = self.sample is not None and self.sample.going and self.sample.activated
+        return self.at_rest(now_ns, stale_after_ns) and not commanded
 
     def halt_registers(self) -> tuple[int, int, int]:
         """Returns the command that stops it.

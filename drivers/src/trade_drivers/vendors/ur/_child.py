@@ -21,16 +21,16 @@ class Child:
     """
 
     def __init__(self, role: Literal["control", "states"], host: str) -> None:
-        ours, theirs = pair()
-        with theirs:
+        own_end, child_end = pair()
+        with child_end:
             self._process = subprocess.Popen(  # noqa: S603 - our own module
-                [sys.executable, "-m", f"trade_drivers.vendors.ur._{role}_child", str(theirs.fileno()), host],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", f"trade_drivers.vendors.ur._{role}_child", str(child_end.fileno()), host],
+                pass_fds=[child_end.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # output of the library's own threads
                 stderr=subprocess.DEVNULL,
             )
-        self._channel: Channel[Report] = Channel(ours, Report)
+        self._channel: Channel[Report] = Channel(own_end, Report)
         self._numbers = 0
         self._answers: dict[int, Done] = {}
         self.ready = False

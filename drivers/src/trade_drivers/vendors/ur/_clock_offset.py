@@ -19,9 +19,9 @@ class Age:
         self._least_ns: int | None = None
         self._at_ns = 0
 
-    def measured_ns(self, at_ns: int, theirs_ns: int) -> int:
-        """Returns when a message was measured by our clock: it arrived at ``at_ns``, stamped ``theirs_ns``."""
-        delay_ns = at_ns - theirs_ns
+    def measured_ns(self, at_ns: int, stamp_ns: int) -> int:
+        """Returns when a message was measured by our clock: it arrived at ``at_ns``, stamped ``stamp_ns``."""
+        delay_ns = at_ns - stamp_ns
         if self._least_ns is None:
             self._least_ns = delay_ns
         self._least_ns = min(delay_ns, self._least_ns + int(_DRIFT * (at_ns - self._at_ns)))

@@ -50,7 +50,7 @@ class Exchange(BusCycle[ArmStatus]):
         self._halted_ns = 0
         self._ending = False
         """True if the process that commands must be replaced after the stop, as its program was ended."""
-        self._telling: threading.Thread | None = None
+        self._stop_sender: threading.Thread | None = None
         """The thread that makes the dashboard end the program."""
 
     # --- from any thread
@@ -152,7 +152,7 @@ class Exchange(BusCycle[ArmStatus]):
         if self.taken:
             return
         until_ns = self.clock() + _TAKEN_NS
-        while not self._control.ready or (self._telling is not None and self._telling.is_alive()):
+        while not self._control.ready or (self._stop_sender is not None and self._stop_sender.is_alive()):
             job.gate()
             if self.clock() > until_ns:
                 raise self.limb.faulty("the process that commands it does not start")
@@ -308,7 +308,7 @@ class Exchange(BusCycle[ArmStatus]):
                 self.drop_control(f"the process that commands it is gone: {gone}")
 
     def _end_program(self) -> None:
-        self._telling = tell(self.link.path, "stop", _ASK_S)
+        self._stop_sender = tell(self.link.path, "stop", _ASK_S)
 
     def _forget(self, motion: "Motion", error: TradeError | None) -> None:
         if self.limb.motion is motion:

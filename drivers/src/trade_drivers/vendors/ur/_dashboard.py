@@ -92,9 +92,9 @@ def commanded(host: str, timeout_s: float) -> bool:
             connection.sendall(_HELLO + _HEAD.pack(_HEAD.size + len(_REGISTER), _INPUTS) + _REGISTER)
             while True:
                 size, kind = _HEAD.unpack(_bytes(connection, _HEAD.size, until))
-                told = _bytes(connection, max(0, size - _HEAD.size), until)
+                body = _bytes(connection, max(0, size - _HEAD.size), until)
                 if kind == _INPUTS:
-                    return b"IN_USE" in told
+                    return b"IN_USE" in body
     except OSError as problem:
         raise DashboardError(f"{host}:{_RTDE}: {problem or 'no answer'}") from None
 

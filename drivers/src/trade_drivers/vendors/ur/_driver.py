@@ -35,7 +35,7 @@ _CYCLES_HZ: Final = {
 }
 """Models of the CB3 and of the e-Series, with the cycles per second of their controllers."""
 _ASK_S: Final = 1.0
-_LET_GO_S: Final = 2.0
+_RELEASED_WITHIN_S: Final = 2.0
 _AGAIN_S: Final = 0.1
 
 
@@ -130,7 +130,7 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> ArmStatus:
 
 def _refuse_company(port: str, where: str) -> None:
     """Refuses an arm that another program controls; a killed process keeps control for a short time."""
-    until = time.monotonic() + _LET_GO_S
+    until = time.monotonic() + _RELEASED_WITHIN_S
     while commanded(port, _ASK_S):
         if time.monotonic() > until:
             _wrong(f"{where}.host", f"{port}: another program has control of this arm; stop it first")

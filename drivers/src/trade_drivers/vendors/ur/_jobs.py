@@ -23,7 +23,7 @@ _OUTSIDE_RAD: Final = 0.02
 """The distance in rad that a joint may be measured outside its range without a command to leave it."""
 _STUCK_NS: Final = 1_000_000_000
 """The time within which a running move must change the measurement."""
-_FOREVER_NS: Final = 2**63
+_NO_DEADLINE_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
 
@@ -117,7 +117,7 @@ class Freedrive(Motion):
         except TradeError as problem:
             self.exchange.release(self, problem)
             raise
-        self.expires_ns = _FOREVER_NS
+        self.expires_ns = _NO_DEADLINE_NS
         self.finish()
 
     def watch(self, now_ns: int) -> None:  # noqa: ARG002 - the gate looks at the clock itself
@@ -298,7 +298,7 @@ class Follow(Motion):
         self._compare(self.usable(), "start", self._plan.tolerances.start_rad)
         self.gate()
         self.exchange.take_over(self)
-        self.expires_ns = _FOREVER_NS  # it started in time; its duration is checked separately
+        self.expires_ns = _NO_DEADLINE_NS  # it started in time; its duration is checked separately
         self._sent_ns = self.exchange.clock()
         self._plan.course.ready(self._sent_ns)
 
