@@ -13,7 +13,7 @@ from trade_gateway.ros._graph import (
     Ended,
     Goal,
     Heard,
-    NodeTold,
+    NodeListener,
     Outcome,
     RosRefused,
     RosUnreachable,
@@ -56,7 +56,7 @@ class MemoryRos:
 
     def tell(self, node: str, there: bool) -> None:
         for watch in list(self.watchers):
-            watch.told(node, there)
+            watch.listener(node, there)
 
     def who(self, node: str) -> str:
         return "" if self.anonymous else node
@@ -128,10 +128,10 @@ class MemoryGraph:
             raise RosRefused(what=node, problem=f"it has no parameter {name}")
         self._ros.parameters[node][name] = value
 
-    def watch_nodes(self, told: NodeTold) -> "_Watch":
-        made = self._keep(_Watch(self._ros, told))
+    def watch_nodes(self, listener: NodeListener) -> "_Watch":
+        made = self._keep(_Watch(self._ros, listener))
         for node in list(self._ros.nodes):
-            told(node, True)
+            listener(node, True)
         return made
 
     def close(self) -> None:
@@ -146,8 +146,8 @@ class MemoryGraph:
 
 
 class _Watch:
-    def __init__(self, ros: MemoryRos, told: NodeTold) -> None:
-        self._ros, self.told = ros, told
+    def __init__(self, ros: MemoryRos, listener: NodeListener) -> None:
+        self._ros, self.listener = ros, listener
         ros.watchers.append(self)
 
     def close(self) -> None:

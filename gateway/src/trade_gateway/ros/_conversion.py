@@ -128,8 +128,8 @@ class ResponseMapping:
     def _filled(self, plain: Any) -> Message:
         if self._paths:
             message: Message = {}
-            for path, ours in self._paths.items():
-                _put(message, path, _at(plain, ours) if ours else plain)
+            for path, source in self._paths.items():
+                _put(message, path, _at(plain, source) if source else plain)
             return message
         if isinstance(plain, dict):
             named = cast("dict[str, Any]", plain)

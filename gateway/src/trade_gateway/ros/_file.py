@@ -327,8 +327,8 @@ def _twice(place: str, names: Sequence[str]) -> Iterable[tuple[str, str]]:
 
 def _circles(read: RosFile) -> Iterable[tuple[str, str]]:
     """Yields mappings that would return to their origin."""
-    ours = {entry.topic for entry in (*read.to_ros.stream, *read.to_ros.joint_states)}
-    for name in sorted(ours & {entry.topic for entry in read.from_ros.topic}):
+    published = {entry.topic for entry in (*read.to_ros.stream, *read.to_ros.joint_states)}
+    for name in sorted(published & {entry.topic for entry in read.from_ros.topic}):
         yield "from_ros.topic", f"{name} is published by this bridge itself. Remove one of the two entries"
     for name in sorted({one.action for one in read.to_ros.trajectory} & {one.action for one in read.from_ros.joints}):
         yield "from_ros.joints", f"{name} is served by this bridge itself. Remove one of the two entries"

@@ -112,9 +112,9 @@ class _Motion:
 
     def _tell_stop(self) -> None:
         entry = self._entry
-        told = self._graph.call(entry.stop, entry.stop_type, {}, _STOPPED_WITHIN_S, stops=True)
-        if told.get("success") is False:
-            raise RosRefused(what=entry.stop, problem=str(told.get("message", "")) or "it was not stopped")
+        response = self._graph.call(entry.stop, entry.stop_type, {}, _STOPPED_WITHIN_S, stops=True)
+        if response.get("success") is False:
+            raise RosRefused(what=entry.stop, problem=str(response.get("message", "")) or "it was not stopped")
         self.resource.moving = False
 
 
@@ -207,8 +207,8 @@ class _SetPoint:
             self._still()
             problem = self._halted()
         if problem:
-            told = f"{problem}; the stop message is published as soon as ROS is back"
-            raise RosUnreachable(what=self._topic, problem=told)
+            unpublished = f"{problem}; the stop message is published as soon as ROS is back"
+            raise RosUnreachable(what=self._topic, problem=unpublished)
 
     def _over(self) -> None:
         with self._guard:

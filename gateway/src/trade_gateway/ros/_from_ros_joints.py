@@ -78,17 +78,17 @@ class RosJoints:
     @service(effect="read")
     def state(self) -> list[RosJoint]:
         """The last state of every joint; RosUnreachable if one is too old."""
-        now, told = time.monotonic(), list[RosJoint]()
-        for theirs, own in zip(self._entry.joints, self._names, strict=True):
-            position, velocity, effort, at = self._heard.get(theirs, (0.0, None, None, None))
+        now, joints = time.monotonic(), list[RosJoint]()
+        for ros_name, own in zip(self._entry.joints, self._names, strict=True):
+            position, velocity, effort, at = self._heard.get(ros_name, (0.0, None, None, None))
             silent_s = now - (self._began if at is None else at)
             if at is None or silent_s > self._entry.stale_after_s:
-                problem = f"no state of {theirs} for {silent_s:.3g} s. Is the node that publishes it running?"
+                problem = f"no state of {ros_name} for {silent_s:.3g} s. Is the node that publishes it running?"
                 raise RosUnreachable(what=self._entry.topic, problem=problem)
-            told.append(
+            joints.append(
                 RosJoint(name=own, position_rad=position, velocity_rad_s=velocity, effort_nm=effort, age_s=silent_s)
             )
-        return told
+        return joints
 
     @service(cancel="stop")
     def move_to(self, positions_rad: list[Position], speed_rad_s: float | None = None) -> list[float]:
@@ -132,11 +132,11 @@ class RosJoints:
                 if len(angles) != len(order):
                     problem = f"a point has {len(angles)} values for {len(order)} joints"
                     raise InvalidArgument(service="follow", argument="trajectory.points", problem=problem)
-            told: Message = msgspec.to_builtins(point)
-            told["positions_rad"] = [point.positions_rad[column] for column in order]
+            plain: Message = msgspec.to_builtins(point)
+            plain["positions_rad"] = [point.positions_rad[column] for column in order]
             if point.velocities_rad_s is not None:
-                told["velocities_rad_s"] = [point.velocities_rad_s[column] for column in order]
-            points.append(told)
+                plain["velocities_rad_s"] = [point.velocities_rad_s[column] for column in order]
+            points.append(plain)
         return self._pursue(points)
 
     @service(effect="stop")

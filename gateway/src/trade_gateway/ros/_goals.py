@@ -76,15 +76,15 @@ def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | 
         Unacceptable: it has other joints, or points without angles.
     """
     said: Sequence[str] = goal["trajectory"]["joint_names"]
-    if sorted(said) != sorted(names.ours):
-        problem = f"it is for {', '.join(said) or 'no joints'}, but must include exactly {', '.join(names.ours)}"
+    if sorted(said) != sorted(names.trade_names):
+        problem = f"it is for {', '.join(said) or 'no joints'}, but must include exactly {', '.join(names.trade_names)}"
         raise Unacceptable(INVALID_JOINTS, problem)
     if goal.get("multi_dof_trajectory", {}).get("points"):
         raise Unacceptable(INVALID_GOAL, "multi_dof_trajectory has points, but only joints of one axis are supported")
     points = [_point(point, said) for point in goal["trajectory"]["points"]]
     if not points:
         raise Unacceptable(INVALID_GOAL, "it has no points. To stop, cancel a goal or call the stop service")
-    joints = [names.ours[name] for name in said]
+    joints = [names.trade_names[name] for name in said]
     if points[0]["time_from_start_s"] > 0:
         if here is None:
             raise Unacceptable(INVALID_GOAL, "its first point must be at 0 s")
@@ -100,11 +100,11 @@ def _point(point: Message, names: Sequence[str]) -> dict[str, Any]:
         if len(point[field]) not in ((len(names),) if field == "positions" else (0, len(names))):
             problem = f"a point has {len(point[field])} {field} for {len(names)} joints"
             raise Unacceptable(INVALID_GOAL, problem)
-    told: dict[str, Any] = {
+    plain: dict[str, Any] = {
         "time_from_start_s": seconds(point["time_from_start"]),
         "positions_rad": point["positions"],
     }
-    return told | ({"velocities_rad_s": point["velocities"]} if point["velocities"] else {})
+    return plain | ({"velocities_rad_s": point["velocities"]} if point["velocities"] else {})
 
 
 def lasts_s(trajectory: Mapping[str, Any]) -> float:
@@ -117,13 +117,13 @@ def tolerances_of(goal: Message) -> dict[str, float]:
 
     Tolerances of speed and acceleration are ignored, and none can be disabled (-1).
     """
-    told: dict[str, float] = {}
-    for ours, theirs in (("path_rad", "path_tolerance"), ("goal_rad", "goal_tolerance")):
-        if said := [one["position"] for one in goal[theirs] if one["position"] > 0]:
-            told[ours] = min(said)
+    tolerances: dict[str, float] = {}
+    for name, field in (("path_rad", "path_tolerance"), ("goal_rad", "goal_tolerance")):
+        if said := [one["position"] for one in goal[field] if one["position"] > 0]:
+            tolerances[name] = min(said)
     if (time_s := seconds(goal["goal_time_tolerance"])) > 0:
-        told["goal_time_s"] = time_s
-    return told
+        tolerances["goal_time_s"] = time_s
+    return tolerances
 
 
 def code_of(error: BaseException) -> int:

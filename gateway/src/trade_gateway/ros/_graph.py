@@ -23,7 +23,7 @@ __all__ = [
     "Goal",
     "Graph",
     "Heard",
-    "NodeTold",
+    "NodeListener",
     "Outcome",
     "Publisher",
     "Pursuit",
@@ -36,7 +36,7 @@ Heard = Callable[[Message, str], object]
 Answer = Callable[[Message, str, float], Message]
 """Takes a request, the caller's name and its time of arrival (``time.monotonic()``, before any wait), returns
 the response; an exception is reported to the caller as a failure."""
-NodeTold = Callable[[str, bool], object]
+NodeListener = Callable[[str, bool], object]
 """Receives a node's name, and whether it is present (False: it is gone, or not visible any more)."""
 
 
@@ -187,7 +187,7 @@ class Graph(Protocol):
         """Sets a parameter. Raises RosUnreachable, RosRefused."""
         ...
 
-    def watch_nodes(self, told: NodeTold) -> Closes:
+    def watch_nodes(self, listener: NodeListener) -> Closes:
         """Reports nodes that come and go, the present ones first. A node that dies is reported within seconds."""
         ...
 

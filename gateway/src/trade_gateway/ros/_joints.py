@@ -11,7 +11,7 @@ from trade.errors import ConfigurationError
 __all__ = ["LIMBS", "JointNames", "Measured", "beside", "joints_of", "limbs", "measured"]
 
 LIMBS: Final = where(kind="JointGroup") | where(kind="Arm") | where(kind="Motor")
-_TOLD_WITHIN_S: Final = 5.0
+_LIMITS_S: Final = 5.0
 
 
 class Measured(NamedTuple):
@@ -37,17 +37,17 @@ class JointNames:
     """
 
     def __init__(self, joints: Sequence[str], *, short: bool, named: Mapping[str, str]) -> None:
-        for theirs, own in named.items():
+        for ros_name, own in named.items():
             if own not in joints:
-                problem = f"{own!r}, called {theirs!r}, is not among {', '.join(joints)}"
+                problem = f"{own!r}, called {ros_name!r}, is not among {', '.join(joints)}"
                 raise ConfigurationError(where="joints", problem=problem)
-        said = {own: theirs for theirs, own in named.items()}
-        self.theirs: Final = [said.get(own, own.rpartition(".")[2] if short else own) for own in joints]
+        said = {own: ros_name for ros_name, own in named.items()}
+        self.ros_names: Final = [said.get(own, own.rpartition(".")[2] if short else own) for own in joints]
         """In the order of the TRADE names."""
-        if len(set(self.theirs)) < len(joints):
+        if len(set(self.ros_names)) < len(joints):
             problem = f'two of {", ".join(joints)} would have one name. Set names = "full", or name them in joints'
             raise ConfigurationError(where="joints", problem=problem)
-        self.ours: Final = dict(zip(self.theirs, joints, strict=True))
+        self.trade_names: Final = dict(zip(self.ros_names, joints, strict=True))
 
 
 def limbs(found: Sequence[Handle], group: str, name: str) -> list[Handle]:
@@ -68,8 +68,8 @@ def beside(container: Container, handle: Handle, name: str) -> Handle:
 
 def joints_of(container: Container, handle: Handle) -> list[str]:
     """Full names of the joints of a service, in the order of its values. Raises what the call for them raises."""
-    told = beside(container, handle, "limits").with_(deadline_s=_TOLD_WITHIN_S)()
-    limits: Any = msgspec.to_builtins(told)
+    answer = beside(container, handle, "limits").with_(deadline_s=_LIMITS_S)()
+    limits: Any = msgspec.to_builtins(answer)
     if isinstance(limits, dict):  # of an arm, or of one joint
         whole = cast("dict[str, Any]", limits)
         limits = whole.get("joints", [whole])
@@ -78,11 +78,11 @@ def joints_of(container: Container, handle: Handle) -> list[str]:
 
 def measured(joints: Sequence[str], state: Any) -> Measured:
     """Reads the positions from the state of a motor, joint group or arm."""
-    told: Any = msgspec.to_builtins(state)
-    if isinstance(told, dict) and "positions_rad" in told:
-        arm = cast("dict[str, Any]", told)
+    plain: Any = msgspec.to_builtins(state)
+    if isinstance(plain, dict) and "positions_rad" in plain:
+        arm = cast("dict[str, Any]", plain)
         return Measured(joints, arm["positions_rad"], arm["velocities_rad_s"], arm["age_s"])
-    motors = cast("list[dict[str, Any]]", told if isinstance(told, list) else [told])
+    motors = cast("list[dict[str, Any]]", plain if isinstance(plain, list) else [plain])
     return Measured(
         [motor["name"] for motor in motors],
         [motor["position_rad"] for motor in motors],

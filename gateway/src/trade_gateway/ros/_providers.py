@@ -131,8 +131,8 @@ def _plain_kind(kind: str) -> type:
 
 def plain(args: Mapping[str, Any]) -> Message:
     """Converts arguments to a message; the type provides omitted arguments and empty lists."""
-    told = msgspec.to_builtins(dict(args), builtin_types=(bytes,))
-    return _without_empty(told)
+    message = msgspec.to_builtins(dict(args), builtin_types=(bytes,))
+    return _without_empty(message)
 
 
 def _without_empty(message: Mapping[str, Any]) -> Message:

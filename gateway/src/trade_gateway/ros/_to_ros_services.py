@@ -69,15 +69,15 @@ class ServicesToRos:
         return asked
 
     def open(self, place: Place, handle: Handle) -> Closes:
-        asked, told, deadline_s = self._asked(handle), self._response, self._entry.deadline_s
+        asked, response, deadline_s = self._asked(handle), self._response, self._entry.deadline_s
 
         stops = handle.effect == "stop"
 
         def answer(request: Message, who: str, came_at: float) -> Message:
             guest = self._nodes.guest(who, came_at, stops=stops)
-            return told(guest.call(handle, asked(request), deadline_s, came_at))
+            return response(guest.call(handle, asked(request), deadline_s, came_at))
 
-        return self._graph.serve(place.name, self._entry.type, answering(told, answer), stops=stops)
+        return self._graph.serve(place.name, self._entry.type, answering(response, answer), stops=stops)
 
 
 class LocksToRos:
@@ -102,13 +102,13 @@ class LocksToRos:
             yield Place("service", name, f"a lock over {self._entry.group}"), first
 
     def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - the lock covers a whole group
-        told = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
+        response = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
         def answer(request: Message, who: str, came_at: float) -> Message:
             text = self._take(who, came_at) if request["data"] else self._give_back(who)
             return {"success": True, "message": text}
 
-        return self._graph.serve(place.name, _SET_BOOL, answering(told, answer))
+        return self._graph.serve(place.name, _SET_BOOL, answering(response, answer))
 
     def _take(self, who: str, came_at: float) -> str:
         if who == UNKNOWN:
@@ -139,13 +139,13 @@ class LocksToRos:
         return "released" if given_back else "it had none"
 
 
-def answering(told: ResponseMapping, answer: Answer) -> Answer:
+def answering(response: ResponseMapping, answer: Answer) -> Answer:
     """Wraps an answer to report errors in the response, if its type can."""
 
     def guarded(request: Message, who: str, came_at: float) -> Message:
         try:
             return answer(request, who, came_at)
         except Exception as error:  # noqa: BLE001 - reported to the node, whatever it is
-            return told.failed(error)
+            return response.failed(error)
 
     return guarded

@@ -67,9 +67,9 @@ class StreamsToRos:
             yield Place("topic", self._entry.topic), handle
 
     def open(self, place: Place, handle: Handle) -> Closes:
-        entry, told = self._entry, self._response
+        entry, response = self._entry, self._response
         stream = self._container.stream(handle, hz=entry.hz)
-        return _Pump(stream, self._topics, place.name, entry.type, lambda sample: told(sample.value, sample.at))
+        return _Pump(stream, self._topics, place.name, entry.type, lambda sample: response(sample.value, sample.at))
 
 
 class JointStatesToRos:
@@ -90,9 +90,9 @@ class JointStatesToRos:
 
     def open(self, place: Place, handle: Handle) -> Closes:
         entry, joints = self._entry, joints_of(self._container, handle)
-        named = {theirs: own for theirs, own in entry.joints.items() if own in joints}
+        named = {ros_name: own for ros_name, own in entry.joints.items() if own in joints}
         names = JointNames(joints, short=entry.names == "last", named=named)
-        theirs = {own: name for name, own in names.ours.items()}
+        ros_names = {own: name for name, own in names.trade_names.items()}
 
         def message(sample: Sample) -> Message | None:
             if handle.health != _HEALTHY:
@@ -100,7 +100,7 @@ class JointStatesToRos:
             now = measured(joints, sample.value)
             return {
                 "header": {"stamp": ros_stamp(sample.at - now.age_s)},
-                "name": [theirs[own] for own in now.names],
+                "name": [ros_names[own] for own in now.names],
                 "position": list(now.positions_rad),
                 "velocity": list(now.velocities_rad_s),
             }

@@ -103,7 +103,7 @@ class _Limb:
                 if canceling.asked:
                     return _outcome(Ended.CANCELED, SUCCESSFUL, "canceled before it began")
                 run = guest.begin(self._follow, args, deadline_s, goal.came_at, admitted)
-                run.on_progress(lambda told: _try(lambda: self._tell(goal, told)))
+                run.on_progress(lambda progress: _try(lambda: self._tell(goal, progress)))
                 canceling.ends(lambda: guest.client.cancel(run))
                 _wait(run, deadline_s, canceling)
         except Exception as error:  # noqa: BLE001 - reported to its client, whatever it is
@@ -117,16 +117,16 @@ class _Limb:
         points = goal.message["trajectory"]["points"]
         if not points or points[0]["time_from_start"] == {"sec": 0, "nanosec": 0}:
             return None
-        now = measured(list(self._names.ours.values()), self._state.with_(deadline_s=_READ_WITHIN_S)())
+        now = measured(list(self._names.trade_names.values()), self._state.with_(deadline_s=_READ_WITHIN_S)())
         return dict(zip(now.names, now.positions_rad, strict=True))
 
-    def _tell(self, goal: Goal, told: object) -> None:
-        progress: Any = msgspec.to_builtins(told)
-        errors: list[float] = progress["errors_rad"]
+    def _tell(self, goal: Goal, progress: object) -> None:
+        plain: Any = msgspec.to_builtins(progress)
+        errors: list[float] = plain["errors_rad"]
         goal.feedback(
             {
                 "header": {"stamp": ros_stamp(time.time())},
-                "joint_names": self._names.theirs,
+                "joint_names": self._names.ros_names,
                 "error": {"positions": [-error for error in errors]},  # in ROS: desired minus actual
             }
         )

@@ -42,7 +42,7 @@ _END_S: Final = 2.0
 _MOST: Final = 100
 """Number of unwanted goals that are remembered."""
 _QUEUE: Final = 100
-_GOES_ON: Final = frozenset({Status.PENDING, Status.ACTIVE})
+_NOT_CANCELED: Final = frozenset({Status.PENDING, Status.ACTIVE})
 """States of a goal whose server has not received a cancel."""
 _HOW: Final = {
     Status.SUCCEEDED: Ended.SUCCEEDED,
@@ -106,7 +106,7 @@ class ActionClient:
             "feedback": (types.feedback, self._feedback),
             "result": (types.result, self._result),
         }
-        opened = [graph.hear(f"{name}/{topic}", kind, told, most=_QUEUE) for topic, (kind, told) in heard.items()]
+        opened = [graph.hear(f"{name}/{topic}", kind, receive, most=_QUEUE) for topic, (kind, receive) in heard.items()]
         self._ends = [self._goal.opened, self._cancel.opened, *(one for one, _ in opened)]
         self._steps = [step for _, steps in opened for step in steps]
         threading.Thread(target=self._look_often, name=f"trade-ros1{name}/goals", daemon=True).start()
@@ -208,7 +208,7 @@ class ActionClient:
     def _status(self, message: Message, who: str, at: float) -> None:
         states = {one["goal_id"]["id"]: Status(one["status"]) for one in message["status_list"]}
         for number, state in states.items():
-            if state in _GOES_ON:
+            if state in _NOT_CANCELED:
                 self._cancel_again(number)
             elif state in ENDED:
                 with self._lock:

@@ -44,7 +44,7 @@ class _Taken:
 
     def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str, at: float) -> None:
         self._server = server
-        self._tells: list[Callable[[], object]] = []
+        self._callbacks: list[Callable[[], object]] = []
         self._canceled = False
         self.goal_id = goal_id
         self.message = message
@@ -60,17 +60,17 @@ class _Taken:
     def when_canceled(self, tell: Callable[[], object]) -> None:
         with self._server.lock:
             if not self._canceled:
-                self._tells.append(tell)
+                self._callbacks.append(tell)
                 return
         tell()
 
     def cancel(self) -> None:
         """Requests its end."""
         with self._server.lock:
-            tells, self._tells, self._canceled = self._tells, [], True
+            callbacks, self._callbacks, self._canceled = self._callbacks, [], True
             if self.status is Status.ACTIVE:
                 self.status = Status.PREEMPTING
-        for tell in tells:
+        for tell in callbacks:
             try:
                 tell()
             except Exception:  # noqa: BLE001 - the callback is the user's

@@ -85,18 +85,18 @@ class Child:
     def _live(self) -> str:
         """Runs one child process; returns how it ended."""
         came, gone, heard = self._callbacks
-        ours, its = socket.socketpair()
-        with ours:
+        own_end, child_end = socket.socketpair()
+        with own_end:
             try:
-                with its:
-                    process = self._start(its)
+                with child_end:
+                    process = self._start(child_end)
             except OSError as error:
                 return f"cannot be started: {error}"
             words = threading.Thread(target=self._listen, args=(process.stderr,), name="trade-ros1-words", daemon=True)
             words.start()
-            ours.settimeout(_START_S)
-            channel = Channel(ours, "trade-ros1")
-            signs = _Signs(ours, heard)
+            own_end.settimeout(_START_S)
+            channel = Channel(own_end, "trade-ros1")
+            signs = _Signs(own_end, heard)
             stood_still = ""
             with self._lock:
                 self._channel = channel
@@ -118,11 +118,11 @@ class Child:
                 words.join(_END_S)
         return stood_still or f"has ended ({code})"
 
-    def _start(self, its: socket.socket) -> "subprocess.Popen[bytes]":
+    def _start(self, child_end: socket.socket) -> "subprocess.Popen[bytes]":
         return subprocess.Popen(  # noqa: S603 - the configured Python, and our own program
-            [*self._command, str(its.fileno()), *self._arguments],
+            [*self._command, str(child_end.fileno()), *self._arguments],
             env=self._environment,
-            pass_fds=[its.fileno()],
+            pass_fds=[child_end.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

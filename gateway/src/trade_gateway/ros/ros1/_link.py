@@ -34,7 +34,7 @@ class Opened:
     link: "Link"
     number: int
     head: Head
-    told: Callable[[Head, bytes], object]
+    received: Callable[[Head, bytes], object]
     most: int = 0
     last: bytes | None = None
     """Of a latched topic."""
@@ -58,10 +58,10 @@ class Link:
         node: str,
         python: str,
         ip: str,
-        told: Callable[[str, bool], object],
+        changed: Callable[[str, bool], object],
         alone: Callable[[], object],
     ) -> None:
-        self._node_changed = told
+        self._node_changed = changed
         self._alone = alone
         self._numbers = itertools.count(1)
         self._state = threading.Condition()
@@ -85,10 +85,10 @@ class Link:
 
     # --- open topics and services
 
-    def open(self, head: Head, told: Callable[[Head, bytes], object], most: int = 0) -> Opened:
+    def open(self, head: Head, received: Callable[[Head, bytes], object], most: int = 0) -> Opened:
         """Opens a topic or service, now and in each restarted node; the callback receives its frames."""
         number = next(self._numbers)
-        opened = Opened(self, number, {**head, "id": number, "most": most}, told, most)
+        opened = Opened(self, number, {**head, "id": number, "most": most}, received, most)
         with self._state:
             self._open[number] = opened
             self._put(opened.head)
@@ -203,7 +203,7 @@ class Link:
                 with self._state:
                     opened = self._open.get(head["id"])
                 if opened is not None:
-                    opened.told(head, body)
+                    opened.received(head, body)
                 elif head["op"] == "request":
                     self.reply(head["ask"], b"", "it is not offered any more")
 

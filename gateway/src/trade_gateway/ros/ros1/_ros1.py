@@ -15,7 +15,7 @@ from trade_gateway.ros._graph import (
     Goal,
     Graph,
     Heard,
-    NodeTold,
+    NodeListener,
     Outcome,
     Publisher,
     Pursuit,
@@ -42,7 +42,7 @@ class Nodes:
         self._watchers: dict[int, Mailbox[tuple[str, bool]]] = {}
         self._watched = 0
 
-    def told(self, name: str, there: bool) -> None:
+    def report(self, name: str, there: bool) -> None:
         """Reports that a node came or went."""
         with self._lock:
             if there == (name in self._there):
@@ -54,11 +54,11 @@ class Nodes:
     def none(self) -> None:
         """Reports that no node is visible any more."""
         for name in sorted(self._there):
-            self.told(name, False)
+            self.report(name, False)
 
-    def watch(self, told: NodeTold) -> Callable[[], None]:
+    def watch(self, listener: NodeListener) -> Callable[[], None]:
         """Reports the present nodes and every change; returns what ends it."""
-        watcher = Mailbox[tuple[str, bool]]("trade-ros1-nodes", lambda news: told(*news), end_s=0.0)
+        watcher = Mailbox[tuple[str, bool]]("trade-ros1-nodes", lambda news: listener(*news), end_s=0.0)
         with self._lock:
             self._watched += 1
             number = self._watched
@@ -137,7 +137,7 @@ class Ros1(Graph):
         self._open: set[Closes] = set()
         self.node: Final = _name(node, "node")
         master = master or os.environ.get("ROS_MASTER_URI", "") or _MASTER
-        self._link = Link(master=master, node=node, python=python, ip=ip, told=self._node, alone=self._nodes.none)
+        self._link = Link(master=master, node=node, python=python, ip=ip, changed=self._node, alone=self._nodes.none)
 
     @property
     def types(self) -> Types:
@@ -170,13 +170,13 @@ class Ros1(Graph):
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
 
         def tell(message: tuple[Head, bytes]) -> None:
-            told, body = message
-            heard(self._types.from_bytes(type_name, body), told["who"], told["at"])
+            head, body = message
+            heard(self._types.from_bytes(type_name, body), head["who"], head["at"])
 
         mailbox = Mailbox[tuple[Head, bytes]](f"trade-ros1{topic}", tell, most=most, end_s=0.0)
 
-        def came(told: Head, body: bytes) -> None:
-            mailbox.put((told, body))
+        def came(head: Head, body: bytes) -> None:
+            mailbox.put((head, body))
 
         opened = self._link.open(head, came, most)
         return opened, (opened.close, mailbox.close)
@@ -230,8 +230,8 @@ class Ros1(Graph):
             raise RosRefused(what=at, problem=f"{value!r} cannot be a parameter of ROS")
         self._link.ask(at, {"op": "set_parameter", "name": at, "value": value}, b"", timeout_s)
 
-    def watch_nodes(self, told: NodeTold) -> Closes:
-        return self._closing((self._nodes.watch(told),))
+    def watch_nodes(self, listener: NodeListener) -> Closes:
+        return self._closing((self._nodes.watch(listener),))
 
     def close(self) -> None:
         with self._lock:
@@ -253,7 +253,7 @@ class Ros1(Graph):
         return head
 
     def _node(self, name: str, there: bool) -> None:
-        self._nodes.told(name, there)
+        self._nodes.report(name, there)
         if not there:
             for client in list(self._clients.values()):
                 client.gone(name)
@@ -265,7 +265,7 @@ class Ros1(Graph):
         return closing
 
 
-def _nothing(told: Head, body: bytes) -> None:
+def _nothing(head: Head, body: bytes) -> None:
     """Ignores frames of a published topic."""
 
 

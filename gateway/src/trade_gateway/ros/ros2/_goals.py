@@ -75,8 +75,8 @@ class Pursued(Goal):
         """Runs the callbacks registered with `when_canceled`. Idempotent."""
         with self._lock:
             self._canceled = True
-            told, self._tell = self._tell, []
-        for tell in told:
+            callbacks, self._tell = self._tell, []
+        for tell in callbacks:
             try:
                 tell()
             except Exception:  # noqa: BLE001 - the remaining callbacks must still run
@@ -198,8 +198,8 @@ class Action:
 
     def _tell_status(self) -> None:
         with self._lock:
-            told = [{"goal_info": goal.info(), "status": goal.status} for goal in self._goals.values()]
-            self._status.send({"status_list": told})
+            statuses = [{"goal_info": goal.info(), "status": goal.status} for goal in self._goals.values()]
+            self._status.send({"status_list": statuses})
 
 
 def stamp(time_ns: int) -> dict[str, Any]:

@@ -88,9 +88,9 @@ def _snake(name: str) -> str:
     return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name)[1:]
 
 
-def _value(told: Message) -> Any:
-    field = _FIELDS.get(told["type"])
-    return None if field is None else told[field]
+def _value(value: Message) -> Any:
+    field = _FIELDS.get(value["type"])
+    return None if field is None else value[field]
 
 
 def _typed(name: str, value: object, declared: int) -> Message:

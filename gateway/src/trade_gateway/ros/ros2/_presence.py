@@ -15,7 +15,7 @@ from typing import Final
 
 import zenoh
 
-from trade_gateway.ros._graph import NodeTold
+from trade_gateway.ros._graph import NodeListener
 from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros.ros2._link import Link
 from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_token
@@ -35,8 +35,8 @@ _MOST_ENDED: Final = 4096
 class Watching:
     """A subscription to the nodes."""
 
-    def __init__(self, told: NodeTold, end: "Callable[[Watching], None]") -> None:
-        self._report = told
+    def __init__(self, listener: NodeListener, end: "Callable[[Watching], None]") -> None:
+        self._report = listener
         self._end = end
         self.mailbox: Final = Mailbox[tuple[str, bool]]("ros2 nodes", self._tell)
 
@@ -90,9 +90,9 @@ class Presence:
         with self._changed:
             return self._offered[kind, name] > 0
 
-    def watch(self, told: NodeTold) -> Watching:
+    def watch(self, listener: NodeListener) -> Watching:
         """See `Graph.watch_nodes`; the bridge's own node is not reported."""
-        watching = Watching(told, self._unwatch)
+        watching = Watching(listener, self._unwatch)
         with self._changed:
             self._watching.append(watching)
             for node in self._nodes:

@@ -74,7 +74,7 @@ class Pursuing:
             raise
         if isinstance(answer, Unanswered):
             unheard = RosUnreachable(what=self._name, problem=answer.problem)
-            if not answer.sent and not self._is_there():
+            if not answer.sent and not self._is_present():
                 self._finish(unheard)
                 raise unheard
             self._abandon(unheard)
@@ -127,7 +127,7 @@ class Pursuing:
                 self._finish(self._read(answer))
             self._over.wait(_AGAIN_S)
 
-    def _is_there(self) -> bool:
+    def _is_present(self) -> bool:
         """Whether a node serves the action after all; if so, this cancels the goal."""
         try:
             answer = self._stop.ask(self._this, _END_S)
@@ -147,14 +147,15 @@ class Pursuing:
 
     def _end(self, why: RosUnreachable) -> None:
         deadline = time.monotonic() + _ABANDON_S
-        told, ended = False, False
+        canceled, ended = False, False
         while not ended and time.monotonic() < deadline and not self._closed.is_set():
-            refusal = None if told else self._cancel_once()
-            told = told or refusal is Refusal.NONE
-            ended = refusal is Refusal.GOAL_TERMINATED or (told and self._has_ended(deadline - time.monotonic()))
+            refusal = None if canceled else self._cancel_once()
+            canceled = canceled or refusal is Refusal.NONE
+            ended = refusal is Refusal.GOAL_TERMINATED or (canceled and self._has_ended(deadline - time.monotonic()))
             if not ended:
                 self._closed.wait(_AGAIN_S)
-        self._finish(RosUnreachable(what=self._name, problem=f"{why.problem}; {_end_of(told=told, ended=ended)}"))
+        problem = f"{why.problem}; {_end_of(canceled=canceled, ended=ended)}"
+        self._finish(RosUnreachable(what=self._name, problem=problem))
 
     def _cancel_once(self) -> Refusal | None:
         with contextlib.suppress(RosUnreachable, RosRefused, ValueError):
@@ -186,9 +187,9 @@ class Pursuing:
                 each.close()
 
 
-def _end_of(*, told: bool, ended: bool) -> str:
+def _end_of(*, canceled: bool, ended: bool) -> str:
     if ended:
         return "it was canceled, and has ended"
-    if told:
+    if canceled:
         return "it was canceled, but whether it has ended is unknown"
     return "it could not be canceled, and whether it has ended is unknown"

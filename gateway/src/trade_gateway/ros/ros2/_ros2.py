@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Answer, Closes, Goal, Graph, Heard, NodeTold, Outcome, Publisher, Pursuit
+from trade_gateway.ros._graph import Answer, Closes, Goal, Graph, Heard, NodeListener, Outcome, Publisher, Pursuit
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros2 import _parameters
 from trade_gateway.ros.ros2._goals import Action
@@ -127,9 +127,9 @@ class Ros2(Graph):
         """See `Graph`. Raises also ConfigurationError: ROS has no parameters of that kind."""
         _parameters.put(self.call, node, name, value, timeout_s)
 
-    def watch_nodes(self, told: NodeTold) -> Closes:
+    def watch_nodes(self, listener: NodeListener) -> Closes:
         """See `Graph`. The bridge's own node is not reported; for frozen or disconnected nodes see `_presence`."""
-        return self._keep(self._node.presence.watch(told))
+        return self._keep(self._node.presence.watch(listener))
 
     @property
     def healthy(self) -> str:

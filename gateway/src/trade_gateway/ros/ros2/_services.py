@@ -162,7 +162,7 @@ class Client:
         """
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
         answers: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
-        was_there = self._is_there()
+        was_there = self._is_present()
         try:
             cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
         except RosUnreachable as unreachable:
@@ -177,7 +177,7 @@ class Client:
         if reply is None:
             missing = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
             cut_off = self._node.link.problem
-            return Unanswered(cut_off or missing, sent=bool(cut_off) or was_there or self._is_there())
+            return Unanswered(cut_off or missing, sent=bool(cut_off) or was_there or self._is_present())
         return self._read(reply)
 
     def send(self, request: Mapping[str, Any], timeout_s: float) -> None:
@@ -189,11 +189,11 @@ class Client:
         """Withdraws the client. Idempotent."""
         self._declared.close()
 
-    def _is_there(self) -> bool:
+    def _is_present(self) -> bool:
         return self._node.presence.offered(Kind.SERVER, self.name)
 
     def _ask(
-        self, payload: bytes, timeout_s: float, told: Callable[[zenoh.Reply], object], ended: Callable[[], object]
+        self, payload: bytes, timeout_s: float, replied: Callable[[zenoh.Reply], object], ended: Callable[[], object]
     ) -> Callable[[], object]:
         session, problem = self._node.link.session, self._node.link.problem
         if session is None or problem:
@@ -202,7 +202,7 @@ class Client:
         try:
             session.get(
                 self._endpoint.key,
-                zenoh.handlers.Callback(told, ended),
+                zenoh.handlers.Callback(replied, ended),
                 target=zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s + _AFTER_S,

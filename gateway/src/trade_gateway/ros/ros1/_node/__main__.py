@@ -95,8 +95,8 @@ class Node:
             if not latched and header.get("latching") == "1" and met not in header:
                 header[met] = "1"  # ROS does not say whether the first message is as old as its publisher
                 return
-            told = {"op": "heard", "id": number, "who": header.get("callerid", ""), "at": time.monotonic()}
-            self._channel.put(told, message._buff, key=str(number), most=most)
+            frame = {"op": "heard", "id": number, "who": header.get("callerid", ""), "at": time.monotonic()}
+            self._channel.put(frame, message._buff, key=str(number), most=most)
 
         self._opened(head, rospy.Subscriber(head["name"], self._class(head), came, tcp_nodelay=True))
 
@@ -129,8 +129,8 @@ class Node:
             self._asked += 1
             asked = self._asked
             self._replies[asked] = replied, reply
-        told = {"op": "request", "id": number, "ask": asked, "who": who, "at": time.monotonic()}
-        self._channel.put(told, body)
+        request = {"op": "request", "id": number, "ask": asked, "who": who, "at": time.monotonic()}
+        self._channel.put(request, body)
         came = replied.wait(_REPLY_S)
         with self._lock:
             self._replies.pop(asked, None)
@@ -151,15 +151,15 @@ class Node:
     # --- requests of TRADE
 
     def _answer(self, head: Head, body: bytes) -> None:
-        told: Head = {"op": "answer", "ask": head["ask"], "failed": ""}
+        reply: Head = {"op": "answer", "ask": head["ask"], "failed": ""}
         answer = b""
         try:
-            told["value"], answer = getattr(self, "_" + head["op"])(head, body)
+            reply["value"], answer = getattr(self, "_" + head["op"])(head, body)
         except Unreachable as error:
-            told.update(failed="unreachable", problem=str(error))
+            reply.update(failed="unreachable", problem=str(error))
         except Exception as error:  # noqa: BLE001 - also what rospy raises: TRADE needs an answer
-            told.update(failed="refused", problem=str(error) or repr(error))
-        self._channel.put(told, answer)
+            reply.update(failed="refused", problem=str(error) or repr(error))
+        self._channel.put(reply, answer)
 
     def _call(self, head: Head, body: bytes) -> tuple[Any, bytes]:
         service = self._service(head)

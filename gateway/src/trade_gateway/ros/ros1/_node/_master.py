@@ -6,7 +6,7 @@ import http.client
 import xmlrpc.client
 from typing import Any
 
-__all__ = ["Refused", "Unreachable", "ask", "is_there"]
+__all__ = ["Refused", "Unreachable", "ask", "is_reachable"]
 
 _UNREACHABLE = (OSError, http.client.HTTPException, xmlrpc.client.ProtocolError)
 
@@ -52,7 +52,7 @@ def ask(uri: str, method: str, *arguments: Any, timeout_s: float = 2.0) -> Any:
     return value
 
 
-def is_there(uri: str, name: str) -> bool:
+def is_reachable(uri: str, name: str) -> bool:
     """Whether a node answers at its slave API."""
     try:
         ask(uri, "getPid", name, timeout_s=1.0)

@@ -36,8 +36,8 @@ class _Held:
 class Peers:
     """Nodes by name; reports each change once to a callback, with the name and whether the node is present."""
 
-    def __init__(self, told: Callable[[str, bool], object]) -> None:
-        self._changed = told
+    def __init__(self, changed: Callable[[str, bool], object]) -> None:
+        self._changed = changed
         self._lock = threading.Lock()
         self._held: dict[str, _Held] = {}
         self._there: set[str] = set()

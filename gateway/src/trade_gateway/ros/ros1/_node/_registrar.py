@@ -16,7 +16,7 @@ from rospy.core import ROSRPC
 from rospy.impl.registration import get_service_manager, get_topic_manager
 from rospy.impl.tcpros_base import get_tcpros_server_address
 
-from ._master import Refused, Unreachable, ask, is_there
+from ._master import Refused, Unreachable, ask, is_reachable
 from ._peers import Peers
 
 __all__ = ["Registrar"]
@@ -96,7 +96,7 @@ class Registrar:
             uri = ask(self._master, "lookupNode", self._node, self._node)
         except Refused:
             return ""
-        return uri if uri != self._handler.uri and is_there(uri, self._node) else ""
+        return uri if uri != self._handler.uri and is_reachable(uri, self._node) else ""
 
     def _register(self, wanted: dict[Entry, tuple[str, Any]], listed: set[Entry]) -> None:
         for entry, (what, opened) in wanted.items():
@@ -107,10 +107,10 @@ class Registrar:
             if self._done.pop(entry, opened) is not opened:
                 self._unregister(entry)  # reopened meanwhile: its peers must be notified so that they reconnect
             kind, name = entry
-            told = ask(self._master, _REGISTER[kind], self._node, name, what, self._handler.uri)
+            publishers = ask(self._master, _REGISTER[kind], self._node, name, what, self._handler.uri)
             self._done[entry] = opened
             if kind == "heard":
-                self._handler.reg_man.publisher_update(name, told)
+                self._handler.reg_man.publisher_update(name, publishers)
         for entry in set(self._done) - set(_open()):
             self._unregister(entry)
             del self._done[entry]
