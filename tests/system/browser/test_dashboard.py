@@ -241,7 +241,7 @@ def test_locks_are_taken_asked_for_and_broken_where_everybody_sees_it(browsers: 
     seen.get_by_role("button", name="Break …").click()
     seen.get_by_label("Reason").fill("it hangs")
     seen.get_by_role("button", name="Break it").click()
-    expect(anna.page.locator("#told")).to_contain_text("it hangs")
+    expect(anna.page.locator("#notice")).to_contain_text("it hangs")
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 

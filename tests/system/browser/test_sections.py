@@ -42,10 +42,10 @@ def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_r
 def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
     expect(part(vera, "call-list")).to_contain_text("the right to read the system")
-    expect(part(anna, "note-calls")).to_be_disabled()  # she does not instrument the system
+    expect(part(anna, "trace-calls")).to_be_disabled()  # she does not instrument the system
     expect(part(chief, "call-list")).to_have_text("No call has been noted yet.")
-    part(chief, "note-calls").click()
-    expect(part(chief, "told")).to_contain_text("Calls are noted in")
+    part(chief, "trace-calls").click()
+    expect(part(chief, "notice")).to_contain_text("Calls are traced in")
     card = anna.service(PAN, "move_to")
     card.get_by_label("position_rad").fill("9")
     card.get_by_role("button", name="Call").click()
@@ -56,8 +56,8 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) 
         expect(row).to_contain_text("rosie.neck.pan.move_to")
         expect(row).to_contain_text("for anna")
         expect(row).to_contain_text("LimitExceeded")
-    part(chief, "note-no-calls").click()
-    expect(part(chief, "told")).to_contain_text("No more calls are noted in")
+    part(chief, "stop-tracing").click()
+    expect(part(chief, "notice")).to_contain_text("Calls are no longer traced in")
 
 
 def test_the_policy_is_for_who_reads_the_system_and_the_audit_for_who_administers_it(browsers: Browsers) -> None:
@@ -67,7 +67,7 @@ def test_the_policy_is_for_who_reads_the_system_and_the_audit_for_who_administer
     expect(bert).to_contain_text("operator")
     expect(part(anna, "audit-list")).to_have_text("This needs the right to administer the system.")
     expect(part(anna, "rule-list")).to_have_text("There are no rules.")
-    part(chief, "note-calls").click()
+    part(chief, "trace-calls").click()
     expect(part(chief, "audit-list").get_by_role("row", name="set_tracing").first).to_contain_text("configure")
 
 

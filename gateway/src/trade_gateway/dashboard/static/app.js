@@ -9,7 +9,7 @@ import { lookForLocks } from "./locks.js";
 import { readLog } from "./log.js";
 import { $, sleep, tell, write } from "./page.js";
 import { forget, lookAround, paintAll } from "./robots.js";
-import { lookAtAudit, lookAtContainers, lookAtPolicy, lookAtSight, lookAtWatchers } from "./system.js";
+import { lookAtAudit, lookAtContainers, lookAtNotifications, lookAtPolicy, lookAtSight } from "./system.js";
 
 const ASK_AGAIN_MS = 1000;
 const LONGEST_PAUSE_MS = 4000;
@@ -104,7 +104,7 @@ keepAsking(lookForEstops, ASK_AGAIN_MS);
 keepAsking(lookAtSight, 2 * ASK_AGAIN_MS);
 keepAsking(lookForLocks, ASK_AGAIN_MS);
 keepAsking(lookAtContainers, 4 * ASK_AGAIN_MS);
-keepAsking(lookAtWatchers, 3 * ASK_AGAIN_MS);
+keepAsking(lookAtNotifications, 3 * ASK_AGAIN_MS);
 keepAsking(lookAtFaults, 2 * ASK_AGAIN_MS);
 keepAsking(showCalls, ASK_AGAIN_MS);
 keepAsking(lookAtPolicy, 5 * ASK_AGAIN_MS);

@@ -25,14 +25,14 @@ export function readCalls() {
 }
 
 export function showCalls() {
-  for (const button of [$("note-calls"), $("note-no-calls")]) button.disabled = !(door.me?.instruments && door.connected);
+  for (const button of [$("trace-calls"), $("stop-tracing")]) button.disabled = !(door.me?.instruments && door.connected);
   if (!door.me?.reads) {
     table($("call-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
   const wanted = $("call-search").value.toLowerCase();
   const rows = [...ended.values()].reverse().map(rowOf).filter((row) => row.join(" ").toLowerCase().includes(wanted));
-  table($("call-list"), "The latest calls", COLUMNS, rows, ended.size ? "None of them is like that." : "No call has been noted yet.");
+  table($("call-list"), "The latest calls", COLUMNS, rows, ended.size ? "None of them is like that." : "No call has been traced yet.");
 }
 
 function rowOf(call) {
@@ -41,16 +41,16 @@ function rowOf(call) {
   return [clock(call.began + call.took_s), call.service, call.container, who, `${(call.took_s * 1000).toFixed(1)} ms`, call.outcome];
 }
 
-async function note(on) {
+async function trace(on) {
   try {
     const { containers } = await door.post("/tracing", { on });
-    tell(`${on ? "Calls are noted" : "No more calls are noted"} in ${containers.join(", ") || "no container"}.`);
+    tell(`${on ? "Calls are traced" : "Calls are no longer traced"} in ${containers.join(", ") || "no container"}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);
   }
 }
 
-$("note-calls").onclick = () => note(true);
-$("note-no-calls").onclick = () => note(false);
+$("trace-calls").onclick = () => trace(true);
+$("stop-tracing").onclick = () => trace(false);
 $("call-reads").onchange = readCalls;
 $("call-search").oninput = showCalls;

@@ -8,7 +8,7 @@ import { button, degrees, draw, fixed, make, show, sleep, write } from "./page.j
 export const STATE_HZ = 5;
 const STALE_MS = 1500;
 const ASK_AGAIN_MS = 1000;
-const DEED_S = 60;
+const ACTION_S = 60;
 const MOST_LEAD_S = 1; // longest lead of a goal over the measurement
 
 /** The device behind the services of a group, and its last measurement. */
@@ -49,8 +49,8 @@ class Device {
         if (this.services.has("limits")) this.limits ??= await door.call(this.group, "limits");
         this.write_speed();
         const stream = { do: "stream", group: this.group, name: "state", hz: STATE_HZ };
-        const { id, ended } = door.begin(stream, (told) => {
-          this.#heard(told);
+        const { id, ended } = door.begin(stream, (message) => {
+          this.#heard(message);
           first();
         });
         this.#stream = id;
@@ -64,10 +64,10 @@ class Device {
     first();
   }
 
-  #heard(told) {
-    this.problem = told.failed ? told.failed.detail : "";
-    if (!told.sample) return;
-    this.state = told.sample.value;
+  #heard(message) {
+    this.problem = message.failed ? message.failed.detail : "";
+    if (!message.sample) return;
+    this.state = message.sample.value;
     this.#heard_at = performance.now();
   }
 
@@ -94,7 +94,7 @@ class Device {
   async act(name) {
     this.say("");
     try {
-      await door.call(this.group, name, {}, { deadline_s: DEED_S });
+      await door.call(this.group, name, {}, { deadline_s: ACTION_S });
     } catch (error) {
       this.refused(error);
     }
@@ -102,7 +102,7 @@ class Device {
 
   refused(error) {
     const known = error.title === "DeviceFault" && this.state?.fault && error.message.includes(this.state.fault);
-    const cure = this.deeds.get(this.constructor.cure)?.textContent;
+    const cure = this.actions.get(this.constructor.cure)?.textContent;
     if (known && cure) this.say(`That fault is in the way. When its cause is gone: ${cure}.`);
     else this.say(`${error.title}: ${error.message}`);
     this.resume.hidden = error.title !== "Stopped";
@@ -131,17 +131,17 @@ class Device {
     this.stopping = button("Stop", () => this.stop(), { class: "stop", "aria-label": `Stop ${this.name}` });
     this.hands = make("div", { class: "hands" }, this.stopping);
     const offered = this.constructor.offers.filter(([name]) => this.services.has(name));
-    this.deeds = new Map(offered.map(([name, text]) => [name, this.deed(name, text)]));
+    this.actions = new Map(offered.map(([name, text]) => [name, this.action(name, text)]));
     this.number = make("span", { class: "number" });
     const title = make("h4", {}, this.number, this.name);
     const notes = make("div", { class: "notes", tabindex: 0, "aria-label": `Notes on ${this.name}`, role: "group" }, this.trouble, this.message, this.resume);
     const owner = make("p", { class: "owner" }, "Locked by ", this.locked);
-    const deeds = this.deeds.size ? make("div", { class: "deeds" }, ...this.deeds.values()) : null;
-    const parts = [title, this.badges, this.picture(), this.figures, owner, this.hands, deeds, notes];
+    const actions = this.actions.size ? make("div", { class: "actions" }, ...this.actions.values()) : null;
+    const parts = [title, this.badges, this.picture(), this.figures, owner, this.hands, actions, notes];
     return make("li", { class: "device", id: `at-${this.group}` }, ...parts);
   }
 
-  deed(name, text) {
+  action(name, text) {
     const about = this.services.get(name).doc.split("\n\n")[0];
     return button(text, () => this.act(name), { "aria-label": `${text} ${this.name}`, title: about });
   }
@@ -157,7 +157,7 @@ class Device {
   paint() {
     const jogs = this.limits && this.may(this.constructor.moved_by) && door.connected;
     for (const jog of this.jogs) jog.let(jogs);
-    for (const [name, deed] of this.deeds) deed.disabled = !(this.may(name) && door.connected);
+    for (const [name, action] of this.actions) action.disabled = !(this.may(name) && door.connected);
     this.stopping.disabled = !door.connected;
     const { state } = this;
     const silent = this.problem || (state ? this.stale && "not heard of lately" : "no data yet");

@@ -36,9 +36,9 @@ class Door {
     if (body) headers["Content-Type"] = "application/json";
     const options = { method, headers, body: body && JSON.stringify(body), cache: "no-store" };
     const answer = await fetch(path, { ...options, signal: AbortSignal.timeout(within_ms) });
-    const told = await answer.json();
-    if (!answer.ok) throw new Refused(told);
-    return told;
+    const content = await answer.json();
+    if (!answer.ok) throw new Refused(content);
+    return content;
   }
 
   get(path, within_ms = SILENT_MS) {
@@ -80,22 +80,22 @@ class Door {
     this.#under_way.clear();
   }
 
-  #hear(told) {
-    if (told.event === "lock_lost") {
-      this.locks.delete(told.lock);
+  #hear(message) {
+    if (message.event === "lock_lost") {
+      this.locks.delete(message.lock);
       this.on_loss();
-      tell(`A lock was lost: ${told.problem.detail}`);
+      tell(`A lock was lost: ${message.problem.detail}`);
       return;
     }
-    const waiting = this.#under_way.get(told.id);
+    const waiting = this.#under_way.get(message.id);
     if (!waiting) return;
-    if (!("result" in told) && !("problem" in told)) {
-      waiting.heard(told);
+    if (!("result" in message) && !("problem" in message)) {
+      waiting.heard(message);
       return;
     }
-    this.#under_way.delete(told.id);
-    if ("problem" in told) waiting.reject(new Refused(told.problem));
-    else waiting.resolve(told.result);
+    this.#under_way.delete(message.id);
+    if ("problem" in message) waiting.reject(new Refused(message.problem));
+    else waiting.resolve(message.result);
   }
 
   /** Begin an operation; `heard` gets its messages, `ended` its result. */

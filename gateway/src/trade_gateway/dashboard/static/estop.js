@@ -11,7 +11,7 @@ let pressed = null; // result of the last press here: the id that all have confi
 
 async function pressEstop() {
   releaseAll();
-  say({ wrong: "Stopping everything … NOBODY HAS CONFIRMED IT YET." });
+  say({ wrong: "Stopping everything … NO ROBOT HAS CONFIRMED IT YET." });
   try {
     say(outcomeOf(await door.estop("dashboard")));
   } catch (error) {
@@ -25,17 +25,17 @@ function say(outcome) {
   showEstops();
 }
 
-function outcomeOf(told) {
-  const failed = Object.entries(told.failed).map(([who, why]) => `${who}: ${why}`);
-  const apart = Object.entries(told.apart).map(([where, why]) => `${where}: ${why}`);
+function outcomeOf(report) {
+  const failed = Object.entries(report.failed).map(([who, why]) => `${who}: ${why}`);
+  const apart = Object.entries(report.apart).map(([where, why]) => `${where}: ${why}`);
   const wrong = [
-    told.confirmed.length ? "" : "NO ROBOT CONFIRMED",
-    told.missing.length ? `NOT CONFIRMED by ${told.missing.join(", ")}` : "",
+    report.confirmed.length ? "" : "NO ROBOT CONFIRMED",
+    report.missing.length ? `NOT CONFIRMED by ${report.missing.join(", ")}` : "",
     failed.length ? `FAILED at ${failed.join("; ")}` : "",
-    apart.length ? `NOT TOLD to who is at ${apart.join("; ")}` : "",
+    apart.length ? `NO CONTAINER REACHED at ${apart.join("; ")}` : "",
   ].filter(Boolean).join("; ");
-  const rest = told.confirmed.length ? `Confirmed by ${told.confirmed.join(", ")}.` : "";
-  return wrong || !told.complete ? { wrong: `✕ ${wrong || "NOT CONFIRMED BY ALL"}: ${CUT}`, rest } : { id: told.id, rest };
+  const rest = report.confirmed.length ? `Confirmed by ${report.confirmed.join(", ")}.` : "";
+  return wrong || !report.complete ? { wrong: `✕ ${wrong || "NOT CONFIRMED BY ALL"}: ${CUT}`, rest } : { id: report.id, rest };
 }
 
 export async function lookForEstops() {
@@ -64,9 +64,9 @@ function showEstops() {
 
 async function clearEstop(open) {
   try {
-    const told = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
+    const report = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
     pressed = null;
-    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself; what it stopped must be resumed first." : `Not cleared by ${told.missing.join(", ") || "any visible container"}.`);
+    tell(report.complete ? "The e-stop is cleared. Nothing moves by itself; what it stopped must be resumed first." : `Not cleared by ${report.missing.join(", ") || "any visible container"}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);
   }

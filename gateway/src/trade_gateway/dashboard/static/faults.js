@@ -9,8 +9,8 @@ const COLUMNS = ["Device", "Fault", "Now", "Seen by", "What to do", "Times", "La
 export async function lookAtFaults() {
   const logs = services.filter((one) => one.name === "faults" && one.group.endsWith(".faults"));
   const open_only = $("open-faults").checked;
-  const told = await Promise.all(logs.filter((one) => one.allowed).map((one) => faultsOf(one, open_only)));
-  const rows = told.flat().sort((one, other) => other.last_at - one.last_at).map(rowOf);
+  const lists = await Promise.all(logs.filter((one) => one.allowed).map((one) => faultsOf(one, open_only)));
+  const rows = lists.flat().sort((one, other) => other.last_at - one.last_at).map(rowOf);
   const none = open_only ? "Nothing is wrong." : "No fault is known.";
   table($("fault-list"), "Faults, the latest first", COLUMNS, rows, logs.length ? none : "No robot that you may see keeps a log of faults.");
 }

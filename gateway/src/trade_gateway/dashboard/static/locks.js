@@ -11,8 +11,8 @@ export async function lookForLocks() {
   locks = await door.get("/locks");
   const mine = new Map([...door.locks].map(([lock, resources]) => [[...resources].sort().join(), lock]));
   const nameOf = (one) => mine.get([...one.resources].sort().join());
-  const told = JSON.stringify([locks, [...door.locks.keys()]]);
-  show($("lock-list"), told, () => (locks.length ? locks.map((one) => lockCard(one, nameOf(one))) : [make("li", { class: "note" }, "Nothing is locked.")]));
+  const key = JSON.stringify([locks, [...door.locks.keys()]]);
+  show($("lock-list"), key, () => (locks.length ? locks.map((one) => lockCard(one, nameOf(one))) : [make("li", { class: "note" }, "Nothing is locked.")]));
 }
 
 function lockCard(one, mine) {

@@ -1,6 +1,6 @@
 // Elements of the page, and how things are said on it. Text is only ever set as text.
 
-const TOLD_FOR_MS = 10000;
+const SHOWN_FOR_MS = 10000;
 
 export const $ = (id) => document.getElementById(id);
 export const sleep = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -42,13 +42,13 @@ export const degrees = (rad) => `${fixed((rad * 180) / Math.PI, 1)}°`;
 export const moment = (seconds) => new Date(seconds * 1000).toLocaleString();
 export const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString();
 
-let told_for = 0;
+let hiding = 0;
 
 /** Show a message for a short time. */
 export function tell(text) {
-  write($("told"), text);
-  clearTimeout(told_for);
-  told_for = setTimeout(() => write($("told"), ""), TOLD_FOR_MS);
+  write($("notice"), text);
+  clearTimeout(hiding);
+  hiding = setTimeout(() => write($("notice"), ""), SHOWN_FOR_MS);
 }
 
 /** A table; a cell is a text, or what a button says and does: `{ label, act, name }`. Without rows, a sentence. */

@@ -59,7 +59,7 @@ function formOf(one) {
     try {
       const args = Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
       const asked = { do: "call", group: one.group, name: one.name, container: one.container, args, deadline_s: 60 };
-      const { id, ended } = door.begin(asked, (told) => write(result, `… ${JSON.stringify(told.progress)}`));
+      const { id, ended } = door.begin(asked, (message) => write(result, `… ${JSON.stringify(message.progress)}`));
       cancel.dataset.call = id;
       [cancel.hidden, run.disabled] = [false, true];
       write(result, "under way …");

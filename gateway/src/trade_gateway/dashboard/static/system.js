@@ -29,9 +29,9 @@ export async function lookAtContainers() {
   table($("container-list"), "Containers, over the last second", ["Container", "Identity", "Host", "CPU", "Host’s CPU", "Memory", "Calls", "Running"], rows, "There is no container.");
 }
 
-export async function lookAtWatchers() {
+export async function lookAtNotifications() {
   if (!door.me.reads) {
-    table($("watcher-list"), "", [], [], "This needs the right to read the system (group trade).");
+    table($("notification-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
   const [standing, hooks] = await Promise.all([door.get("/notifications"), door.get("/hooks")]);
@@ -39,7 +39,7 @@ export async function lookAtWatchers() {
     ...standing.map((one) => [one.occasion, one.call, one.condition || "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || one.state]),
     ...hooks.map((one) => [`${one.side} ${one.target}`, one.call, "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || (one.suspended ? "suspended" : "attached")]),
   ];
-  table($("watcher-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "There are no notifications and no hooks.");
+  table($("notification-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "There are no notifications and no hooks.");
 }
 
 export async function lookAtPolicy() {
@@ -58,8 +58,8 @@ export async function lookAtPolicy() {
 }
 
 async function lookAtRules() {
-  const told = services.filter((one) => one.name === "rules" && one.group === "rules" && one.allowed);
-  const found = await Promise.all(told.map((one) => door.call("rules", "rules", {}, { container: one.container })));
+  const engines = services.filter((one) => one.name === "rules" && one.group === "rules" && one.allowed);
+  const found = await Promise.all(engines.map((one) => door.call("rules", "rules", {}, { container: one.container })));
   const rows = found.flat().map((one) => [one.name, one.occasion, one.condition || "—", one.container, `${one.fired}`, `${one.failed}`, one.why || one.last_error || one.state]);
   table($("rule-list"), "Rules by which the system configures itself", ["Rule", "Occasion", "Condition", "Runs in", "Fired", "Failed", "State"], rows, "There are no rules.");
 }
