@@ -76,9 +76,9 @@ class Judge:
 
     def walked(self, began_s: float, stood_s: float) -> None:
         """Checks three steps: only the owner of the legs moved them, and the head moved at the same time."""
-        stands = walk.STAND[0]
+        standing_rad = walk.STAND[0]
         ends = [walk.FORWARD[0] if leg == "left" else walk.BACK[0] for leg in walk.STEPS]
-        expected = {"legs.left.hip": [*ends, stands], "legs.right.hip": [*(-end for end in ends), stands]}
+        expected = {"legs.left.hip": [*ends, standing_rad], "legs.right.hip": [*(-end for end in ends), standing_rad]}
         say("of the drives and the servos:")
         for joint, through in expected.items():
             angles = [entry.position_rad or 0.0 for entry in self.rests(joint, began_s)]

@@ -77,10 +77,10 @@ def _came_back(judge: Judge, sim: SimProcess, stood: dict[str, float], killed_s:
     """Check that nothing moved by itself and that both have their state."""
     say("since the kill:")
     commands = motion_writes(sim.entries(), since=killed_s, bus="neck")
-    stands = _truth(sim)
-    angles_now = ", ".join(f"{joint} at {angle:+.3f} rad" for joint, angle in stands.items())
+    now = _truth(sim)
+    angles_now = ", ".join(f"{joint} at {angle:+.3f} rad" for joint, angle in now.items())
     print(f"    {len(commands)} writes that could move it; {angles_now}, as before")
-    if commands or judge.moves(PAN, killed_s) or stands != stood:
+    if commands or judge.moves(PAN, killed_s) or now != stood:
         raise DemoFailed(f"something moved by itself: it was at {stood}")
     angles = [state.position_rad for state in trade.call(where(name="state", kind="JointGroup") & HEAD)]
     level = trade.call(where(name="level") & LAMP)

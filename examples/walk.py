@@ -43,11 +43,11 @@ def walk() -> None:
             if leg.fault:
                 print(f"walk: {leg.name} had a fault: {leg.fault}", flush=True)
         enable()
-        stands = move_to(STAND + STAND, speed_rad_s=1.0)
+        reached = move_to(STAND + STAND, speed_rad_s=1.0)
         for leg in STEPS:
-            through = (stands, both(leg, LIFTED, STAND), both(leg, FORWARD, BACK))
+            through = (reached, both(leg, LIFTED, STAND), both(leg, FORWARD, BACK))
             points = [{"time_from_start_s": i * HALF_A_STEP_S, "positions_rad": at} for i, at in enumerate(through)]
-            stands = follow({"joints": joints(), "points": points})
+            reached = follow({"joints": joints(), "points": points})
             print(f"walk: a step with the {leg} leg", flush=True)
         move_to(STAND + STAND, speed_rad_s=1.0)
         print("walk: I stand", flush=True)
