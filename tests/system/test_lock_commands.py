@@ -190,8 +190,8 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
         (["lock", "nowhere", "--wait", "0", "--", "true"], 1, "NoSuchService: no service matches group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
-        (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: no other container was found in system test-"),
-        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NobodyFound: no other container was found in system test-"),
+        (["estop", "--clear", "--limit", "0.2"], 1, "NoContainerFound: no other container was found in system "),
+        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NoContainerFound: no other container was found in system "),
     ],
 )
 def test_wrong_words_are_answered_in_one_line(
@@ -209,7 +209,7 @@ def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
 ) -> None:
     said = trade_command("--connect", nobody_there, *words)
     assert (said.returncode, said.stdout) == (1, "")
-    assert said.stderr.startswith("NobodyFound: no other container was found in system test-")
+    assert said.stderr.startswith("NoContainerFound: no other container was found in system test-")
     assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
 
 

@@ -18,7 +18,7 @@ PEER = Path(__file__).with_name("peer.py")
 NOTICED_BY = {
     "runs-late": "late-is-never",
     "runs-twice": "once",
-    "forgets-the-latest": "once-for-ever",
+    "forgets-the-latest": "once-without-expiry",
     "ignores-locks": "locks",
     "ignores-sessions": "session-ends",
     "ignores-stops": "stops",
@@ -38,7 +38,7 @@ NOTICED_BY = {
     "endless-leases": "leases",
     "grants-what-moves": "waits-for-motion",
     "answers-nonsense": "turns",
-    "tells-no-tally": "tells-late",
+    "tells-no-tally": "reports-late",
 }
 """What is broken, and which check has to fail."""
 

@@ -277,7 +277,7 @@ def test_S09_an_e_stop_holds_until_it_is_cleared(door: Opened) -> None:
 def test_S09_a_door_that_finds_nobody_does_not_say_that_none_is_open(tmp_path: Path) -> None:
     with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
         refused = Client(made.url, add_token(tokens, "anna")).ask("POST", "/estop/clear")
-        assert (refused.status, refused.title) == (503, "NobodyFound")
+        assert (refused.status, refused.title) == (503, "NoContainerFound")
 
 
 def test_S09_an_e_stop_that_nobody_was_told_is_no_success_and_stays_open(tmp_path: Path) -> None:
@@ -285,7 +285,7 @@ def test_S09_an_e_stop_that_nobody_was_told_is_no_success_and_stays_open(tmp_pat
         anna = Client(made.url, add_token(tokens, "anna"))
         assert anna.ask("GET", "/sight").body == {"others": [], "silent": [], "apart": {}}
         refused = anna.ask("POST", "/estop", {"reason": "smoke"})
-        assert (refused.status, refused.title) == (503, "NobodyFound")
+        assert (refused.status, refused.title) == (503, "NoContainerFound")
         assert "use the switch that cuts the power" in refused.body["detail"]
         [known] = anna.ask("GET", "/estops").body
         assert known["id"] in refused.body["detail"]

@@ -129,7 +129,7 @@ class Settings:
         if certificate is not None:
             for endpoint in self.listen or ("tls/127.0.0.1:0",):
                 certificate.check_is_for(Endpoint.read(dialled_from_here(Endpoint.read(endpoint))).host)
-        if self.credentials is not None and not _can_be_told(*self.credentials):
+        if self.credentials is not None and not _can_be_stored(*self.credentials):
             problem = "user and password must be printable, without spaces around them, and the user without a colon"
             raise ConfigurationError(where="credentials", problem=problem)
         for endpoint in self.connect:
@@ -358,7 +358,7 @@ def _credentials(text: str | None) -> tuple[str, str] | None:
     return user, password
 
 
-def _can_be_told(user: str, password: str) -> bool:
+def _can_be_stored(user: str, password: str) -> bool:
     """Whether the transport's file of users can hold them."""
     fit = all(text and text.isprintable() and text == text.strip() for text in (user, password))
     return fit and ":" not in user

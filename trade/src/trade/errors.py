@@ -22,7 +22,7 @@
     `-- SetupError             the installation or the configuration must change
         |-- ConfigurationError
         |   `-- WrongDevice
-        `-- CannotConnect, NobodyFound, CannotStart, LinkStays
+        `-- CannotConnect, NoContainerFound, CannotStart, LinkStays
 
 Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
 builtin that a Python programmer would catch for it, so ``except TimeoutError`` catches a deadline that passed.
@@ -63,13 +63,13 @@ __all__ = [
     "LockedByOther",
     "MigrationUnknown",
     "MotionStopped",
+    "NoContainerFound",
     "NoSuchCall",
     "NoSuchClass",
     "NoSuchEstop",
     "NoSuchHook",
     "NoSuchNotification",
     "NoSuchService",
-    "NobodyFound",
     "NotInstantiable",
     "NotLocked",
     "NotSerialisable",
@@ -749,7 +749,7 @@ class CannotConnect(SetupError, ConnectionError):
 
 
 @dataclass(kw_only=True, eq=False)
-class NobodyFound(SetupError, ConnectionError):
+class NoContainerFound(SetupError, ConnectionError):
     """No other container was found in the system, or some are missing, so the request has no reliable answer."""
 
     system: str

@@ -126,8 +126,8 @@ def say_error(error: BaseException) -> None:
     """Prints an error's name and message on standard error, with remedies as commands."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     message = str(error)
-    for remedy, ours in REMEDIES.items():
-        message = message.replace(remedy, ours)
+    for remedy, command in REMEDIES.items():
+        message = message.replace(remedy, command)
     if isinstance(error, DeviceFault):
         message = as_commands(error.device, message)
     console.print(f"[bold red]{type(error).__name__}[/]: {escape(message)}")

@@ -39,14 +39,14 @@ def visitor_among_others(context: typer.Context) -> Container:
     """Opens the same for queries: if the settings name endpoints, one of them has to answer.
 
     Raises:
-        NobodyFound: none of these endpoints answers; with the reason, if known.
+        NoContainerFound: none of these endpoints answers; with the reason, if known.
     """
     container = visitor(context)
     try:
         if container.settings.connect and len(container.addresses()) == 1:
             reachability = container.reachability(limit_s=_PATIENCE_S)
             if not reachability.others:
-                raise reachability.nobody(container.settings.system)
+                raise reachability.as_error(container.settings.system)
     except BaseException:
         container.close()
         raise

@@ -285,18 +285,24 @@ class ClientApi:
         """Stops everything in the system.
 
         Raises:
-            NobodyFound: no container is known to have received it. It is open here; joining containers receive it.
+            NoContainerFound: no container is known to have received it. It is open here; joining containers receive it.
         """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
         report = await self.apart(self._container.estop, reason, stops=True)
         look = partial(self._container.reachability, limit_s=0)
         reachability = await self.apart(look, stops=True)  # only after the e-stop, as it waits
         if not (report.confirmed or report.missing or report.failed):
-            raise reachability.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_RECEIVED}")
+            raise reachability.as_error(self._container.settings.system, f"e-stop {report.id}: {_NOT_RECEIVED}")
         return _stopped(report, reachability)
 
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
-        """Clears e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and a container is silent."""
+        """Clears e-stops.
+
+        Raises:
+            AccessDenied: the client may not administer the system.
+            NoSuchEstop: none of these e-stops is open.
+            NoContainerFound: no e-stop is known, and a container does not answer.
+        """
         ids = body.ids or [one.id for one in self._container.estops()]
         self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
         if not ids:
@@ -315,7 +321,7 @@ class ClientApi:
     def _require_answers(self) -> None:
         reachability = self._container.reachability(limit_s=_ANSWERED_S)
         if not reachability.complete:
-            raise reachability.nobody(self._container.settings.system, "so an open e-stop may be unknown here")
+            raise reachability.as_error(self._container.settings.system, "so an open e-stop may be unknown here")
 
     def estops(self, who: str) -> list[messages.EstopView]:
         """The open e-stops. Raises AccessDenied: an identity may do nothing here but stop."""
@@ -364,7 +370,7 @@ class _Notified:
         self._occasion = occasion
         self._judge = judge
         self._tell = tell
-        self.told_as = f"notify {client.identity} (a client of the HTTP gateway)"
+        self.target_text = f"notify {client.identity} (a client of the HTTP gateway)"
         """Its text in lists of notifications."""
 
     def hear(self, handle: Handle) -> None:

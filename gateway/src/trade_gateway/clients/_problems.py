@@ -39,7 +39,7 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
     (errors.NotSerialisable, HTTPStatus.BAD_REQUEST),
     (errors.ConfigurationError, HTTPStatus.BAD_REQUEST),
     (errors.Busy, HTTPStatus.SERVICE_UNAVAILABLE),
-    (errors.NobodyFound, HTTPStatus.SERVICE_UNAVAILABLE),
+    (errors.NoContainerFound, HTTPStatus.SERVICE_UNAVAILABLE),
     (errors.CallerError, HTTPStatus.CONFLICT),
     (errors.CallError, HTTPStatus.BAD_GATEWAY),
     (errors.DeviceError, HTTPStatus.BAD_GATEWAY),

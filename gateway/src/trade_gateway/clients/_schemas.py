@@ -254,7 +254,7 @@ class EstopView(Struct, frozen=True):
     by: str
     reason: str
     at: float
-    told_by: str = ""
+    told_by: str = ""  # plain: told
     """The container that reported it, if this is not its giver: the report may be false."""
 
 

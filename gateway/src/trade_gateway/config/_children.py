@@ -31,7 +31,7 @@ class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Resident memory above which it is ended; None: no limit."""
     lease_from: str = ""
     """A gateway of another host whose lease it needs to run here, and which runs it if this host is lost."""
-    stands_in_for: str = ""
+    stands_in_for: str = ""  # plain: stands
     """The gateway of another host that owns this container; it runs here while that host is lost."""
     lease_s: Annotated[float, Meta(ge=2, le=600)] = _LEASE_S
     """With ``stands_in_for``: how long that gateway has the container after its last sign of life."""

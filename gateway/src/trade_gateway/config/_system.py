@@ -16,7 +16,7 @@ from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, a
 
 __all__ = ["SystemPlan", "read_system_file"]
 
-_TELLS_ITSELF: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
+_SET_BY_GATEWAY: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
 """Keys that a gateway file sets instead of the system file."""
 
 _Text = Annotated[str, Meta(min_length=1)]
@@ -95,7 +95,7 @@ class _WithGateways(Tables):
 
     def check_kind(self, name: str, entry: Entry) -> None:
         super().check_kind(name, entry)
-        for key in _TELLS_ITSELF if entry.gateway else ():
+        for key in _SET_BY_GATEWAY if entry.gateway else ():
             if getattr(entry, key):
                 self.refuse(name, key, "is set in the gateway file; leave it out")
 

@@ -122,8 +122,8 @@ def passes_errors(stage: Stage) -> None:
         require("jammed" in str(found), f"the error of the suite's service arrived as {found!r}")
 
 
-@check("locks-ours", "S11", still=True)
-def locks_ours(stage: Stage) -> None:
+@check("locks-suite", "S11", still=True)
+def locks_suite(stage: Stage) -> None:
     """It takes a lock on the suite's resources, calls under it, and releases it."""
     with stage.voice() as anna, _lathe(stage) as lathe:
         reply = anna.answer(_relay(stage, anna, "cut", ["judge.lathe"], [1.0]))

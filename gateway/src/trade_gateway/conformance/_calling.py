@@ -114,8 +114,8 @@ def once(stage: Stage) -> None:
         require(stage.turns(anna) == began + 1, f"one call began {stage.turns(anna) - began} turns")
 
 
-@check("once-for-ever", "S02")
-def once_for_ever(stage: Stage) -> None:
+@check("once-without-expiry", "S02")
+def once_without_expiry(stage: Stage) -> None:
     """A call with the latest possible expiry is answered, does not run again, and does no harm."""
     peer, arm = stage.peer, stage.peer.arm
     with stage.voice() as anna:

@@ -130,7 +130,7 @@ class Stage:
                     stdin=subprocess.DEVNULL,
                     stdout=said,
                     stderr=subprocess.STDOUT,
-                    env={**_without_ours(os.environ), **self.environment()},
+                    env={**_without_settings(os.environ), **self.environment()},
                     start_new_session=True,  # it may be a shell, or start other processes: all of them are ended
                 )
         except OSError as bad:
@@ -297,5 +297,5 @@ def _is_boot(chunks: Sequence[str]) -> bool:
     return len(chunks) == 3 and all(map(is_chunk, chunks))
 
 
-def _without_ours(environment: Mapping[str, str]) -> dict[str, str]:
+def _without_settings(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not name.startswith("TRADE_") or "RUNTIME" in name}

@@ -15,7 +15,7 @@ from trade_gateway.conformance._environment import Stage
 from trade_gateway.conformance._peer import GROUP
 from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, error_of
 
-_ALL_TOLD_S = 3.0
+_CONFIRMED_WITHIN_S = 3.0
 _WATCHED_S = 0.5
 
 
@@ -98,11 +98,11 @@ def estop_reported(stage: Stage) -> None:
     """An e-stop by a container of this project is reported as complete, and so is its clearing."""
     arm = stage.peer.place("turn")
     stage.container.find(where(name="halt", group=GROUP), wait_s=PATIENCE_S)
-    report = stage.container.estop("a check", limit_s=_ALL_TOLD_S)
+    report = stage.container.estop("a check", limit_s=_CONFIRMED_WITHIN_S)
     try:
         require(report.complete and "peer/peer" in report.confirmed, f"the report of an e-stop says {report}")
     finally:
-        cleared = stage.container.estop_clear([report.id], limit_s=_ALL_TOLD_S)
+        cleared = stage.container.estop_clear([report.id], limit_s=_CONFIRMED_WITHIN_S)
     require(cleared.complete, f"the report of the clearing says {cleared}")
     stage.container.resume(where(name="turn", group=GROUP))
     with stage.voice() as anna:
@@ -152,7 +152,7 @@ def estop_kept(stage: Stage) -> None:
     """An e-stop is still open after a kill and a restart, even if other containers have cleared it meanwhile."""
     order = _with_voice(stage, lambda bob: _ordered(stage, bob))
     stage.kill()
-    stage.container.estop_clear([order.request], limit_s=_ALL_TOLD_S)
+    stage.container.estop_clear([order.request], limit_s=_CONFIRMED_WITHIN_S)
     with stage.voice("anna") as anna:  # this starts it
         try:
             require(order.request in _shown(stage), "after its restart the e-stop is not open any more")

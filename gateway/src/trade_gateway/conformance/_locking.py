@@ -56,7 +56,7 @@ def locks(stage: Stage) -> None:
         bob.result(arm, "turn", here_rad)
 
 
-@check("locks-told", "S11")  # plain: told
+@check("locks-shown", "S11")
 def locks_shown(stage: Stage) -> None:
     """locks shows what is held, by which owner and for what purpose; a refusal names the owner."""
     arm = stage.peer.arm
@@ -76,18 +76,18 @@ def locks_shown(stage: Stage) -> None:
         _release(anna, lock)
 
 
-@check("locked-by-ours", "S11")
-def locked_by_ours(stage: Stage) -> None:
+@check("locked-by-suite", "S11")
+def locked_by_suite(stage: Stage) -> None:
     """A container of this project locks its group as a whole, keeps the lock and turns the arm under it."""
-    ours = stage.container
-    turn = ours.find(where(name="turn", group=GROUP), wait_s=PATIENCE_S)
+    suite = stage.container
+    turn = suite.find(where(name="turn", group=GROUP), wait_s=PATIENCE_S)
     with stage.voice() as anna:
         here_rad = stage.angle(anna)
-        with ours.lock(where(group=GROUP), purpose="a check", lease_s=_LEASE_S) as lock:
+        with suite.lock(where(group=GROUP), purpose="a check", lease_s=_LEASE_S) as lock:
             require("peer.arm" in lock.resources, f"what was locked is {lock.resources}")
             threading.Event().wait(2 * _LEASE_S)
             require(turn(here_rad) == here_rad, "turn answered something else")
-            require([info.token for info in ours.locks()] == list(lock.tokens()), f"the locks are {ours.locks()}")
+            require([info.token for info in suite.locks()] == list(lock.tokens()), f"the locks are {suite.locks()}")
             refused = error_of(anna.ask(stage.peer.arm, "turn", here_rad))
             require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
         anna.result(stage.peer.arm, "turn", here_rad)

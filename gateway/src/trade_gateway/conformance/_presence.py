@@ -81,8 +81,8 @@ def describes(stage: Stage) -> None:
         require(own[name].effect == effect, f"trade.{name} has the effect {own[name].effect!r}, not {effect!r}")
 
 
-@check("tells-late", "Presence and registry", still=True)  # plain: tells
-def tells_late(stage: Stage) -> None:
+@check("reports-late", "Presence and registry", still=True)
+def reports_late(stage: Stage) -> None:
     """It publishes its tally at least every sixteen seconds."""
     with stage.listening(tally_key(stage.peer.address)) as heard:
         eventually(lambda: len(heard) > 0, "it did not publish its tally", _TALLY_S)

@@ -74,10 +74,10 @@ class Actor:
             raise DrillFailed(problem=f"the {self.name} was not ready within {within_s:g} s") from None
         if not line:
             raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}")
-        told: dict[str, Any] = json.loads(line)
-        if "error" in told:
-            raise DrillFailed(problem=f"the {self.name} says {told['error']}")
-        return told
+        message: dict[str, Any] = json.loads(line)
+        if "error" in message:
+            raise DrillFailed(problem=f"the {self.name} says {message['error']}")
+        return message
 
     def objection(self) -> str:
         """The error that it reports; empty if there is no message."""

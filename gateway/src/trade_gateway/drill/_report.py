@@ -75,9 +75,9 @@ class Report(Struct, frozen=True, kw_only=True):
 def as_data(report: Report) -> dict[str, Any]:
     """The report as plain data, with the verdicts."""
     data: dict[str, Any] = msgspec.to_builtins(report)
-    for played, told in zip(report.scenes, data["scenes"], strict=True):
-        told["ok"] = played.ok
-        for stop, row in zip(played.stops, told["stops"], strict=True):
+    for played, scene in zip(report.scenes, data["scenes"], strict=True):
+        scene["ok"] = played.ok
+        for stop, row in zip(played.stops, scene["stops"], strict=True):
             row["verdict"] = stop.verdict
     return {"ok": report.ok, **data}
 

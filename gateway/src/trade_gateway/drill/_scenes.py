@@ -123,8 +123,8 @@ SCENES: Final = (
 
 def limit_s(scene: Scene, target: Target, given: Drill) -> float:
     """How soon after the failure a joint must be at rest, in seconds: by the robot file, or by the rule."""
-    told: float | None = getattr(given, scene.name)
-    if told is not None:
-        return told
+    given_s: float | None = getattr(given, scene.name)
+    if given_s is not None:
+        return given_s
     noticed_s = target.watchdog_s if scene.noticed_s is None else scene.noticed_s
     return noticed_s + target.brakes_s + ALLOWANCE_S

@@ -101,7 +101,7 @@ class _Line:
         if self._next is not None:
             return await asyncio.shield(self._next)
         shared = self._next = asyncio.get_running_loop().create_future()
-        shared.add_done_callback(lambda told: told.cancelled() or told.exception())  # it may be shared by no request
+        shared.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may be shared by no request
         try:
             async with self._places:
                 self._next = None
@@ -311,8 +311,8 @@ class Conversation:
 
     async def _watch(self, asked: messages.Watch) -> None:
         def tell(occasion: str, handle: Handle) -> None:
-            told = self._api.view(self._client.identity, handle)
-            self._post({"id": asked.id, "event": occasion, "service": told})
+            view = self._api.view(self._client.identity, handle)
+            self._post({"id": asked.id, "event": occasion, "service": view})
 
         standing = await self._api.apart(self._api.watch, self._client, asked, tell)
         try:

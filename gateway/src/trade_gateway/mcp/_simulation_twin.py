@@ -108,16 +108,16 @@ class Twin:
 
     def _place(self, here: Container, group: str, state: Any) -> bool:
         """Brings a group to the real one's position; returns whether it arrived."""
-        told = msgspec.to_builtins(state)
+        plain = msgspec.to_builtins(state)
         try:
-            match told:
-                case list() if told:
-                    angles = [one["position_rad"] for one in cast("list[dict[str, Any]]", told)]
+            match plain:
+                case list() if plain:
+                    angles = [one["position_rad"] for one in cast("list[dict[str, Any]]", plain)]
                     self._do(here, group, "move_to", angles)
                 case {"positions_rad": list()}:
                     self._do(here, group, "power_on")
                     self._do(here, group, "release_brakes")
-                    self._do(here, group, "move_joints", told["positions_rad"])
+                    self._do(here, group, "move_joints", plain["positions_rad"])
                 case {"position_rad": float() | int() as angle}:
                     self._do(here, group, "move_to", angle)
                 case {"width_m": float() | int() as width}:

@@ -138,9 +138,9 @@ class Sources:
     def _arm(self, handle: Handle, sample: Sample) -> Message:
         names = self._arms.get(handle)
         if names is None:
-            limits = where(name="limits", group=handle.groups[0], container=handle.container, kind="Arm")
-            told = self._container.find(limits, wait_s=0).with_(deadline_s=_LIMITS_S)()
-            names = self._arms[handle] = [joint.name for joint in told.joints]
+            service = where(name="limits", group=handle.groups[0], container=handle.container, kind="Arm")
+            limits = self._container.find(service, wait_s=0).with_(deadline_s=_LIMITS_S)()
+            names = self._arms[handle] = [joint.name for joint in limits.joints]
         return _joints(handle, sample, names)
 
     def labels(self) -> list[str]:

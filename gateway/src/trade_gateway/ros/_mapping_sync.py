@@ -79,8 +79,8 @@ class Following:
         self._look_now = threading.Event()
         self._closing = False
         self._first = threading.Event()
-        hear = _Heard(self._look_now.set)
-        self._notifications = [ask(where(), hear.told) for ask in (container.joined, container.left, container.changed)]
+        news = _Heard(self._look_now.set)
+        self._notifications = [ask(where(), news.came) for ask in (container.joined, container.left, container.changed)]
         self._thread = threading.Thread(target=self._follow, name="trade-ros-following", daemon=True)
         self._thread.start()
 
@@ -176,13 +176,13 @@ class Following:
 class _Heard:
     """Receives notifications of services that come, go and change."""
 
-    told_as = "update the mappings to ROS (the ROS bridge)"
+    target_text = "update the mappings to ROS (the ROS bridge)"
     """Its text in lists of notifications."""
 
     def __init__(self, look: Callable[[], object]) -> None:
         self._look = look
 
-    def told(self, _: Handle) -> None:
+    def came(self, _: Handle) -> None:
         self._look()
 
 

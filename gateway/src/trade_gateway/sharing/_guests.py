@@ -16,12 +16,12 @@ _AGAIN_S: Final = 0.2
 class _Guest:
     """A guest in one other system."""
 
-    def __init__(self, ours: Container, settings: Settings, share: Share) -> None:
+    def __init__(self, home: Container, settings: Settings, share: Share) -> None:
         with ExitStack() as leaving:
-            self.ours = ours
+            self.home = home
             self.container = opened(settings)
             leaving.callback(self.container.close)
-            self.border = Border(ours, self.container, exported=share.export, imported=share.import_)
+            self.border = Border(home, self.container, exported=share.export, imported=share.import_)
             leaving.callback(self.border.close)
             self._leaving = leaving.pop_all()
 
@@ -35,19 +35,19 @@ class Guests:
     def __init__(self) -> None:
         self._guests: dict[str, _Guest] = {}
 
-    def apply(self, ours: Container, plan: Plan) -> None:
+    def apply(self, home: Container, plan: Plan) -> None:
         """Opens and closes guests as the file says; unchanged ones are not disturbed.
 
         Raises:
             ConfigurationError: one of them cannot be started; the others are as the file says.
         """
         for name, guest in list(self._guests.items()):
-            if plan.shares.get(name) != guest.container.settings or guest.ours is not ours:
+            if plan.shares.get(name) != guest.container.settings or guest.home is not home:
                 self._guests.pop(name).close()
         for name, share in plan.file.share.items():
             guest = self._guests.get(name)
             if guest is None:
-                self._guests[name] = _Guest(ours, plan.shares[name], share)
+                self._guests[name] = _Guest(home, plan.shares[name], share)
             else:
                 guest.border.share(exported=share.export, imported=share.import_)
 

@@ -200,7 +200,7 @@ class _Rule(NamedTuple):
 
 _LOCKS: Final = frozenset(("break_lock", "request_release"))
 _STOPS: Final = frozenset(("estop", "estop_clear", "resume"))
-_TABLE_TELLS: Final = frozenset(("acquire",))
+_REPORTED_BY_TABLE: Final = frozenset(("acquire",))
 """The lock table reports these itself, in more detail; only their refusals are reported here."""
 _SILENT: Final = frozenset(
     ("renew", "release", "release_requested", "notification_failed", "hook_suspended", "listen", "unlisten")
@@ -230,8 +230,8 @@ def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
         return None
     if effect == "read":
         return _Rule("read", always=True, about=False)
-    kind: Kind = "lock" if name in _LOCKS or name in _TABLE_TELLS else "stop" if name in _STOPS else "configure"
-    return _Rule(kind, name not in _TABLE_TELLS, about=True)
+    kind: Kind = "lock" if name in _LOCKS or name in _REPORTED_BY_TABLE else "stop" if name in _STOPS else "configure"
+    return _Rule(kind, name not in _REPORTED_BY_TABLE, about=True)
 
 
 class Audited(Interceptor):

@@ -103,8 +103,8 @@ def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
 
 def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
     """The endpoints that this container can link to: all of a system have certificates, or none has."""
-    ours = [endpoint for endpoint in endpoints if (Endpoint.read(endpoint).protocol == "tls") == certified]
-    if others := [endpoint for endpoint in endpoints if endpoint not in ours]:
+    linkable = [endpoint for endpoint in endpoints if (Endpoint.read(endpoint).protocol == "tls") == certified]
+    if others := [endpoint for endpoint in endpoints if endpoint not in linkable]:
         kinds = ("without certificates", "with certificates")
         _logger.warning(
             "%s: %s, and this container is %s: they cannot be linked. Set TRADE_TLS for the whole system or for none",
@@ -112,7 +112,7 @@ def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
             kinds[not certified],
             kinds[certified],
         )
-    return ours
+    return linkable
 
 
 def _nearest(listen: list[str]) -> str:

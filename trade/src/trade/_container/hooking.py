@@ -25,7 +25,7 @@ class Hook:
     def __init__(self, home: "Hooking", name: str, side: Side, target: Handle | Constraint, call: Handle) -> None:
         self.id: Final = name
         """Its id, unique in the system."""
-        self.told_as: Final = f"hook {name}"
+        self.target_text: Final = f"hook {name}"
         self.side: Final[Side] = side
         self.target: Final = target
         self.call: Final = call

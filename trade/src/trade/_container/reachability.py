@@ -8,7 +8,7 @@ from msgspec import Struct
 from trade._discovery.dialer import Dialer
 from trade._protocol.keys import Address
 from trade._registry.registry import Registry
-from trade.errors import NobodyFound
+from trade.errors import NoContainerFound
 
 __all__ = ["Reachability", "look_around"]
 
@@ -39,14 +39,15 @@ class Reachability(Struct, frozen=True):
         """Whether it found a container at each endpoint, and all have listed their services."""
         return bool(self.others) and not self.silent and not self.apart
 
-    def nobody(self, system: str, so: str = "") -> NobodyFound:
+    def as_error(self, system: str, so: str = "") -> NoContainerFound:
         """The error of a request that has no reliable answer, because containers are missing.
 
         Args:
             system: the system of the request.
             so: what is unknown therefore.
         """
-        return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
+        others, apart = bool(self.others), self.unanswered
+        return NoContainerFound(system=system, so=so, others=others, silent=self.silent, apart=apart)
 
 
 def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Reachability:

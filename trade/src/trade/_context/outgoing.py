@@ -17,7 +17,7 @@ from trade.errors import Cancelled, LockLost, NotLocked
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
-_NOBODY: Final = Behalf()
+_NO_BEHALF: Final = Behalf()
 
 
 class Claim(Struct, frozen=True):
@@ -125,7 +125,7 @@ class Inherited(Struct, gc=False):
             _require_held(locks, record)
         if outer is None:
             return Behalf((), (), tokens) if tokens else None
-        inherited = outer.behalf or _NOBODY
+        inherited = outer.behalf or _NO_BEHALF
         if effect != "stop":
             tokens += inherited.tokens
         return Behalf(outer.sessions, (outer.id, *inherited.calls), tokens)

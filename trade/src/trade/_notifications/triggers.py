@@ -153,11 +153,11 @@ def action_of(target: Target, host: str, where: str) -> Action:
 
 
 def text_of(target: Target) -> str:
-    """The target as text. Methods of the middleware's own objects are described by the object's ``told_as``."""
+    """The target as text. Methods of the middleware's own objects are described by the object's ``target_text``."""
     if isinstance(target, Action):
         return str(target)
-    told_as: str = getattr(getattr(target, "__self__", None), "told_as", "")
-    if told_as:
-        return told_as
+    target_text: str = getattr(getattr(target, "__self__", None), "target_text", "")
+    if target_text:
+        return target_text
     owner: Mapping[str, Any] | Any = getattr(target, "__qualname__", None)
     return f"{owner or repr(target)} (a function)"

@@ -141,7 +141,7 @@ class Estop(Struct, frozen=True, array_like=True, gc=False):
     reason: Annotated[str, Meta(max_length=500)]
     at: float
     """``time.time()`` there."""
-    told_by: Annotated[str, Meta(max_length=300)] = ""
+    told_by: Annotated[str, Meta(max_length=300)] = ""  # plain: told
     """``identity/container`` of the container that reported it, if neither that nor its identity gave it; empty: this
     container received the order itself. The reporter may have invented it."""
 
@@ -286,13 +286,13 @@ def decode_provider(payload: bytes) -> ProviderInfo:
         raise unread(payload, bad) from None
     if not all(is_chunk(estop.id) for estop in message.estops):
         raise Malformed(NO_CHUNK)
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         **structs.asdict(message),
         "services": services,
         "kind": intern(message.kind),
         "host": intern(message.host),
     }
-    return ProviderInfo(**told)
+    return ProviderInfo(**fields)
 
 
 def _service(data: bytes) -> ServiceInfo:

@@ -143,8 +143,8 @@ def loaded_type(path: str) -> type | None:
 
 def _same_fields(kind: type, definition: Mapping[str, Any]) -> bool:
     """Whether our type of that name equals the remote one: different programs or versions may use one name."""
-    [_], ours = msgspec.json.schema_components([kind], schema_hook=lambda _: {})
-    own = ours.get(kind.__name__, {})
+    [_], definitions = msgspec.json.schema_components([kind], schema_hook=lambda _: {})
+    own = definitions.get(kind.__name__, {})
     return all(set(own.get(part, ())) == set(definition.get(part, ())) for part in ("properties", "required", "enum"))
 
 

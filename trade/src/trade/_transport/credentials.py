@@ -69,8 +69,8 @@ def _private_file(text: str) -> Generator[Path]:
 
 def _check_private(path: Path) -> None:
     state = path.lstat()
-    ours = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not stat.S_IMODE(state.st_mode) & 0o077)
-    if not ours or not stat.S_ISREG(state.st_mode) or not state.st_size:
+    private = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not stat.S_IMODE(state.st_mode) & 0o077)
+    if not private or not stat.S_ISREG(state.st_mode) or not state.st_size:
         raise ConfigurationError(
             where=str(path), problem="must belong to this user alone; remove it, a new one is made"
         )

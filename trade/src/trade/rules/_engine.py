@@ -58,7 +58,7 @@ class _ActiveRule:
 
     def __init__(self, engine: "Rules", name: str, rule: Rule) -> None:
         self.name: Final = name
-        self.told_as: Final = f"rule {name}"
+        self.target_text: Final = f"rule {name}"
         self.rule: Final = rule
         self._engine = engine
         self.why = ""

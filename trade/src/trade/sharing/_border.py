@@ -45,26 +45,26 @@ class Border:
     A context manager; `close` withdraws everything. The containers stay open; their creators close them.
 
     Args:
-        ours: a container of one system.
-        theirs: a container of another one.
+        own: a container of one system.
+        other: a container of another one.
         exported: groups of our system that the other one sees and calls; ``*`` is all.
-        imported: groups of the other system that ours sees and calls.
+        imported: groups of the other system that ``own`` sees and calls.
 
     Raises:
         ConfigurationError: both containers belong to one system.
     """
 
     def __init__(
-        self, ours: Container, theirs: Container, *, exported: Sequence[str] = (), imported: Sequence[str] = ()
+        self, own: Container, other: Container, *, exported: Sequence[str] = (), imported: Sequence[str] = ()
     ) -> None:
-        names = [one.settings.system for one in (ours, theirs)]
+        names = [one.settings.system for one in (own, other)]
         if names[0] == names[1]:
             problem = "a system cannot be shared with itself; name another one"
             raise ConfigurationError(where=f"share with {names[0]}", problem=problem)
         with ExitStack() as leaving:
-            self.out = BorderDirection(ours, theirs, exported)
+            self.out = BorderDirection(own, other, exported)
             leaving.callback(self.out.close)
-            self.back = BorderDirection(theirs, ours, imported)
+            self.back = BorderDirection(other, own, imported)
             leaving.callback(self.back.close)
             self.out.reverse, self.back.reverse = self.back, self.out
             self.out.begin()
@@ -256,11 +256,11 @@ class BorderDirection:
         self, call: CallContext, wanted: Wanted, terms: LockRequest, on_lost: OnLost, on_request: OnRequest
     ) -> Lock:
         """Lock home resources for a remote client; renewed for as long as the client renews its lock there."""
-        ours = LockRequest(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
+        request = LockRequest(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
             return Lock(
-                self._home.locking.lease_client, ours, lambda: Selection(asked), on_lost, on_request, Claim()
+                self._home.locking.lease_client, request, lambda: Selection(asked), on_lost, on_request, Claim()
             ).acquire()
 
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:

@@ -21,7 +21,7 @@ class Severable(NamedTuple):
     other: Transport
     sever: Callable[[], None]
     """Disconnect them: when this returns or soon after, signs of life disappear on both sides."""
-    mend: Callable[[], None]
+    reconnect: Callable[[], None]
     """Reconnect them, within some time after this returns."""
 
 
@@ -36,29 +36,29 @@ class LossConformance(ABC):
         """Two linked transports, closed at the end."""
 
     def test_signs_of_life_fall_on_both_sides_and_rise_again(self) -> None:
-        with self.severable() as (one, other, sever, mend):
+        with self.severable() as (one, other, sever, reconnect):
             _signs = one.appear("alive/one"), other.appear("alive/other")
             far = RecordingListener(one.presences("alive/other")), RecordingListener(other.presences("alive/one"))
             assert [ear.next().payload for ear in far] == [b"", b""]
             sever()
             assert [ear.next().payload for ear in far] == [None, None]
             assert one.present("alive/**", PATIENCE_S) == ["alive/one"]
-            mend()
+            reconnect()
             assert [ear.next().payload for ear in far] == [b"", b""]
 
     def test_once_a_sign_has_risen_again_all_that_stands_is_told_when_asked(self) -> None:
-        with self.severable() as (one, other, sever, mend):
+        with self.severable() as (one, other, sever, reconnect):
             standing = {f"shop/{number}": b"1" for number in range(50)}
             Teller(one, "shop/*", standing)
             lost = _Lost(one, other, sever)
             del standing["shop/49"]
-            mend()
+            reconnect()
             assert lost.returns()
             [answer] = other.ask("shop/**", PATIENCE_S)
             assert answer.messages == [Message(f"shop/{number}", b"1") for number in range(49)]
 
     def test_who_is_lost_amid_a_question_is_not_waited_for(self) -> None:
-        with self.severable() as (one, other, sever, _mend):
+        with self.severable() as (one, other, sever, _reconnect):
             questions = one.questions("shop/*")
             meet(listener=one, speaker=other)
             with ThreadPoolExecutor(1) as pool:
@@ -69,21 +69,21 @@ class LossConformance(ABC):
             question.close()
 
     def test_once_a_sign_has_risen_again_announcements_are_heard_as_before(self) -> None:
-        with self.severable() as (one, other, sever, mend):
+        with self.severable() as (one, other, sever, reconnect):
             ear = RecordingListener(other.announcements("shop/**"))
             lost = _Lost(one, other, sever)
             one.announce("shop/bread", b"missed")
-            mend()
+            reconnect()
             assert lost.returns()
             meet(listener=other, speaker=one)
             one.announce("shop/bread", b"heard")
             assert ear.next() == Message("shop/bread", b"heard")
 
     def test_once_a_sign_has_risen_again_messages_arrive_as_before(self) -> None:
-        with self.severable() as (one, other, sever, mend):
+        with self.severable() as (one, other, sever, reconnect):
             ear, publisher = RecordingListener(one.subscribe("room/a")), other.publish("room/a")
             lost = _Lost(one, other, sever)
-            mend()
+            reconnect()
             assert lost.returns()
             publisher.put(b"after")
             assert ear.next() == Message("room/a", b"after")

@@ -98,8 +98,8 @@ def _print(out: Output, played: Played) -> None:
         out.say(f"  [{_COLOURS[False]}]not held[/]: {escape(problem)}")
     for stop in played.stops:
         ok = stop.verdict == "ok"
-        went_on = f"moved for {stop.took_s:.3f} s" if stop.took_s is not None else "was still moving"
-        out.say(f"  {stop.joint:<20} {went_on}, limit {stop.limit_s:.3f} s  [{_COLOURS[ok]}]{stop.verdict}[/]")
+        motion = f"moved for {stop.took_s:.3f} s" if stop.took_s is not None else "was still moving"
+        out.say(f"  {stop.joint:<20} {motion}, limit {stop.limit_s:.3f} s  [{_COLOURS[ok]}]{stop.verdict}[/]")
 
 
 def _write(folder: Path, found: Report) -> None:

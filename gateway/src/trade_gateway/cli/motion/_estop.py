@@ -55,9 +55,9 @@ def estop(
         if reachability is None:
             reachability = container.reachability(limit_s=0)  # only now, so that it does not delay the e-stop
     if reachability.apart and not clear:
-        raise reachability.nobody(system, "containers there were not stopped; use the switch that cuts the power")
+        raise reachability.as_error(system, "containers there were not stopped; use the switch that cuts the power")
     if clear and not reachability.complete:
-        raise reachability.nobody(system, "an e-stop that is open there stays open; clear it again when they answer")
+        raise reachability.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
     if not report.complete or not (clear or _known(report, container.address.who)):
         raise typer.Exit(1)
 
@@ -80,19 +80,19 @@ def _clear(container: Container, found: Reachability, ids: list[str] | None, lim
     """Clears these e-stops, or all open ones; None: all containers report that none is open.
 
     Raises:
-        NobodyFound: some or all containers were not found, and no other one knows the e-stop.
+        NoContainerFound: some or all containers were not found, and no other one knows the e-stop.
         NoSuchEstop: all containers were asked, and none knows it.
     """
     system, cannot_tell = container.settings.system, "so it is unknown whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
     if not found.others or not (wanted or found.complete):
-        raise found.nobody(system, cannot_tell)
+        raise found.as_error(system, cannot_tell)
     try:
         return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
     except NoSuchEstop:
         if found.complete:
             raise
-        raise found.nobody(system, cannot_tell) from None
+        raise found.as_error(system, cannot_tell) from None
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
@@ -103,8 +103,8 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         out.say(f"[bold red]FAILED: {escape(name)}{_version(report, name)}: {escape(problem)}[/]")
     for name in report.missing:
         hears = done == "stopped" or name not in report.versions
-        missed = "did not answer" if hears else "can be cleared only by a `trade` of its own version"
-        out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
+        problem = "did not answer" if hears else "can be cleared only by a `trade` of its own version"
+        out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {problem}[/]")
     if report.apart:
         out.say(f"{len(report.apart)} containers did not answer; they may offer no services, so nothing to stop")
     known = _known(report, own)

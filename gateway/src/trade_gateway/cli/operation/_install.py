@@ -151,8 +151,8 @@ def _is_to_be_written(path: Path, text: str, *, force: bool) -> bool:
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
     mark = _MARK.match(found)
-    ours = mark is not None and _marked(found[mark.end() :]) == found
-    if found != text and not ours and not force:
+    unchanged = mark is not None and _marked(found[mark.end() :]) == found
+    if found != text and not unchanged and not force:
         problem = "was changed since" if mark else "was not written by `trade install`"
         remedy = "move it away, or put your changes into a .d folder beside it and use --force. Nothing was written"
         raise ConfigurationError(where=str(path), problem=f"{problem}; {remedy}")
