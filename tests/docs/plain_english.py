@@ -1,4 +1,4 @@
-"""A style checker: reports words that this project avoids, in pages, docstrings, comments, messages and help.
+"""A style checker: reports words that this project avoids, in pages, docstrings, comments, messages, help and names.
 
 `python -m tests.docs.plain_english [PATH...]` prints `file:line: "word": use ...` and exits with 1 if it found one.
 A line that needs the word (a quotation, the name of a book) ends in `plain: WORD`, as a comment.
@@ -6,6 +6,7 @@ A line that needs the word (a quotation, the name of a book) ends in `plain: WOR
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import sys
@@ -18,6 +19,7 @@ SEARCHED = (
     "trade/src", "drivers/src", "gateway/src", "hil-sim/src", "examples", "docs",
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "tests/README.md",
 )  # fmt: skip
+PRODUCT = ("trade/src", "drivers/src", "gateway/src", "hil-sim/src")
 AVOIDED = {
     r"told|tells|telling": "notify, report, inform, say",
     r"nobody|no one": "no client, no container, none",
@@ -37,6 +39,8 @@ AVOIDED = {
     r"passers?-by|passes by": "a short-lived container",
 }
 _WORDS = [(re.compile(rf"\b(?:{words})\b", re.IGNORECASE), advice) for words, advice in AVOIDED.items()]
+_NAME_PATTERNS = [*(pattern for pattern, _ in _WORDS), re.compile(r"\b(?:ours|yours|theirs|let go|deeds?)\b")]
+_NAME_PART = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _PROSE_TOKENS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
 _CODE_IN_STRING = re.compile(r"(?<!\{)\{[^{}]*\}")
 _CODE_IN_PAGE = re.compile(r"`[^`]*`|\]\([^)]*\)|<[^>]*>|https?://\S+")
@@ -66,6 +70,34 @@ def _of_module(source: str) -> Iterator[tuple[int, str]]:
                 yield number, f"{line} {escape[0] if escape else ''}"
 
 
+def defined(path: Path) -> Iterator[tuple[int, str, str]]:
+    """The functions, classes, parameters, attributes and variables of a module: line number, line and name."""
+    source = path.read_text(encoding="utf-8")
+    lines = source.splitlines()
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                name = node.name
+            case ast.arg():
+                name = node.arg
+            case ast.Name(ctx=ast.Store()):
+                name = node.id
+            case ast.Attribute(ctx=ast.Store()):
+                name = node.attr
+            case _:
+                continue
+        yield node.lineno, lines[node.lineno - 1], name
+
+
+def in_names(path: Path) -> Iterator[str]:
+    """One line of report for each avoided word in a name that a module defines; names of tests are sentences."""
+    for number, line, name in defined(path):
+        words = "" if name.startswith("test_") else " ".join(_NAME_PART.findall(name)).lower()
+        for match in (match for pattern in _NAME_PATTERNS for match in pattern.finditer(words)):
+            if f"plain: {match[0]}" not in line:
+                yield f'{path}:{number}: "{match[0]}" in the name {name}: use the term of the field'
+
+
 def _of_page(text: str) -> Iterator[tuple[int, str]]:
     fenced = False
     for number, line in enumerate(text.splitlines(), 1):
@@ -82,6 +114,8 @@ def findings(paths: list[Path]) -> Iterator[str]:
         for number, line in prose(path):
             for word, advice in avoided(line):
                 yield f'{path}:{number}: "{word}": use {advice}'
+        if path.suffix == ".py" and any(path.resolve().is_relative_to(ROOT / package) for package in PRODUCT):
+            yield from in_names(path)
 
 
 def files(roots: list[Path]) -> list[Path]:

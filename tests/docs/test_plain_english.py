@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.docs.plain_english import findings
+from tests.docs.plain_english import findings, in_names
 
 PAGE = """# A title
 
@@ -23,6 +23,15 @@ quoted = "Whoever said so"  # plain: Whoever
 label = f"{told} goes on"
 '''
 
+NAMES = """class NodeTold:
+    told_by: str  # plain: told
+
+    def watch(self, theirs: int) -> None:
+        self.let_go = said.told
+
+    def test_nobody_waits(self) -> None: ...
+"""
+
 
 def found(path: Path, text: str) -> list[tuple[str, str]]:
     path.write_text(text, encoding="utf-8")
@@ -42,3 +51,9 @@ def test_a_finding_says_what_to_write_instead(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("It begins anew.\n", encoding="utf-8")
     assert list(findings([page])) == [f'{page}:1: "anew": use again']
+
+
+def test_a_module_is_searched_in_the_names_that_it_defines(tmp_path: Path) -> None:
+    path = tmp_path / "module.py"
+    path.write_text(NAMES, encoding="utf-8")
+    assert [line.split('"')[1] for line in in_names(path)] == ["told", "theirs", "let go"]
