@@ -5,7 +5,7 @@ import pickle
 import sys
 import types
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 import pytest
@@ -24,8 +24,9 @@ CONCRETE = [
 
 def sample(kind: type[TradeError]) -> TradeError:
     """One of that kind with a value in every field."""
-    values: dict[type, Any] = {str: "text", float: 1.5, int: 7, bool: True}
+    values: dict[Any, Any] = {str: "text", float: 1.5, int: 7, bool: True}
     hints = get_type_hints(kind)
+    values |= {hint: get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Literal}
     return kind(**{f.name: values.get(hints[f.name], ("one", "two")) for f in dataclasses.fields(kind)})
 
 

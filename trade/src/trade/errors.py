@@ -32,7 +32,7 @@ All errors are in one module, so that a reader sees the whole tree.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, Literal
 
 from trade._timestamps import clock
 
@@ -685,12 +685,15 @@ class NotStopped(DeviceSilent):
         )
 
 
+TrajectoryPart = Literal["start", "path", "goal"]
+"""The part of a trajectory where a tolerance was exceeded."""
+
+
 @dataclass(kw_only=True, eq=False)
 class ToleranceExceeded(DeviceError, RuntimeError):
     """A joint is farther from its trajectory than its tolerance allows: at the start, on the way, or at the end."""
 
-    what: str
-    """``start``, ``path`` or ``goal``."""
+    what: TrajectoryPart
     error_rad: float
     tolerance_rad: float
 
@@ -769,15 +772,30 @@ class NoContainerFound(SetupError, ConnectionError):
         return "; ".join([*said, self.so] if self.so else said)
 
 
+StartFailure = Literal[
+    "unknown host key",
+    "changed host key",
+    "not let in",
+    "refused",
+    "timeout",
+    "unknown host",
+    "no trade there",
+    "it did not come up",
+    "no answer",
+    "not seen",
+    "no ssh here",
+    "ssh failed",
+]
+"""Why a container was not started on a host."""
+
+
 @dataclass(kw_only=True, eq=False)
 class CannotStart(SetupError, ConnectionError):
     """No container was started on the host, or it did not join this system."""
 
     host: str
     container: str
-    reason: str
-    """``unknown host key``, ``changed host key``, ``not let in``, ``refused``, ``timeout``, ``unknown host``,
-    ``no trade there``, ``it did not come up``, ``no answer``, ``not seen``, ``no ssh here`` or ``ssh failed``."""
+    reason: StartFailure
     said: str
     """The output of ssh, or of the command on the host."""
     remedy: str

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError
+from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError, TrajectoryPart
 from trade_drivers.bus._gate import Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
@@ -139,7 +139,7 @@ class Follow(Motion[AxisT]):
             raise off[0] if off else moving[0].faulty("it does not come to rest at the end of its trajectory")
         return not off and not moving
 
-    def _astray(self, axis: AxisT, what: str, tolerance_rad: float) -> ToleranceExceeded | None:
+    def _astray(self, axis: AxisT, what: TrajectoryPart, tolerance_rad: float) -> ToleranceExceeded | None:
         """Returns the error for a joint whose newest measurement is too far from its set-point of that time."""
         if (sample := axis.sample) is None:
             return None

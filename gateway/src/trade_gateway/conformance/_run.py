@@ -4,6 +4,7 @@ import logging
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import Final
 
@@ -71,9 +72,12 @@ CHECKS: Final[tuple[Check, ...]] = (
 )
 
 
-OK: Final = "ok"
-FAILED: Final = "failed"
-LEFT_OUT: Final = "left out"
+class Result(str, Enum):
+    """The result of one check."""
+
+    OK = "ok"
+    FAILED = "failed"
+    LEFT_OUT = "left out"
 
 
 class Outcome(Struct, frozen=True):
@@ -82,8 +86,7 @@ class Outcome(Struct, frozen=True):
     check: str
     what: str
     rule: str
-    outcome: str
-    """``ok``, ``failed`` or ``left out``."""
+    outcome: Result
     why: str = ""
     took_s: float = 0.0
 
@@ -118,22 +121,22 @@ def _each(stage: Stage, checks: Sequence[Check]) -> Iterator[Outcome]:
     for one in checks:
         begun = time.monotonic()
         outcome, why = _judge(stage, one)
-        if outcome == FAILED:
+        if outcome is Result.FAILED:
             stage.dismiss()  # the next check begins with a fresh one
         yield Outcome(one.name, one.what, one.rule, outcome, why, round(time.monotonic() - begun, 3))
 
 
-def _judge(stage: Stage, one: Check) -> tuple[str, str]:
+def _judge(stage: Stage, one: Check) -> tuple[Result, str]:
     if not (one.still or stage.motion):
-        return LEFT_OUT, "it is of motion; --motion turns the arm"
+        return Result.LEFT_OUT, "it is of motion; --motion turns the arm"
     try:
         if one.needs and not stage.peer.says(one.needs):
-            return LEFT_OUT, f"its own provider has no {one.needs}"
+            return Result.LEFT_OUT, f"its own provider has no {one.needs}"
         one.does(stage)
     except NotHeld as why:
-        return FAILED, str(why)
+        return Result.FAILED, str(why)
     except (TradeError, TimeoutError) as error:
-        return FAILED, f"{type(error).__name__}: {error}"
+        return Result.FAILED, f"{type(error).__name__}: {error}"
     except (TypeError, ValueError, LookupError, AttributeError) as error:  # its answer may have any content
-        return FAILED, f"its answer cannot be read: {type(error).__name__}: {error}"
-    return OK, ""
+        return Result.FAILED, f"its answer cannot be read: {type(error).__name__}: {error}"
+    return Result.OK, ""

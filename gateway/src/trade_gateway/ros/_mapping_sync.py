@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple, Protocol
 
 from trade import Constraint, Container, Handle, where
 from trade.errors import ConfigurationError
@@ -25,8 +25,8 @@ _AGAIN_S: Final = 2.0
 class Place(NamedTuple):
     """The kind and name of a mapping in ROS."""
 
-    kind: str
-    """``service``, ``action``, ``command`` or ``topic``; except for topics, names are unique."""
+    kind: Literal["service", "action", "command", "topic"]
+    """Except for topics, names are unique."""
     name: str
     what: str = ""
     """A description for people, if the mapping covers several services of TRADE."""

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from trade._context.call_context import patience_s
-from trade.errors import CannotStart, ConfigurationError
+from trade.errors import CannotStart, ConfigurationError, StartFailure
 
 CONNECT_S: Final = 10
 LONGEST_S: Final = 60.0
@@ -20,7 +20,7 @@ _HOST: Final = re.compile(r"(?:[A-Za-z0-9_][\w.+-]*@)?[A-Za-z0-9_\[][\w.:%\]-]*"
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*")
 _SSH_FAILED: Final = 255
 _NOT_FOUND: Final = frozenset((126, 127))
-_REASONS: Final = (
+_REASONS: Final[Sequence[tuple[re.Pattern[str], StartFailure, str]]] = (
     (
         re.compile(r"REMOTE HOST IDENTIFICATION HAS CHANGED|Host key for .* has changed"),
         "changed host key",
@@ -183,11 +183,12 @@ def _read(
 def _refusal(
     host: str, name: str, command: str, words: Sequence[str], ended: "subprocess.CompletedProcess[str]"
 ) -> CannotStart:
+    reason: StartFailure = "ssh failed"
+    remedy = f"try `ssh {host} true`"
     if ended.returncode == _SSH_FAILED:
-        reason, remedy = next(
-            ((reason, remedy) for pattern, reason, remedy in _REASONS if pattern.search(ended.stderr)),
-            ("ssh failed", f"try `ssh {host} true`"),
-        )
+        known = next((row for row in _REASONS if row[0].search(ended.stderr)), None)
+        if known is not None:
+            _, reason, remedy = known
     elif ended.returncode in _NOT_FOUND:
         reason = "no trade there"
         remedy = f"{command!r} is not found by its shell; install trade-gateway there, or give the path of its `trade`"

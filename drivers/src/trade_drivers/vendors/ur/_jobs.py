@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError, TrajectoryPart
 from trade_drivers.bus._gate import Command, Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.motion._plan import Plan
@@ -333,7 +333,7 @@ class Follow(Motion):
         self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
         self._sent_ns = now_ns
 
-    def _compare(self, sample: Sample, what: str, tolerance_rad: float) -> None:
+    def _compare(self, sample: Sample, what: TrajectoryPart, tolerance_rad: float) -> None:
         elapsed_s = self._plan.course.elapsed_s(sample.at_ns)
         for name, angle, track in zip(self.limb.joints, sample.positions, self._plan.tracks, strict=True):
             error = angle - track.curve.at(elapsed_s)[0]

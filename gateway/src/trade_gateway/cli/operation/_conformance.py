@@ -10,9 +10,9 @@ from rich.markup import escape
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json, chosen
 from trade_gateway.cli._output import Output
-from trade_gateway.conformance import CHECKS, FAILED, LEFT_OUT, OK, Check, Outcome, run
+from trade_gateway.conformance import CHECKS, Check, Outcome, Result, run
 
-_COLOURS = {OK: "green", FAILED: "bold red", LEFT_OUT: "yellow"}
+_COLOURS = {Result.OK: "green", Result.FAILED: "bold red", Result.LEFT_OUT: "yellow"}
 
 
 def conformance(
@@ -44,11 +44,11 @@ def conformance(
         )
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no process is left behind
     outcomes = run(peer, _chosen(only or [], motion=motion), lambda outcome: _print(out, outcome), motion=motion)
-    failed = [outcome.check for outcome in outcomes if outcome.outcome == FAILED]
+    failed = [outcome.check for outcome in outcomes if outcome.outcome is Result.FAILED]
     if failed:
         out.say(f"[bold red]failed[/]: {len(failed)} of {len(outcomes)}: {escape(', '.join(failed))}")
         raise typer.Exit(1)
-    left_out = [outcome.check for outcome in outcomes if outcome.outcome == LEFT_OUT]
+    left_out = [outcome.check for outcome in outcomes if outcome.outcome is Result.LEFT_OUT]
     out.say(f"[bold green]passed[/]: {len(outcomes) - len(left_out)} checks, {len(left_out)} left out")
     if not motion and left_out:
         out.say("[yellow]its stops and locks were not checked[/]: checks of motion need --motion")
@@ -76,4 +76,5 @@ def _print(out: Output, outcome: Outcome) -> None:
         out.data(outcome)
         return
     why = f": {escape(outcome.why)}" if outcome.why else ""
-    out.say(f"[{_COLOURS[outcome.outcome]}]{outcome.outcome:<8}[/] {outcome.check:<20} {escape(outcome.what)}{why}")
+    result = outcome.outcome
+    out.say(f"[{_COLOURS[result]}]{result.value:<8}[/] {outcome.check:<20} {escape(outcome.what)}{why}")
