@@ -58,7 +58,7 @@ chaos-locks: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients
 siege: export SIEGE_MINUTES := $(MINUTES)
 siege: export SIEGE_MUTANT := $(MUTANT)
 siege: export SEED := $(SEED)
-siege: $(UV) ## robots, gateway, door, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
+siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
 	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:tests.support.rerun $(ARGS) || { \
 	  test -z "$(MINIMISE)" || $(RUN) python -m tests.system.siege_minimised; exit 1; }
 

@@ -14,11 +14,11 @@ _CHUNK = 65536
 
 
 @contextlib.contextmanager
-def door(scene: Stage) -> Generator[tuple[str, str]]:
+def http_gateway(scene: Stage) -> Generator[tuple[str, str]]:
     """An address on the laboratory's network, and a token for anna."""
-    tokens = scene.folder / "door-tokens.toml"
+    tokens = scene.folder / "http-tokens.toml"
     token = add_token(tokens, "anna")
-    words = ("door", "--name", "page", "--listen", "127.0.0.1:0", "--tokens", tokens, "--json")
+    words = ("http", "--name", "page", "--listen", "127.0.0.1:0", "--tokens", tokens, "--json")
     with scene.trade("anna", *words) as opened:
         yield opened.ready()["url"], token
 
@@ -26,7 +26,7 @@ def door(scene: Stage) -> Generator[tuple[str, str]]:
 @contextlib.contextmanager
 def dashboard(scene: Stage) -> Generator[tuple[str, str]]:
     """An address for the browser of this host, and a token for anna."""
-    with door(scene) as (url, token):
+    with http_gateway(scene) as (url, token):
         if (window := scene.places.window) is None:
             yield url, token
             return

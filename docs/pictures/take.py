@@ -92,13 +92,13 @@ def main() -> None:
         token = add_token(tokens, "anna")
         with (
             started("up", ROSIE, "--sim", *leave_out),
-            started("door", "--listen", "127.0.0.1:0", "--tokens", tokens) as door,
+            started("http", "--listen", "127.0.0.1:0", "--tokens", tokens) as http,
             sync_playwright() as playwright,
             trade.lock(where(group="rosie.left.hand"), purpose="carry", wait_s=10),
         ):
             browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
-            dashboard(browser, door["url"], token, "dashboard.png", **DESKTOP)
-            dashboard(browser, door["url"], token, "dashboard-phone.png", **PHONE)
+            dashboard(browser, http["url"], token, "dashboard.png", **DESKTOP)
+            dashboard(browser, http["url"], token, "dashboard-phone.png", **PHONE)
             browser.close()
             terminal("top.svg", ["top", "--count", "1"])
         trade.close()

@@ -56,7 +56,7 @@ def gateway(folder: Path, text: str) -> Plan:
     (folder / "clinic" / "door").symlink_to(folder / "clinic-pki" / "issued" / "guest")
     save(folder, "rosie.toml", (ROOT / "examples" / "head.toml").read_text(encoding="utf-8"))
     save(folder, "mind.py", "class Planner: ...\n")
-    save(folder, "door-tokens.toml", "")
+    save(folder, "http-tokens.toml", "")
     return read_gateway_file(save(folder, "gateway.toml", text))
 
 
@@ -211,14 +211,14 @@ def test_limits_of_a_drill(text: str) -> None:
 
 
 @of("http.md", "Beyond this host")
-def test_rights_of_a_door(tmp_path: Path, text: str) -> None:
+def test_rights_of_an_http_gateway(tmp_path: Path, text: str) -> None:
     policy = read_policy(save(tmp_path, "policy.toml", f'[roles.operator]\ncall = ["rosie"]\n{text}'))
     assert policy.decide("page", "call", "rosie.head") == policy.decide("anna", "call", "rosie.head")
 
 
 @of("http.md", "HTTP and WebSocket")
-def test_a_door(tmp_path: Path, text: str) -> None:
-    save(tmp_path, "door-tokens.toml", "")
+def test_an_http_gateway(tmp_path: Path, text: str) -> None:
+    save(tmp_path, "http-tokens.toml", "")
     plan = read_system_file(save(tmp_path, "system.toml", f'[system]\nname = "home"\n{text}'))
     assert [part.name for part in plan.parts] == ["page"]
     assert gateway(tmp_path / "gateway", f'system = "home"\n{text}').children[0].name == "page"

@@ -1,4 +1,4 @@
-"""A door of a system in memory, and clients of it over real sockets."""
+"""An HTTP gateway of a system in memory, and clients of it over real sockets."""
 
 import http.client
 import json
@@ -16,7 +16,7 @@ from tests.support.two_joint_robot import Joint, Robot
 from tests.support.waiting import PATIENCE_S
 from trade import Container, service
 from trade.testing import memory_system
-from trade_gateway.http import Door, Tokens, add_token
+from trade_gateway.http import HttpGateway, Tokens, add_token
 
 POLICY = """
 [roles.all]
@@ -41,7 +41,7 @@ chief = ["all"]
 anna = ["operator"]
 bert = ["viewer"]
 """
-"""Who may do what at a door that is `governed`."""
+"""Who may do what at an HTTP gateway that is `governed`."""
 
 
 class Axis(Joint):
@@ -124,26 +124,26 @@ class Client:
 
 @dataclass
 class Opened:
-    """A door, its tokens, and the robot behind it."""
+    """An HTTP gateway, its tokens, and the robot behind it."""
 
     robot: Robot
-    door: Door
+    gateway: HttpGateway
     tokens: Path
 
     def client(self, name: str = "anna") -> Client:
-        return Client(self.door.url, add_token(self.tokens, name))
+        return Client(self.gateway.url, add_token(self.tokens, name))
 
     def __getitem__(self, name: str) -> Joint:
         return self.robot.joints[name]
 
 
 @contextmanager
-def opened(container: Container, folder: Path, **options: Any) -> Iterator[tuple[Door, Path]]:
-    """A door of a container, to which `nobody` has a token."""
+def opened(container: Container, folder: Path, **options: Any) -> Iterator[tuple[HttpGateway, Path]]:
+    """An HTTP gateway of a container, to which `nobody` has a token."""
     tokens = folder / "tokens.toml"
     add_token(tokens, "nobody")
-    with Door(container, listen="127.0.0.1:0", tokens=Tokens(tokens), **options) as door:
-        yield door, tokens
+    with HttpGateway(container, listen="127.0.0.1:0", tokens=Tokens(tokens), **options) as gateway:
+        yield gateway, tokens
 
 
 def heard(socket: ClientConnection) -> Any:
@@ -165,7 +165,7 @@ def ask(socket: ClientConnection, **message: Any) -> Any:
 
 
 def govern(robot: Robot, folder: Path, text: str) -> None:
-    """Give the door's container a policy."""
+    """Give the HTTP gateway's container a policy."""
     path = folder / "policy.toml"
     path.write_text(text)
     robot.me.load_policy(path)
@@ -173,7 +173,7 @@ def govern(robot: Robot, folder: Path, text: str) -> None:
 
 @contextmanager
 def governed(folder: Path) -> Iterator[Opened]:
-    """A door that may do everything, in a system with a policy."""
+    """An HTTP gateway that may do everything, in a system with a policy."""
     with memory_system() as system:
         robot = Robot(system)
         govern(robot, folder, POLICY)

@@ -118,8 +118,8 @@ def _no_stop_line(patch: Patch) -> None:
     """Nobody listens on the stop line."""
     from trade._stop_line import service
 
-    patch(service, "host_door", lambda _: None)
-    patch(service, "_network_doors", lambda *_: [])
+    patch(service, "host_socket", lambda _: None)
+    patch(service, "_network_sockets", lambda *_: [])
 
 
 HOW: Final[dict[str, Callable[[Patch], None]]] = {

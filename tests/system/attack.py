@@ -8,7 +8,7 @@ from typing import Any, Final
 from msgspec import Raw
 
 from tests.support.waiting import wait_until
-from tests.system.sites import DOOR, Site
+from tests.system.sites import GATEWAY, Site
 from trade._protocol.messages import PROTOCOL, Call, encode_message
 
 POLICY: Final = """
@@ -63,7 +63,7 @@ class Attack:
         self.dash = site.launched("right2", "dash", policy=lenient, reachable=True)
         public = (self.planner, self.chief, self.dash)
         for member, side in ((self.arm, "private"), *((one, "public") for one in public)):
-            member.tell("start", DOOR[side])
+            member.tell("start", GATEWAY[side])
         for member in (self.arm, *public):
             member.heard()
         self.arm.ask("register_joint", ARM)
@@ -93,7 +93,7 @@ class Attack:
     def open(self, identity: str, mode: str = "peer") -> str:
         """A session with that certificate, linked to the gateway, and as a peer to its neighbour; its name."""
         name = f"{identity}{next(numbers)}"
-        self.intruder.ask("open", name, str(self.folder(identity)), DOOR["public"], mode)
+        self.intruder.ask("open", name, str(self.folder(identity)), GATEWAY["public"], mode)
         assert self.intruder.ask("linked", name, *([self.planner.ask("id")] if mode == "peer" else []))
         self.intruder.ask("listen", name, f"reply/*/{identity}/{name}/*")
         return name

@@ -83,7 +83,7 @@ class Page(Outsider):
                 return self.joints_of(json.load(answer))
         except (OSError, WebSocketException, ValueError) as gone:
             self.ended.wait(0.2)
-            raise Refused("NoDoor", str(gone)) from gone
+            raise Refused("NoConnection", str(gone)) from gone
 
     def take(self, robots: Sequence[str], wait_s: float) -> Any:
         taken = super().take(robots, wait_s)

@@ -1,4 +1,4 @@
-"""A client of a door that sets the pan joint moving and stays: ``page.py URL TOKEN socket|request|session``."""
+"""An HTTP client that sets the pan joint moving and stays: ``page.py URL TOKEN socket|request|session``."""
 
 import json
 import sys

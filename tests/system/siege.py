@@ -26,7 +26,7 @@ from tests.support.lock_log import Log
 from tests.system import wall_clock
 from tests.system.networks import Member, Networks, ip
 from tests.system.siege_records import CAN_BUS, Alarm, Fault, Rescue
-from tests.system.sites import DOOR, SYSTEM, Site
+from tests.system.sites import GATEWAY, SYSTEM, Site
 from trade_gateway.http import add_token
 from trade_hil_sim import BusOff, SimProcess
 
@@ -198,7 +198,7 @@ class Driver(Kept):
         file.write_text(_robot_file(robot, patience, self.sim.ports))
         program = [str(_HERE / "broken_driver.py"), mutant] if mutant else ["-m", "trade_gateway"]
         self._file = file
-        super().__init__(site, "left", robot, DOOR["private"], self._words(program))
+        super().__init__(site, "left", robot, GATEWAY["private"], self._words(program))
 
     def _words(self, program: Sequence[str]) -> list[str]:
         return [str(_HERE / "wall_clock.py"), str(self.clock), *program, "up", str(self._file), "--json"]
@@ -247,12 +247,12 @@ class Stand:
         self._policy = folder / "kept.toml"
         self._policy.write_text(_POLICY)
         self._wire = Member(networks.host("between"), "wire", _WIRE, folder / "runtime", script=_HERE / "slow_wire.py")
-        self._wire.ask(json.dumps({"connect": DOOR["public"].removeprefix("tls/")}))
+        self._wire.ask(json.dumps({"connect": GATEWAY["public"].removeprefix("tls/")}))
         self.drivers = {robot: Driver(self.site, robot, mutant) for robot in _ROBOTS}
         tokens = folder / "tokens.toml"
         self._token = add_token(tokens, "anna")
-        door = ["-m", "trade_gateway", "door", "--name", "hall", "--listen", _HALL, "--tokens", str(tokens), "--json"]
-        self._hall = Kept(self.site, "right", "hall", f"tls/{_WIRE}", door)
+        http = ["-m", "trade_gateway", "http", "--name", "hall", "--listen", _HALL, "--tokens", str(tokens), "--json"]
+        self._hall = Kept(self.site, "right", "hall", f"tls/{_WIRE}", http)
         self.clients = {slot: self._client(slot) for slot in range(len(_KINDS))}
         self._eve, self._warden = self._alarmist("eve"), self._alarmist("warden")
 
@@ -277,7 +277,7 @@ class Stand:
     def _alarmist(self, name: str) -> Member:
         """One without any role, or one that may clear e-stops."""
         member = self.site.launched("right2", name, script=_HERE / "alarmist.py", policy=self._policy)
-        member.tell(json.dumps({"connect": DOOR["public"]}))
+        member.tell(json.dumps({"connect": GATEWAY["public"]}))
         return member
 
     def restart(self, slot: int) -> None:
@@ -379,13 +379,13 @@ class Stand:
     def freeze_gateway(self) -> Callable[[], None]:
         return self._noted("freeze gateway", "door", _frozen(self.site.gateway.pid))
 
-    def kill_door(self) -> Callable[[], None]:
-        self._noted("kill door", "hall", None)
+    def kill_http_gateway(self) -> Callable[[], None]:
+        self._noted("kill http gateway", "hall", None)
         _signal(self._hall.pid, signal.SIGKILL)
         return _nothing
 
-    def freeze_door(self) -> Callable[[], None]:
-        return self._noted("freeze door", "hall", _frozen(self._hall.pid))
+    def freeze_http_gateway(self) -> Callable[[], None]:
+        return self._noted("freeze http gateway", "hall", _frozen(self._hall.pid))
 
     def cut(self) -> Callable[[], None]:
         """Both clients' hosts, or the robots'."""
@@ -449,7 +449,7 @@ class Stand:
         return self._noted("clock", driver.robot, lambda: wall_clock.shift(driver.clock, 0.0))
 
     def disk(self) -> Callable[[], None]:
-        """There is no room any more for what drivers, door and gateway keep."""
+        """There is no room any more for what drivers, HTTP gateway and gateway keep."""
         self._disk.fill()
         return self._noted("disk", "all", self._disk.free)
 
@@ -500,7 +500,7 @@ class Stand:
 
     def _ports(self, whom: str) -> str:
         if whom == "door":
-            host, port = DOOR["public"].removeprefix("tls/").split(":")
+            host, port = GATEWAY["public"].removeprefix("tls/").split(":")
             return f"{host}:{port},{host}:{int(port) + 1000}"
         there = (self.site.folder / "runtime" / whom / SYSTEM).glob("tls_*")  # nobody, if it has just been killed
         return ",".join(":".join(path.name.split("_")[1:]) for path in there) or "127.0.0.1:1"
@@ -515,7 +515,7 @@ class Stand:
             "TRADE_RUNTIME_DIR": str(self.site.folder / "runtime" / identity),
         }
         began = time.monotonic()
-        words = [str(_HERE / "rescuer.py"), robot, str(_RESCUE_S), *([] if whom == robot else [DOOR["public"]])]
+        words = [str(_HERE / "rescuer.py"), robot, str(_RESCUE_S), *([] if whom == robot else [GATEWAY["public"]])]
         said = subprocess.run(
             [*self._on("left" if whom == robot else "right"), *words],
             env={**os.environ, **settings},
@@ -573,8 +573,8 @@ TROUBLES: Final[Mapping[str, Callable[[Stand], Callable[[], None]]]] = {
     "bus off": Stand.bus_off,
     "kill gateway": Stand.kill_gateway,
     "freeze gateway": Stand.freeze_gateway,
-    "kill door": Stand.kill_door,
-    "freeze door": Stand.freeze_door,
+    "kill http gateway": Stand.kill_http_gateway,
+    "freeze http gateway": Stand.freeze_http_gateway,
     "cut": Stand.cut,
     "one way": Stand.one_way,
     "delay": Stand.delay,

@@ -226,10 +226,10 @@ def _frozen_s(faults: Sequence[Fault], order: Order) -> float:
 
 
 def _held_up_s(faults: Sequence[Fault], order: Order) -> float:
-    """For how long, since then, the door did not run that a page comes by: it counts from when it has heard."""
+    """For how long, since then, the HTTP gateway did not run that a page comes by: it counts from when it has heard."""
     if _kind(order.number) != "page":
         return 0.0
-    frozen = (fault for fault in faults if fault.what == "freeze door" and fault.until > order.t)
+    frozen = (fault for fault in faults if fault.what == "freeze http gateway" and fault.until > order.t)
     return sum(fault.until - max(fault.t, order.t) for fault in frozen)
 
 
@@ -304,7 +304,7 @@ def _must_rest_s(fault: Fault, order: Order, resource: str) -> float | None:
         case "freeze client":  # an agent says nothing while it waits: its host cannot tell that it is frozen
             mine = fault.whom == _who(order.number) and _kind(order.number) != "agent"
             return STOPS_S if mine else None
-        case "kill door" | "freeze door":
+        case "kill http gateway" | "freeze http gateway":
             return STOPS_S if _kind(order.number) == "page" else None
         case "kill gateway" | "freeze gateway" | "cut" | "one way":
             return STOPS_S

@@ -13,7 +13,7 @@ from tests.system.networks import MEMBER, Member, Networks
 
 SYSTEM = "lab-0"
 """The one that the gateway is of; ``member.py`` appends its turn."""
-DOOR = {"private": "tls/10.231.1.1:7450", "public": "tls/10.231.2.1:7450"}
+GATEWAY = {"private": "tls/10.231.1.1:7450", "public": "tls/10.231.2.1:7450"}
 """Where the gateway listens."""
 _HOSTS = {"left": ("private", "10.231.1.2"), "right": ("public", "10.231.2.2"), "right2": ("public", "10.231.2.3")}
 
@@ -123,7 +123,7 @@ class Site:
     def member(self, host: str, name: str, *, identity: str = "", policy: Path | None = None) -> Member:
         """A container that is linked to the gateway."""
         made = self.launched(host, name, identity=identity, policy=policy)
-        made.ask("start", DOOR[_HOSTS[host][0]])
+        made.ask("start", GATEWAY[_HOSTS[host][0]])
         return made
 
     def change(self, path: Path, before: str, after: str) -> None:
@@ -145,11 +145,11 @@ policy = "policy.toml"
 
 [network.private]
 interface = "net1"
-listen = ["{DOOR["private"]}"]
+listen = ["{GATEWAY["private"]}"]
 export = {private}
 
 [network.public]
 interface = "net2"
-listen = ["{DOOR["public"]}"]
+listen = ["{GATEWAY["public"]}"]
 export = {public}
 """

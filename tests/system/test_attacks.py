@@ -19,7 +19,7 @@ from tests.support.waiting import wait_until
 from tests.system import rights
 from tests.system.attack import ARM, POLICY, Attack, numbers
 from tests.system.conftest import ROOT, networks_of_ones_own
-from tests.system.sites import DOOR, Site
+from tests.system.sites import GATEWAY, Site
 from trade._protocol.messages import (
     EMPTY,
     PROTOCOL,
@@ -313,7 +313,7 @@ def test_a_sign_of_life_is_of_oneself(attack: Attack, as_dash: str) -> None:
 def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it(attack: Attack) -> None:
     """Containers of one name are told apart by identity and boot; answers go by those."""
     twin = attack.site.launched("left", "planner", identity="porter")
-    twin.ask("start", DOOR["private"])
+    twin.ask("start", GATEWAY["private"])
     assert twin.ask("group", ARM, "arm") and twin.ask("call_group", ARM) == [7]
     before = attack.moved()
     attack.planner.ask("started", "nap", ARM, "1.0")
@@ -346,16 +346,14 @@ def bad_papers(attack: Attack) -> dict[str, tuple[Path, str]]:
 
 
 @pytest.mark.parametrize("bad", ["expired", "of another system", "with a wrong key"])
-def test_a_certificate_that_is_no_good_opens_no_door(
-    attack: Attack, bad_papers: dict[str, tuple[Path, str]], bad: str
-) -> None:
+def test_an_invalid_certificate_is_refused(attack: Attack, bad_papers: dict[str, tuple[Path, str]], bad: str) -> None:
     before = attack.moved()
     folder, alert = bad_papers[bad]
-    host, _, port = DOOR["public"].removeprefix("tls/").partition(":")
+    host, _, port = GATEWAY["public"].removeprefix("tls/").partition(":")
     assert alert in attack.intruder.ask("knock", str(folder), host, port).upper()
     assert attack.intruder.ask("knock", str(attack.site.papers.of("planner")), host, port) == ""
     name = f"bad{next(numbers)}"
-    attack.intruder.ask("open", name, str(folder), DOOR["public"])
+    attack.intruder.ask("open", name, str(folder), GATEWAY["public"])
     attack.say(name, attack.key("planner"), attack.call(name, "planner", "move", 7))
     good = attack.open("planner")
     attack.say(name, attack.key("planner"), attack.call(name, "planner", "move", 7))
@@ -379,7 +377,7 @@ def silent(attack: Attack, name: str, who: str) -> bool:
 def test_who_has_no_role_or_is_unknown_says_at_most_stop(attack: Attack, as_planner: str, who: str) -> None:
     before = attack.moved()
     name = f"{who}{next(numbers)}"
-    attack.intruder.ask("open", name, str(attack.site.papers.of(who)), DOOR["public"])
+    attack.intruder.ask("open", name, str(attack.site.papers.of(who)), GATEWAY["public"])
     assert attack.intruder.ask("linked", name)  # of this authority it is
     attack.say(name, attack.key(who), attack.call(name, who, "move", 1))
     assert silent(attack, name, who) == (who == "mallory")

@@ -13,7 +13,7 @@ from tests.support import simulated_robots as robots
 from tests.support.waiting import wait_until
 from tests.system.conftest import Bench
 from tests.system.networks import Member, Networks, ip
-from tests.system.sites import DOOR, SYSTEM, Site
+from tests.system.sites import GATEWAY, SYSTEM, Site
 from trade_hil_sim import events
 
 pytestmark = pytest.mark.timeout(300)
@@ -54,7 +54,7 @@ def bench(site: Site, system: str, monkeypatch: pytest.MonkeyPatch, benches: Cal
         ("TRADE_SYSTEM", SYSTEM),
         ("TRADE_TLS", str(site.papers.of("rosie"))),
         ("TRADE_POLICY", str(site.policy)),
-        ("TRADE_CONNECT", DOOR["private"]),
+        ("TRADE_CONNECT", GATEWAY["private"]),
     ):
         monkeypatch.setenv(name, value)
     file = site.folder / "head.toml"

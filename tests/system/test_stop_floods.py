@@ -14,7 +14,7 @@ import pytest
 from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks, ip
-from tests.system.sites import DOOR, Site
+from tests.system.sites import GATEWAY, Site
 
 FLOOD = Path(__file__).with_name("stranger_flood.py")
 NEWCOMER = Path(__file__).with_name("newcomer.py")
@@ -148,7 +148,7 @@ anna = ["operator"]
         arm = site.member("left", "arm")
         arm.ask("register_joint", "rosie.neck")
         before = descriptors(site.gateway.pid)
-        host, port = DOOR["public"].removeprefix("tls/").split(":")
+        host, port = GATEWAY["public"].removeprefix("tls/").split(":")
         flood(networks.host("right2"), f"{host}:{port},{host}:{int(port) + 1000}")
         environment = {
             "TRADE_TLS": str(site.papers.of("anna")),
@@ -156,7 +156,7 @@ anna = ["operator"]
             "TRADE_SYSTEM": "lab-0",
             "TRADE_POLICY": str(site.policy),
         }
-        check(came(networks.host("right"), environment, DOOR["public"]), "rosie.neck.halt")
+        check(came(networks.host("right"), environment, GATEWAY["public"]), "rosie.neck.halt")
         assert len(arm.ask("estops")) == 1
         assert descriptors(site.gateway.pid) - before < MOST_DESCRIPTORS
     finally:
@@ -171,7 +171,7 @@ def test_a_gateway_starts_while_strangers_are_at_its_port(
     try:
         arm = site.member("left", "arm")
         arm.ask("register_joint", "rosie.neck")
-        host, port = DOOR["public"].removeprefix("tls/").split(":")
+        host, port = GATEWAY["public"].removeprefix("tls/").split(":")
         flood(networks.host("right2"), f"{host}:{port},{host}:{int(port) + 1000}")
         site.end(signal.SIGKILL)
         site.begin()
@@ -182,7 +182,7 @@ def test_a_gateway_starts_while_strangers_are_at_its_port(
             "TRADE_SYSTEM": "lab-0",
             "TRADE_POLICY": str(site.policy),
         }
-        check(came(networks.host("right"), environment, DOOR["public"]), "rosie.neck.halt")
+        check(came(networks.host("right"), environment, GATEWAY["public"]), "rosie.neck.halt")
     finally:
         site.close()
 

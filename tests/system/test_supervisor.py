@@ -292,7 +292,7 @@ def test_S20_of_two_that_look_after_one_robot_the_second_is_refused_and_gives_up
     assert kept.become("one", "up").pid == first.pid
 
 
-class Door:
+class GatewayProcess:
     """``trade gateway`` with children."""
 
     def __init__(self, run: Callable[..., Program], file: Path, text: str, system: str) -> None:
@@ -311,16 +311,18 @@ class Door:
 
 
 @pytest.fixture
-def door(run: Callable[..., Program], tmp_path: Path, system: str) -> Callable[[str], Door]:
-    return lambda text: Door(run, tmp_path / "gateway.toml", text, system)
+def start_gateway(run: Callable[..., Program], tmp_path: Path, system: str) -> Callable[[str], GatewayProcess]:
+    return lambda text: GatewayProcess(run, tmp_path / "gateway.toml", text, system)
 
 
 def children() -> list[Any]:
     return trade.find(where(name="children"), wait_s=30)()
 
 
-def test_a_gateway_tells_of_its_children_and_starts_one_again_for_who_asks(door: Callable[[str], Door]) -> None:
-    there = door(f"[container.a]\n{COUNTER}")
+def test_a_gateway_tells_of_its_children_and_starts_one_again_for_who_asks(
+    start_gateway: Callable[[str], GatewayProcess],
+) -> None:
+    there = start_gateway(f"[container.a]\n{COUNTER}")
     there.until("up")
     [info] = children()
     assert (info.name, info.state, info.restarts, info.pid > 0, info.rss_mb > 1) == ("a", "up", 0, True, True)
@@ -335,8 +337,8 @@ def test_a_gateway_tells_of_its_children_and_starts_one_again_for_who_asks(door:
     assert (again.restarts, again.pid != info.pid) == (1, True)
 
 
-def test_children_end_with_their_gateway_however_that_ends(door: Callable[[str], Door]) -> None:
-    there = door(f'[container.a]\n{COUNTER}[container.head]\nrobot = "{ROSIES_HEAD}"\nsim = true\n')
+def test_children_end_with_their_gateway_however_that_ends(start_gateway: Callable[[str], GatewayProcess]) -> None:
+    there = start_gateway(f'[container.a]\n{COUNTER}[container.head]\nrobot = "{ROSIES_HEAD}"\nsim = true\n')
     there.until("up", "head")
     pids = [info.pid for info in children()]
     there.program.signal(signal.SIGKILL)
@@ -344,9 +346,9 @@ def test_children_end_with_their_gateway_however_that_ends(door: Callable[[str],
 
 
 def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
-    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+    start_gateway: Callable[[str], GatewayProcess], sim: SimProcess, tmp_path: Path
 ) -> None:
-    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there = start_gateway(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
     there.until("up", "head")
     [info] = children()
     pan = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=30)
@@ -361,9 +363,9 @@ def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
 
 
 def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
-    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+    start_gateway: Callable[[str], GatewayProcess], sim: SimProcess, tmp_path: Path
 ) -> None:
-    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there = start_gateway(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
     there.until("up", "head")
     [info] = children()
     killed_at = time.monotonic()
@@ -374,16 +376,16 @@ def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
 
 
 def test_P70_a_gateway_that_is_stopped_leaves_nobody_behind_and_all_is_known_when_it_is_back(
-    door: Callable[[str], Door],
+    start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
-    there = door(f"[container.a]\n{COUNTER}")
+    there = start_gateway(f"[container.a]\n{COUNTER}")
     there.until("up")
     call("count")
     [info] = children()
     there.program.signal(signal.SIGTERM)
     assert there.program.wait() == 0
     assert not psutil.pid_exists(info.pid)
-    door(f"[container.a]\n{COUNTER}").until("up")
+    start_gateway(f"[container.a]\n{COUNTER}").until("up")
     assert call("shown") == 1
 
 
@@ -403,12 +405,14 @@ door = ["chief"]
 
 
 def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
-    door: Callable[[str], Door], tmp_path: Path, start_container: Callable[..., Container]
+    start_gateway: Callable[[str], GatewayProcess], tmp_path: Path, start_container: Callable[..., Container]
 ) -> None:
     papers = Papers(tmp_path / "pki")
     (tmp_path / "policy.toml").write_text(POLICY)
-    door_tls, child_tls, my_tls = papers.of("door", purpose="gateway"), papers.of("a"), papers.of("anna")
-    there = door(f'tls = "{door_tls}"\npolicy = "policy.toml"\n[container.a]\ntls = "{child_tls}"\n{COUNTER}')
+    gateway_tls, child_tls, my_tls = papers.of("door", purpose="gateway"), papers.of("a"), papers.of("anna")
+    there = start_gateway(
+        f'tls = "{gateway_tls}"\npolicy = "policy.toml"\n[container.a]\ntls = "{child_tls}"\n{COUNTER}'
+    )
     there.until("up")
     anna = start_container("anna", tls=my_tls, policy=tmp_path / "policy.toml")
     anna.find(where(name="count"), wait_s=30)()
@@ -421,8 +425,10 @@ def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
     )
 
 
-def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(door: Callable[[str], Door]) -> None:
-    there = door(f"[container.a]\n{COUNTER}")
+def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(
+    start_gateway: Callable[[str], GatewayProcess],
+) -> None:
+    there = start_gateway(f"[container.a]\n{COUNTER}")
     there.until("up")
     [info] = children()
     there.write("[container.a]\nprovidres = []\n")
@@ -433,19 +439,19 @@ def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by
     assert next(one.pid for one in children() if one.name == "a") == info.pid
 
 
-def test_a_door_that_is_killed_is_back_at_its_place_for_those_who_have_a_token(
-    door: Callable[[str], Door], tmp_path: Path
+def test_an_http_gateway_that_is_killed_restarts_at_its_address_with_its_tokens(
+    start_gateway: Callable[[str], GatewayProcess], tmp_path: Path
 ) -> None:
     token = add_token(tmp_path / "tokens.toml", "anna")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"127.0.0.1:{taken.getsockname()[1]}"
-    there = door(
+    there = start_gateway(
         f"[container.a]\n{COUNTER}"
-        f'[container.page]\nafter = ["a"]\ndoor = {{ tokens = "tokens.toml", listen = "{place}" }}\n'
+        f'[container.page]\nafter = ["a"]\nhttp = {{ tokens = "tokens.toml", listen = "{place}" }}\n'
     )
     there.until("up", "page")
     anna = Client(f"http://{place}", token)
-    wait_until(lambda: anna.call("hall.count").status == 200, "who comes by the door is heard")
+    wait_until(lambda: anna.call("hall.count").status == 200, "who comes by the HTTP gateway is heard")
     page = next(info for info in children() if info.name == "page")
     os.kill(page.pid, signal.SIGKILL)
     there.until("up", "page")

@@ -19,7 +19,7 @@ from tests.system.networks import Member, Networks
 from tests.system.siege import Driver
 from tests.system.siege_judge import judge
 from tests.system.siege_records import Answer, AnyRecord, Fault
-from tests.system.sites import DOOR, SYSTEM, Site
+from tests.system.sites import GATEWAY, SYSTEM, Site
 from trade._protocol.messages import PROTOCOL
 
 NOW, NEXT = PROTOCOL, PROTOCOL + 1
@@ -78,7 +78,7 @@ class Stand:
         )
         slot = list(_HOSTS).index(name)
         told = {"slot": slot, "folder": str(self.records), "robots": robots, "speed_rad_s": speed_rad_s}
-        made.tell(json.dumps({**told, "connect": DOOR["private" if host == "left" else "public"]}))
+        made.tell(json.dumps({**told, "connect": GATEWAY["private" if host == "left" else "public"]}))
         self.behaviours[name] = made
 
     def _through(self, version: int) -> list[str]:
@@ -111,7 +111,7 @@ class Stand:
             "TRADE_SYSTEM": SYSTEM,
             "TRADE_TLS": str(self.site.papers.of("chief")),
             "TRADE_POLICY": str(self.site.folder / "kept.toml"),
-            "TRADE_CONNECT": DOOR["private" if host == "left" else "public"],
+            "TRADE_CONNECT": GATEWAY["private" if host == "left" else "public"],
             "TRADE_RUNTIME_DIR": str(self.site.folder / "runtime" / host),
         }
         return subprocess.run(

@@ -1,4 +1,4 @@
-"""What clients of a door and agents say."""
+"""What clients of an HTTP gateway and agents say."""
 
 from typing import Any, Final
 
@@ -19,11 +19,11 @@ _BODIES: Final = [
     messages.SessionBody,
 ]
 _REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
-"""What the door answers with BadMessage."""
+"""What the HTTP gateway answers with BadMessage."""
 
 
 def _frame(data: bytes) -> Any:
-    """A message of the WebSocket, as the door takes it."""
+    """A message of the WebSocket, as the HTTP gateway takes it."""
     asked = messages.read(data, messages.ASKED)
     messages.numbers(getattr(asked, "args", None))
     return asked
@@ -43,7 +43,7 @@ def _tool(data: bytes) -> Any:
 
 
 TARGETS: Final = [
-    Target("door-frame", _frame, _REFUSED, messages.encoder.encode),
-    Target("door-body", _body, _REFUSED),
+    Target("http-frame", _frame, _REFUSED, messages.encoder.encode),
+    Target("http-body", _body, _REFUSED),
     Target("agent-tool", _tool, _REFUSED),
 ]

@@ -71,7 +71,7 @@ TARGETS: Final = [
     _toml("named-files", named_files),
     _toml("ros-file", read_ros_file),
     _toml("lexicon", read_lexicon),
-    _toml("door-tokens", Tokens),
+    _toml("http-tokens", Tokens),
     Target("revoked-names", _revoked, (ConfigurationError,)),
     Target("open-estop", in_a_file(read_open_estop, "e1.json")),
     Target("talk-memory", in_a_file(read_memory, "memory.json")),

@@ -129,7 +129,7 @@ def _files() -> Iterator[tuple[str, bytes]]:
     yield "gateway-file", _GATEWAY.encode()
     yield "named-files", _GATEWAY.encode()
     yield "system-file", _SYSTEM.encode()
-    yield "door-tokens", _TOKENS.encode()
+    yield "http-tokens", _TOKENS.encode()
     yield "revoked-names", b'revoked = ["old-arm"]\n'
     yield "open-estop", msgspec.json.encode(Estop("e1", "anna/desk/e1", "smoke", 1.5))
     yield "talk-memory", b'{"rosie.turn": "arm"}'
@@ -175,7 +175,7 @@ def _clients() -> Iterator[tuple[str, bytes]]:
         *({"do": do, "id": 4, **more} for do, more in (("logs", {"level": 30}), ("calls", {"reads": True}))),
     ]
     for frame in frames:
-        yield "door-frame", json.dumps(frame).encode()
+        yield "http-frame", json.dumps(frame).encode()
     bodies = [
         {"args": {"level": 0.5}, "deadline_s": 2},
         {"group": "lab", "wait_s": 0},
@@ -187,7 +187,7 @@ def _clients() -> Iterator[tuple[str, bytes]]:
         {"lease_s": 5},
     ]
     for number, body in enumerate(bodies[: len(BODIES)]):
-        yield "door-body", bytes([number]) + json.dumps(body).encode()
+        yield "http-body", bytes([number]) + json.dumps(body).encode()
     given = {
         "group": "rosie",
         "name": "turn",

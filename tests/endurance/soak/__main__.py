@@ -33,7 +33,7 @@ from trade_drivers import load
 
 ROOT: Final = Path(__file__).parents[3]
 sys.path.insert(0, str(ROOT / "examples"))
-from demo_page import door  # noqa: E402 - the examples are no package
+from demo_page import http_gateway  # noqa: E402 - the examples are no package
 from demo_stage import POLICY, ROBOT, Actor, DemoFailed, Stage, stage  # noqa: E402
 
 _PLANNER: Final = Path(__file__).with_name("planner.py")
@@ -65,7 +65,7 @@ class Soak:
     def go(self, seconds: float) -> None:
         """All of it; raises DemoFailed: something did not come up."""
         with ExitStack() as stack:
-            url, token = stack.enter_context(door(self._scene))
+            url, token = stack.enter_context(http_gateway(self._scene))
             planners = {part: stack.enter_context(self._scene.behaviour(str(_PLANNER), part)) for part in self._parts}
             self._began = time.monotonic()
             stack.enter_context(self._beside(self._follow, url, token))
@@ -187,7 +187,7 @@ def _named(command: list[str]) -> str:
         return "simulator"
     if "trade_gateway" not in words:
         return ""
-    return {"up": "driver", "gateway": "gateway", "door": "page"}.get(words[words.index("trade_gateway") + 1], "")
+    return {"up": "driver", "gateway": "gateway", "http": "page"}.get(words[words.index("trade_gateway") + 1], "")
 
 
 def _bus(part: str) -> str:

@@ -1,4 +1,4 @@
-"""The dashboard in a real Chromium, of a simulated robot behind a door in a process of its own."""
+"""The dashboard in a real Chromium, of a simulated robot behind an HTTP gateway in a process of its own."""
 
 import os
 import shutil
@@ -57,8 +57,8 @@ def chromium() -> str:
     return found
 
 
-class Doorway:
-    """``trade door`` with a policy, that can be killed and started again at the same address."""
+class HttpProcess:
+    """``trade http`` with a policy, that can be killed and started again at the same address."""
 
     def __init__(self, run: Callable[..., Program], folder: Path) -> None:
         self._run, self._tokens = run, folder / "tokens.toml"
@@ -68,7 +68,7 @@ class Doorway:
 
     def start(self, listen: str = "") -> None:
         words = ("--listen", listen or self.url.removeprefix("http://"), "--tokens", self._tokens, "--json")
-        self.program = self._run("-m", "trade_gateway", "door", *words)
+        self.program = self._run("-m", "trade_gateway", "http", *words)
         self.url = self.program.json()["url"]
 
     def token(self, identity: str) -> str:
@@ -76,16 +76,16 @@ class Doorway:
 
 
 @pytest.fixture
-def doorway(
+def http(
     bench: Bench,
     run: Callable[..., Program],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> Doorway:
+) -> HttpProcess:
     (tmp_path / "policy.toml").write_text(POLICY.format(own=Settings.read().identity))
     monkeypatch.setenv("TRADE_POLICY", str(tmp_path / "policy.toml"))
     monkeypatch.setenv("TRADE_AUDIT", str(tmp_path / "audit"))
-    made = Doorway(run, tmp_path)
+    made = HttpProcess(run, tmp_path)
     client = Client(made.url, made.token("chief"))
     wait_until(lambda: client.ask("GET", f"/services?group={PAN}&name=state").body, "it is known")
     return made
@@ -127,9 +127,9 @@ class View:
 class Browsers:
     """Chromium, once or several times."""
 
-    def __init__(self, start: Callable[[], Browser], doorway: Doorway) -> None:
+    def __init__(self, start: Callable[[], Browser], http: HttpProcess) -> None:
         self._start = start
-        self._doorway = doorway
+        self._http = http
         self._first: Browser | None = None
 
     def view(self, who: str, *, alone: bool = False, **options: Any) -> View:
@@ -141,15 +141,15 @@ class Browsers:
             browser = self._first
         page = browser.new_context(viewport={"width": 1280, "height": 900}, **options).new_page()
         page.set_default_timeout(PATIENCE_MS)
-        page.goto(self._doorway.url)
+        page.goto(self._http.url)
         view = View(page)
-        view.sign_in(self._doorway.token(who))
+        view.sign_in(self._http.token(who))
         expect(view.link).to_have_text("● Connected")
         return view
 
 
 @pytest.fixture
-def browsers(doorway: Doorway) -> Iterator[Browsers]:
+def browsers(http: HttpProcess) -> Iterator[Browsers]:
     executable = chromium()
     expect.set_options(timeout=PATIENCE_MS)
     with sync_playwright() as playwright:
@@ -161,7 +161,7 @@ def browsers(doorway: Doorway) -> Iterator[Browsers]:
             started.append(browser)
             return browser
 
-        yield Browsers(start, doorway)
+        yield Browsers(start, http)
         for browser in started:
             with suppress(Exception):  # it was killed by its test
                 browser.close()

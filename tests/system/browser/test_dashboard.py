@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.support.waiting import wait_until
-from tests.system.browser.conftest import PAN, Browsers, Doorway, View, renderers
+from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
 from tests.system.conftest import Bench
 from trade._transport.endpoints import free_endpoint
 from trade_hil_sim import events
@@ -154,13 +154,13 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
 
 
 def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
-    browsers: Browsers, doorway: Doorway, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    browsers: Browsers, http: HttpProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     nowhere = free_endpoint()
-    doorway.program.signal(signal.SIGKILL)
+    http.program.signal(signal.SIGKILL)
     monkeypatch.setenv("TRADE_CONNECT", nowhere)
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))  # where no robot has its stop line
-    doorway.start()
+    http.start()
     chief = browsers.view("chief")
     expect(chief.page.locator("#apart")).to_contain_text(f"The HTTP gateway reaches no container at {nowhere}")
     expect(chief.page.locator("#apart")).to_contain_text("nothing accepts connections there")
@@ -174,15 +174,15 @@ def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
     expect(chief.stopped).not_to_contain_text("nothing moves")
 
 
-def test_a_page_comes_back_by_itself_when_the_door_does(bench: Bench, browsers: Browsers, doorway: Doorway) -> None:
+def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers: Browsers, http: HttpProcess) -> None:
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
-    doorway.program.signal(signal.SIGKILL)
+    http.program.signal(signal.SIGKILL)
     stands(bench)
     expect(anna.link).to_contain_text("Not connected")
     expect(anna.plus).to_be_disabled()
     anna.page.mouse.up()
-    doorway.start()
+    http.start()
     expect(anna.link).to_have_text("● Connected")
     expect(anna.plus).to_be_enabled()
     jog(bench, anna, anna.plus)
@@ -245,12 +245,12 @@ def test_locks_are_taken_asked_for_and_broken_where_everybody_sees_it(browsers: 
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
-def test_a_wrong_token_is_told_and_another_one_is_asked_for(browsers: Browsers, doorway: Doorway) -> None:
+def test_a_wrong_token_is_told_and_another_one_is_asked_for(browsers: Browsers, http: HttpProcess) -> None:
     anna = browsers.view("anna")
     anna.page.get_by_role("button", name="Sign out").click()
     anna.sign_in("guess")
     expect(anna.page.locator("#login-problem")).to_contain_text("this token is unknown or revoked")
-    anna.sign_in(doorway.token("bert"))
+    anna.sign_in(http.token("bert"))
     expect(anna.page.locator("#who")).to_have_text("as bert")
 
 

@@ -76,7 +76,7 @@ def test_the_records_of_all_containers_are_shown_in_order_of_time(folder: Path) 
     assert "refused   arm: anna rosie.arm.grip AccessDenied: no rule gives berta [call]  (call 7)" in last
 
 
-def test_who_acted_through_a_door_is_shown_and_found_by_name(tmp_path: Path) -> None:
+def test_clients_of_an_http_gateway_are_shown_and_found_by_name(tmp_path: Path) -> None:
     by_anna = structs.replace(row("rosie.neck.look", time.time(), who="page"), session="page/door/1f/anna.6")
     write(tmp_path / "neck.sqlite", [by_anna, structs.replace(by_anna, session="page/door/1f/bert.7")])
     shown = trade("audit", tmp_path, "--who", "anna").stdout.splitlines()

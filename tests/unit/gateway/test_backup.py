@@ -55,7 +55,7 @@ robot = "/robots/far.toml"
 rules = "rules.toml"
 
 [container.page]
-door = { tokens = "pages/tokens.toml" }
+http = { tokens = "pages/tokens.toml" }
 """
 KEYS = {f"config/pki/issued/door/{name}" for name in ("ca.pem", "cert.pem", "key.pem")}
 

@@ -1,4 +1,4 @@
-"""The files of the dashboard, as the door gives them to whoever asks."""
+"""The files of the dashboard, as the HTTP gateway gives them to whoever asks."""
 
 import re
 from pathlib import Path
@@ -13,8 +13,8 @@ STATIC = Path(__file__).parents[3] / "gateway" / "src" / "trade_gateway" / "dash
 
 
 def test_the_page_and_what_it_needs_are_given_to_everybody_and_run_no_script_but_their_own(tmp_path: Path) -> None:
-    with memory_system() as system, opened(system.container("me"), tmp_path) as (door, _):
-        anybody = Client(door.url)
+    with memory_system() as system, opened(system.container("me"), tmp_path) as (gateway, _):
+        anybody = Client(gateway.url)
         page = anybody.ask("GET", "/")
         needed = re.findall(r'(?:src|href)="(/[^"]+)"', page.body.decode())
         assert {"/dashboard/app.js", "/dashboard/style.css", "/dashboard/icon.svg"} <= set(needed)
@@ -33,8 +33,8 @@ def test_the_page_and_what_it_needs_are_given_to_everybody_and_run_no_script_but
 
 @pytest.mark.parametrize("path", [route.path for route in pages()])
 def test_a_page_of_the_dashboard_is_only_read(tmp_path: Path, path: str) -> None:
-    with memory_system() as system, opened(system.container("me"), tmp_path) as (door, _):
-        assert Client(door.url).ask("POST", path, {}).status == 405
+    with memory_system() as system, opened(system.container("me"), tmp_path) as (gateway, _):
+        assert Client(gateway.url).ask("POST", path, {}).status == 405
 
 
 def test_nothing_in_the_page_comes_from_elsewhere_or_is_inline() -> None:

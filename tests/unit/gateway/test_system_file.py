@@ -82,15 +82,15 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}[container.a]\nproviders = [\n  {{ groups = ["x"] }},\n]\n', 5, "class is missing"),
         (f"{HEAD}{LAMPS}after = 3\n", 6, "Expected `array`"),
         (f'{HEAD}{LAMPS}after = ["rosie"]\n', 6, "no container 'rosie'; there is lamps"),
-        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules, door; there is none"),
+        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules, http; there is none"),
         (f'{HEAD}{LAMPS}rules = "care.toml"\n', 6, "there is providers and rules"),
         (f"{HEAD}{LAMPS}sim = true\n", 6, "goes with robot"),
         (f'{HEAD}{LAMPS}without = ["legs"]\n', 6, "goes with robot"),
         (f'{HEAD}[container.a]\nrobot = "rosie.toml"\nallow = ["x:Y"]\n', 6, "goes with providers"),
-        (f"{HEAD}{PAGE}door = {{}}\n", 5, "no client could log in; name tokens"),
-        (f'{HEAD}{PAGE}door = {{ tokens = "t.toml" }}\n', 5, "trade door token NAME --tokens "),
+        (f"{HEAD}{PAGE}http = {{}}\n", 5, "no client could log in; name tokens"),
+        (f'{HEAD}{PAGE}http = {{ tokens = "t.toml" }}\n', 5, "trade http token NAME --tokens "),
         (
-            f"{HEAD}{PAGE}door = {{ port = 80 }}\n",
+            f"{HEAD}{PAGE}http = {{ port = 80 }}\n",
             5,
             "unknown key 'port'; there is listen, tokens, tls, origins, hosts",
         ),
@@ -174,9 +174,9 @@ def test_records_lie_where_the_system_says_or_the_container(folder: Path) -> Non
     assert plan.settings.audit is None
 
 
-def test_a_door_is_opened_with_what_its_table_says(folder: Path) -> None:
+def test_an_http_gateway_starts_with_the_options_of_its_table(folder: Path) -> None:
     (folder / "t.toml").touch()
-    said = 'door = { tokens = "t.toml", listen = "127.0.0.1:7081", origins = ["http://a", "http://b"] }\n'
+    said = 'http = { tokens = "t.toml", listen = "127.0.0.1:7081", origins = ["http://a", "http://b"] }\n'
     [part] = read_system_file(write(folder, f"{HEAD}{PAGE}{said}")).parts
     named = ["--listen", "127.0.0.1:7081", "--origin", "http://a", "--origin", "http://b"]
-    assert list(part.words)[2:] == ["door", "--name", "page", *named, "--tokens", str(folder / "t.toml")]
+    assert list(part.words)[2:] == ["http", "--name", "page", *named, "--tokens", str(folder / "t.toml")]

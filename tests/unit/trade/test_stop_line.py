@@ -61,7 +61,7 @@ def lines(container: Container) -> StopLines:
     return StopLines(Settings.read(system=container.settings.system, container="panel", identity="anna"))
 
 
-def door(container: Container) -> Path:
+def stop_socket(container: Container) -> Path:
     [place] = places(container.settings)
     assert place.path is not None
     return place.path
@@ -159,7 +159,7 @@ def test_who_is_open_can_be_asked(driver: Container) -> None:
 
 
 def test_the_socket_is_for_this_user_and_goes_with_its_container(driver: Container) -> None:
-    path = door(driver)
+    path = stop_socket(driver)
     assert path.stat().st_mode & 0o077 == 0
     driver.close()
     assert not path.exists()
@@ -170,7 +170,7 @@ def test_what_a_killed_container_left_is_taken_away(driver: Container) -> None:
         runtime_folder() / driver.settings.system / ".stop-4194400-00000000"
     )  # beyond the highest process there can be
     left.write_bytes(b"")
-    assert [place.path for place in places(driver.settings)] == [door(driver)]
+    assert [place.path for place in places(driver.settings)] == [stop_socket(driver)]
     assert not left.exists()
 
 

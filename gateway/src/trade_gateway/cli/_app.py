@@ -31,7 +31,7 @@ _COMMANDS: Final = {
     "container": (_ROBOTS, "cli.robots._container:container"),
     "start": (_ROBOTS, "cli.robots._start:start"),
     "migrate": (_ROBOTS, "cli.robots._migrate:migrate"),
-    "door": (_ROBOTS, "cli.robots._http:app"),
+    "http": (_ROBOTS, "cli.robots._http:app"),
     "system": (_ROBOTS, "cli.robots._system:app"),
     "install": (_OPERATION, "cli.operation._install:install"),
     "backup": (_OPERATION, "cli.operation._backup:backup"),

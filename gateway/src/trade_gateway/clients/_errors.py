@@ -52,18 +52,18 @@ class NoAuditRecord(Refusal, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
-class NotLetIn(Refusal, PermissionError):
+class NotAuthenticated(Refusal, PermissionError):
     """The client cannot be identified; nothing was done."""
 
     http_status = HTTPStatus.UNAUTHORIZED
     reason: str
 
     def describe(self) -> str:
-        return f"{self.reason}. Send a token (Authorization: Bearer ...), which `trade door token NAME` creates"
+        return f"{self.reason}. Send a token (Authorization: Bearer ...), which `trade http token NAME` creates"
 
 
 @dataclass(kw_only=True, eq=False)
-class WrongDoor(Refusal, PermissionError):
+class WrongOrigin(Refusal, PermissionError):
     """The request came from a page of another site, or names another host; nothing was done."""
 
     http_status = HTTPStatus.FORBIDDEN

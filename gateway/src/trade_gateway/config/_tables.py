@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 LOCAL: Final = "local"
-_KINDS: Final = ("robot", "gateway", "providers", "rules", "door")
+_KINDS: Final = ("robot", "gateway", "providers", "rules", "http")
 _ONLY_WITH: Final = {"sim": "robot", "without": "robot", "allow": "providers"}
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
@@ -55,12 +55,12 @@ class ObjectSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, 
     """Arguments of its constructor, by position or by name."""
 
 
-class DoorSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An HTTP gateway: the options of ``trade door``."""
+class HttpSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An HTTP gateway: the options of ``trade http``."""
 
     listen: _Text = "127.0.0.1:7080"
     tokens: str = ""
-    """The file of tokens: ``trade door token NAME --tokens FILE``."""
+    """The file of tokens: ``trade http token NAME --tokens FILE``."""
     tls: str = ""
     """Folder of the server's certificate."""
     origins: list[_Text] = []
@@ -88,7 +88,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Further classes that others may create in it."""
     rules: str = ""
     """A rules file."""
-    door: DoorSpec | None = None
+    http: HttpSpec | None = None
     after: list[_Text] = []
     """Containers that must be up first."""
     tls: str = ""
@@ -119,7 +119,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return self.host == LOCAL
 
 
-_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": ObjectSpec, "door": DoorSpec}
+_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": ObjectSpec, "http": HttpSpec}
 """The type of the table under a key of an entry."""
 
 
@@ -222,12 +222,12 @@ class Tables:
         """Raises ConfigurationError if something that it needs on this host is missing or wrong."""
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
-        if entry.door and importlib.util.find_spec("uvicorn") is None:
-            self.refuse(name, "door", "needs the extra http; pip install 'trade-gateway[http]'")
-        if entry.door and not (entry.door.tokens or entry.door.tls):
-            self.refuse(name, "door", "no client could log in; name tokens, or tls and its authority's certificates")
-        if entry.door and entry.door.tokens and not (tokens := self.beside(entry.door.tokens)).exists():
-            self.refuse(name, "door", f"there is no {tokens}; make it: trade door token NAME --tokens {tokens}")
+        if entry.http and importlib.util.find_spec("uvicorn") is None:
+            self.refuse(name, "http", "needs the extra http; pip install 'trade-gateway[http]'")
+        if entry.http and not (entry.http.tokens or entry.http.tls):
+            self.refuse(name, "http", "no client could log in; name tokens, or tls and its authority's certificates")
+        if entry.http and entry.http.tokens and not (tokens := self.beside(entry.http.tokens)).exists():
+            self.refuse(name, "http", f"there is no {tokens}; make it: trade http token NAME --tokens {tokens}")
         with self.about(name, entry):
             if entry.robot:
                 check(without(load(self.beside(entry.robot)), entry.without)[0])
@@ -254,15 +254,15 @@ class Tables:
                 does = ["gateway", file]
             case "rules":
                 does = ["rules", "run", file, "--name", name]
-            case "door":
-                does = ["door", "--name", name, *self._door_words(entry)]
+            case "http":
+                does = ["http", "--name", name, *self._http_words(entry)]
             case _:
                 patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
                 does = ["container", "--name", name, *patterns]
         return ["--system", self.around.system, *dialled, *does]
 
-    def _door_words(self, entry: Entry) -> list[str]:
-        said = entry.door or DoorSpec()
+    def _http_words(self, entry: Entry) -> list[str]:
+        said = entry.http or HttpSpec()
         options = {"--listen": [said.listen], "--origin": said.origins, "--host": said.hosts}
         for option, named in (("--tokens", said.tokens), ("--tls", said.tls)):
             options[option] = [str(self.beside(named)) if entry.is_local else named] if named else []

@@ -98,7 +98,7 @@ def found(stage: Stage) -> None:
     arm = stage.peer.place("echo")
     handle = stage.container.find(where(name="echo", group=GROUP), wait_s=10.0)
     require((handle.key.domain, handle.key.provider) == arm, f"{handle} was found, not the one of {arm}")
-    require(handle("through the front door") == "through the front door", "echo answered something else")
+    require(handle("one") == "one", "echo answered something else")
 
 
 @check("survives-rubbish", "Messages", still=True)

@@ -13,7 +13,7 @@ _MODULES: Final = (
     "calls",
     "chain",
     "devices",
-    "door",
+    "gateway",
     "estop",
     "faults",
     "jog",

@@ -1,6 +1,6 @@
 """The HTTP gateway: HTTP and WebSocket for clients without TRADE (the extra ``http``)."""
 
 from trade_gateway.http._authentication import Tokens, add_token
-from trade_gateway.http._server import Door
+from trade_gateway.http._server import HttpGateway
 
-__all__ = ["Door", "Tokens", "add_token"]
+__all__ = ["HttpGateway", "Tokens", "add_token"]

@@ -15,7 +15,7 @@ from tomlkit.exceptions import TOMLKitError
 from trade._protocol.keys import is_chunk
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
-from trade_gateway.clients._errors import NotLetIn
+from trade_gateway.clients._errors import NotAuthenticated
 
 _logger = logging.getLogger("trade")
 
@@ -91,7 +91,7 @@ def _read(path: Path) -> dict[str, str]:
     try:
         known: Any = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap().get(_TABLE, {})
     except OSError as bad:
-        problem = f"cannot be read ({bad.strerror}). `trade door token NAME` creates a token and the file"
+        problem = f"cannot be read ({bad.strerror}). `trade http token NAME` creates a token and the file"
         raise ConfigurationError(where=str(path), problem=problem) from None
     except (TOMLKitError, UnicodeDecodeError) as bad:
         raise ConfigurationError(where=str(path), problem=f"is not TOML: {bad}") from None
@@ -133,7 +133,7 @@ class Authenticator:
         """The identity of a request's client.
 
         Raises:
-            NotLetIn: it has no identity, or its token is unknown.
+            NotAuthenticated: it has no identity, or its token is unknown.
             AccessDenied: the identity is revoked.
         """
         who = self._identity(self.shown(scope), scope.get(CERTIFIED))
@@ -145,17 +145,17 @@ class Authenticator:
         """Whether the client is still admitted as that identity."""
         try:
             return self.who(scope) == who
-        except (NotLetIn, AccessDenied):
+        except (NotAuthenticated, AccessDenied):
             return False
 
     def _identity(self, token: str, certified: Any) -> str:
         if token:
             known = self._tokens.who(token)
             if known is None:
-                raise NotLetIn(reason="this token is unknown or revoked")
+                raise NotAuthenticated(reason="this token is unknown or revoked")
             return known
         if isinstance(certified, str):
             return certified
         if self._judge.lets_anybody_in:
             return ANONYMOUS
-        raise NotLetIn(reason="the HTTP gateway admits no clients without an identity")
+        raise NotAuthenticated(reason="the HTTP gateway admits no clients without an identity")

@@ -14,7 +14,7 @@ from starlette.routing import Route
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
 from trade_gateway.clients import Client, ClientApi, NoSuchSession
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.clients._errors import BadMessage, HttpError, NeedsSession, NotLetIn
+from trade_gateway.clients._errors import BadMessage, HttpError, NeedsSession, NotAuthenticated
 from trade_gateway.http._authentication import Authenticator
 from trade_gateway.http._openapi import document
 from trade_gateway.http._origin_check import problem_response
@@ -73,7 +73,7 @@ class Http:
                 return await by_method[method](request)
             except TradeError as error:
                 self._api.note_refused(error)
-                headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotLetIn) else None
+                headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotAuthenticated) else None
                 return problem_response(error, headers)
 
         return Route(path, answer, methods=list(by_method))

@@ -38,7 +38,7 @@ _BODIES: Final = (
 )
 _COMPONENTS: Final = "#/components/schemas/"
 _FORMATS: Final = {"datetime": "date-time", "date": "date", "time": "time", "UUID": "uuid"}
-_TAG: Final = "door"
+_TAG: Final = "gateway"
 _VALUES: Final = ("const", "default", "enum", "examples")
 """Keys whose values are data, not schemas."""
 _SESSION: Final = {

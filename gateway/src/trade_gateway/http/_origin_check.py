@@ -8,7 +8,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from trade_gateway.clients._errors import WrongDoor
+from trade_gateway.clients._errors import WrongOrigin
 from trade_gateway.clients._problems import problem_of
 from trade_gateway.clients._schemas import encoder
 
@@ -41,14 +41,14 @@ class Gate:
         else:
             await WebSocket(scope, receive, send).send_denial_response(problem_response(wrong))
 
-    def _wrong(self, scope: Scope, headers: Headers) -> WrongDoor | None:
+    def _wrong(self, scope: Scope, headers: Headers) -> WrongOrigin | None:
         host = _without_port(headers.get("host", "")).lower()
         if host not in self._hosts:
-            remedy = f"use {', '.join(sorted(self._hosts))}, or allow this name with `trade door --host NAME`"
-            return WrongDoor(what=f"host {host!r}", remedy=remedy)
+            remedy = f"use {', '.join(sorted(self._hosts))}, or allow this name with `trade http --host NAME`"
+            return WrongOrigin(what=f"host {host!r}", remedy=remedy)
         origin = headers.get("origin")
         if origin is not None and origin not in self._origins and origin != _own_site(scope, headers):
-            return WrongDoor(what=f"a page of {origin!r}", remedy="`trade door --origin URL` allows it")
+            return WrongOrigin(what=f"a page of {origin!r}", remedy="`trade http --origin URL` allows it")
         return None
 
 

@@ -46,7 +46,7 @@ _LAST_PORT: Final = 65_535
 _JOINED_WITHIN_S: Final = 10.0
 
 
-class Door:
+class HttpGateway:
     """The HTTP gateway of a container, for clients over HTTP and WebSocket. A context manager.
 
     Args:
@@ -75,8 +75,8 @@ class Door:
         api = ClientApi(container)
         _check_reach(listen, host, api, tls)
         if not tokens and tls is None and not api.judge.lets_anybody_in:
-            problem = "no client could connect. Create a token with `trade door token NAME`"
-            raise ConfigurationError(where=f"door {listen}", problem=problem)
+            problem = "no client could connect. Create a token with `trade http token NAME`"
+            raise ConfigurationError(where=f"HTTP gateway {listen}", problem=problem)
         self._api = api
         names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
         self._app = _application(api, tokens, names, origins)
@@ -105,9 +105,9 @@ class Door:
             ssl_context_factory=None if context is None else lambda _config, _default: context,
         )
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._serve, name="trade-door", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="trade-http", daemon=True)
 
-    def open(self) -> "Door":
+    def open(self) -> "HttpGateway":
         """Accepts clients; those that connect before it is ready wait."""
         self._thread.start()
         return self
@@ -131,7 +131,7 @@ class Door:
         except Exception:
             _logger.exception("the HTTP gateway at %s has ended", self.url)
 
-    def __enter__(self) -> "Door":
+    def __enter__(self) -> "HttpGateway":
         return self.open()
 
     def __exit__(self, *_: object) -> None:

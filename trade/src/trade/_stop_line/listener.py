@@ -50,20 +50,20 @@ class Listener:
     """Accepts connections and reads their requests until it is closed.
 
     Args:
-        doors: the listening sockets, with the TLS context of those on a network.
+        servers: the listening sockets, with the TLS context of those on a network.
         serve: takes over connections with a request.
     """
 
-    def __init__(self, doors: Sequence[tuple[socket.socket, ssl.SSLContext | None]], serve: Serve) -> None:
+    def __init__(self, servers: Sequence[tuple[socket.socket, ssl.SSLContext | None]], serve: Serve) -> None:
         self._serve = serve
         self._strangers: dict[socket.socket, Stranger] = {}
         """The oldest first."""
         self._ending = threading.Event()
         self._selector = selectors.DefaultSelector()
-        self._doors = [door for door, _ in doors]
-        for door, context in doors:
-            door.setblocking(False)
-            self._selector.register(door, selectors.EVENT_READ, context)
+        self._sockets = [server for server, _ in servers]
+        for server, context in servers:
+            server.setblocking(False)
+            self._selector.register(server, selectors.EVENT_READ, context)
         self._bell, self._ear = socket.socketpair()
         self._selector.register(self._ear, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="trade-stop-line", daemon=True)
@@ -88,10 +88,10 @@ class Listener:
         elif sock is not self._ear:
             self._welcome(sock, key.data)
 
-    def _welcome(self, door: socket.socket, context: ssl.SSLContext | None) -> None:
+    def _welcome(self, server: socket.socket, context: ssl.SSLContext | None) -> None:
         for _ in range(_AT_ONCE):
             try:
-                sock, address = door.accept()
+                sock, address = server.accept()
             except OSError:  # no more connections, or no descriptors: then slow ones are dropped soon
                 return
             sock.setblocking(False)
@@ -176,6 +176,6 @@ class Listener:
         self._ending.set()
         self._bell.send(b"!")
         self._thread.join(2)
-        for sock in (*self._doors, self._bell, self._ear):
+        for sock in (*self._sockets, self._bell, self._ear):
             sock.close()
         self._selector.close()

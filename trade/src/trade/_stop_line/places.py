@@ -112,40 +112,40 @@ def _dialled(path: Path, limit_s: float) -> socket.socket:
     return dialling
 
 
-def host_door(system: str) -> tuple[socket.socket, Path] | None:
+def host_socket(system: str) -> tuple[socket.socket, Path] | None:
     """The listening socket for this user on this host; None without Unix sockets. Raises OSError."""
     if not _HAS_UNIX:
         return None
     path = runtime_folder() / system / f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
     path.parent.mkdir(mode=0o700, exist_ok=True)
-    door = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         with _short(path) as name:
-            door.bind(name)
+            server.bind(name)
         path.chmod(0o600)
-        door.listen(_BACKLOG)
+        server.listen(_BACKLOG)
     except BaseException:
-        door.close()
+        server.close()
         raise
-    return door, path
+    return server, path
 
 
-def network_door(endpoint: Endpoint) -> socket.socket:
+def network_socket(endpoint: Endpoint) -> socket.socket:
     """The listening socket beside that endpoint. Raises ConfigurationError if its port cannot be opened."""
     host, port = endpoint.host.strip("[]"), line_port(endpoint.port)
-    door = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+    server = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     try:
-        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        door.bind((host, port))
-        door.listen(_BACKLOG)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind((host, port))
+        server.listen(_BACKLOG)
     except OSError as bad:
-        door.close()
+        server.close()
         problem = (
             f"its stop line, port {port}, cannot be opened ({bad.strerror or bad}). Free that port, or listen on "
             f"another one: the stop line is {_PORTS_BEYOND} above"
         )
         raise ConfigurationError(where=f"listen {endpoint}", problem=problem) from None
-    return door
+    return server
 
 
 def is_own_user(caller: socket.socket) -> bool:

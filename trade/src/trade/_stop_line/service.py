@@ -20,7 +20,7 @@ from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport
 from trade._stop_line.listener import Listener
 from trade._stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
-from trade._stop_line.places import host_door, network_door
+from trade._stop_line.places import host_socket, network_socket
 from trade._transport.endpoints import Endpoint
 from trade.errors import LimitExceeded, TradeError
 
@@ -64,8 +64,8 @@ class StopLineService:
         self._path: Path | None = None
         self._closed = False
         certificate = settings.certificate()
-        if certificate is not None and (doors := _network_doors(settings, certificate)):
-            self._listeners.append(Listener(doors, self._serve))
+        if certificate is not None and (servers := _network_sockets(settings, certificate)):
+            self._listeners.append(Listener(servers, self._serve))
 
     @property
     def own_places(self) -> tuple[str, ...]:
@@ -78,12 +78,12 @@ class StopLineService:
             if self._path is not None or self._closed:
                 return
             try:
-                door = host_door(self._system)
+                server = host_socket(self._system)
             except (OSError, TradeError) as bad:
                 _logger.warning("the stop line on this host cannot be opened: %s. Stops here need the transport", bad)
                 return
-            if door is not None:
-                sock, self._path = door
+            if server is not None:
+                sock, self._path = server
                 self._listeners.append(Listener([(sock, None)], self._serve))
 
     # --- called by the listener
@@ -160,18 +160,18 @@ class StopLineService:
             self._path.unlink(missing_ok=True)
 
 
-def _network_doors(settings: Settings, certificate: Certificate) -> list[tuple[socket.socket, ssl.SSLContext | None]]:
+def _network_sockets(settings: Settings, certificate: Certificate) -> list[tuple[socket.socket, ssl.SSLContext | None]]:
     """One listening socket beside each endpoint with a fixed port."""
     context = line_context(certificate, server=True)
-    doors: list[tuple[socket.socket, ssl.SSLContext | None]] = []
+    servers: list[tuple[socket.socket, ssl.SSLContext | None]] = []
     try:
         for endpoint in filter(_is_known, map(Endpoint.read, settings.listen)):
-            doors.append((network_door(endpoint), context))  # noqa: PERF401 - the open ones are closed if one fails
+            servers.append((network_socket(endpoint), context))  # noqa: PERF401 - the open ones are closed if one fails
     except BaseException:
-        for door, _ in doors:
-            door.close()
+        for server, _ in servers:
+            server.close()
         raise
-    return doors
+    return servers
 
 
 def _is_known(endpoint: Endpoint) -> bool:

@@ -41,11 +41,11 @@ class PortGuard:
     def __init__(self, ports: Iterable[int], links: Callable[[], int]) -> None:
         self._ports = frozenset(ports)
         self._links = links
-        self._doors = _listening(self._ports) if sys.platform == "linux" and _OPEN_FILES.is_dir() else []
+        self._sockets = _listening(self._ports) if sys.platform == "linux" and _OPEN_FILES.is_dir() else []
         self._shut = False
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trade-port-guard", daemon=True)
-        if self._doors:
+        if self._sockets:
             self._thread.start()
 
     def _run(self) -> None:
@@ -72,12 +72,12 @@ class PortGuard:
 
     def _filter(self, *, shut: bool) -> None:
         program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(_DROP_ALL))
-        for door in self._doors:
+        for sock in self._sockets:
             with contextlib.suppress(OSError):  # the socket is closed
                 if shut:
-                    door.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
+                    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
                 else:
-                    door.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+                    sock.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
         self._shut = shut
 
     def close(self) -> None:
@@ -85,8 +85,8 @@ class PortGuard:
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(2)
-        for door in self._doors:
-            door.close()
+        for sock in self._sockets:
+            sock.close()
 
 
 def _listening(ports: frozenset[int]) -> list[socket.socket]:

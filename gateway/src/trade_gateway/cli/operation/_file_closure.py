@@ -33,7 +33,7 @@ class Named(NamedTuple):
     """The number of containers on this host besides the gateway."""
 
 
-class _Door(Struct):
+class _Http(Struct):
     tokens: str = ""
     tls: str = ""
 
@@ -46,17 +46,17 @@ class _Part(Struct, kw_only=True):
     audit: str = ""
     robot: str = ""
     rules: str = ""
-    door: _Door | None = None
+    http: _Http | None = None
     gateway: str = ""
     host: str = _LOCAL
 
     def files(self, folder: Path) -> Iterator[Path]:
         """Returns the files of this host that it names directly."""
-        door = self.door or _Door()
-        for name in (self.robot, self.rules, door.tokens):
+        http = self.http or _Http()
+        for name in (self.robot, self.rules, http.tokens):
             if name:
                 yield folder / name
-        for tls in (self.tls, door.tls):
+        for tls in (self.tls, http.tls):
             if tls:
                 yield from (folder / tls / name for name in _CERTIFICATE)
         if self.policy:

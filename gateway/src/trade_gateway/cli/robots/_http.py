@@ -1,4 +1,4 @@
-"""``trade door``: the HTTP gateway, which serves HTTP and WebSocket clients and the dashboard."""
+"""``trade http``: the HTTP gateway, which serves HTTP and WebSocket clients and the dashboard."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,22 +15,22 @@ from trade_gateway.cli.robots._detached import ready
 from trade_gateway.process._signals import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S: Final = 1.0
-_TOKENS: Final = Path("door-tokens.toml")
-_NAME: Final = "door"
+_TOKENS: Final = Path("http-tokens.toml")
+_NAME: Final = "http"
 
 app = typer.Typer(
     invoke_without_command=True,
     help="Serve HTTP and WebSocket clients and the dashboard.\n\n"
-    "For example: trade door token anna, and then trade door",
+    "For example: trade http token anna, and then trade http",
 )
 
 TokenFile = Annotated[
-    Path, typer.Option("--tokens", rich_help_panel=SECURITY, help="File of tokens, which trade door token makes.")
+    Path, typer.Option("--tokens", rich_help_panel=SECURITY, help="File of tokens, which trade http token makes.")
 ]
 
 
 @app.callback()
-def door(
+def http(
     context: typer.Context,
     listen: Annotated[
         str,
@@ -58,12 +58,12 @@ def door(
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)
-    opened = room_of_extra("http", "trade door")
+    opened = room_of_extra("http", "trade http")
     choice: SystemChoice = context.obj
     with (
         leaving() as asked_to_leave,
         Container(choice.settings(name)) as container,
-        opened.Door(
+        opened.HttpGateway(
             container,
             listen=listen,
             tokens=opened.Tokens(tokens if tokens.exists() or tokens != _TOKENS else None),
@@ -72,7 +72,7 @@ def door(
             hosts=host or (),
         ) as standing,
     ):
-        refuse_twice(container, "trade door")
+        refuse_twice(container, "trade http")
         container.terminating.close = asked_to_leave.set
         settle()
         _say_ready(out, container, standing.url)
@@ -92,16 +92,16 @@ def token(
 
     To revoke the token, remove its line from the file. Motion of its client stops then.
 
-    For example: trade door token anna
+    For example: trade http token anna
     """
-    made = room_of_extra("http", "trade door").add_token(tokens, identity)
+    made = room_of_extra("http", "trade http").add_token(tokens, identity)
     out = Output(as_json=as_json)
     if as_json:
         out.data({"identity": identity, "token": made})
         return
     out.say(f"token of {escape(identity)}; it is not shown again:\n  [bold]{made}[/]")
-    out.say("for example, where DOOR is the address that trade door prints:")
-    out.say(f"  [bold]curl -H 'Authorization: Bearer {made}' DOOR/services[/]")
+    out.say("for example, where URL is the address that trade http prints:")
+    out.say(f"  [bold]curl -H 'Authorization: Bearer {made}' URL/services[/]")
 
 
 def _say_ready(out: Output, container: Container, url: str) -> None:

@@ -2,7 +2,7 @@
 
 import { readCalls, showCalls } from "./calls.js";
 import { STATE_HZ } from "./devices.js";
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { lookForEstops } from "./estop.js";
 import { lookAtFaults } from "./faults.js";
 import { lookForLocks } from "./locks.js";
@@ -17,11 +17,11 @@ const LONGEST_PAUSE_MS = 4000;
 /** Poll while connected and visible. A robot without an answer is gone. */
 async function keepAsking(look, every_ms) {
   for (;;) {
-    if (door.connected && document.visibilityState === "visible") {
+    if (gateway.connected && document.visibilityState === "visible") {
       try {
         await look();
       } catch (error) {
-        if (error.name === "TimeoutError" || error.name === "TypeError") door.drop();
+        if (error.name === "TimeoutError" || error.name === "TypeError") gateway.drop();
         else tell(`${error.title ?? error.name}: ${error.message}`);
       }
     }
@@ -38,9 +38,9 @@ function onChange() {
 
 function showConnection(connected) {
   write($("link"), connected ? "● Connected" : "✕ Not connected: what you see is old. Trying again …");
-  write($("who"), door.me ? `as ${door.me.identity}` : "");
+  write($("who"), gateway.me ? `as ${gateway.me.identity}` : "");
   document.body.classList.toggle("offline", !connected);
-  $("leave").hidden = !door.token;
+  $("leave").hidden = !gateway.token;
 }
 
 /** Wait for a token. */
@@ -50,17 +50,17 @@ async function signIn(error) {
   write($("who"), "");
   document.body.classList.remove("offline");
   document.body.classList.add("outside");
-  write($("login-problem"), door.token ? error.message : "");
+  write($("login-problem"), gateway.token ? error.message : "");
   $("token").focus();
   await new Promise((done) => {
     $("login-form").onsubmit = (event) => {
       event.preventDefault();
-      door.token = $("token").value.trim();
+      gateway.token = $("token").value.trim();
       $("token").value = "";
       done();
     };
   });
-  sessionStorage.setItem("token", door.token);
+  sessionStorage.setItem("token", gateway.token);
   document.body.classList.remove("outside");
 }
 
@@ -73,14 +73,14 @@ async function main() {
   let pause_ms = 250;
   for (;;) {
     try {
-      door.me = await door.get("/me");
-      const { closed } = await door.open();
+      gateway.me = await gateway.get("/me");
+      const { closed } = await gateway.open();
       [$("inside").hidden, $("login").hidden] = [false, true];
       showConnection(true);
       pause_ms = 250;
       forget();
-      door.begin({ do: "watch" }, onChange).ended.catch(() => {});
-      if (door.me.reads) {
+      gateway.begin({ do: "watch" }, onChange).ended.catch(() => {});
+      if (gateway.me.reads) {
         readLog();
         readCalls();
       } else write($("log-problem"), "This needs the right to read the system (group trade).");
@@ -88,12 +88,12 @@ async function main() {
       await closed;
     } catch (error) {
       if (error.status === 401 || error.status === 403) {
-        door.me = null;
+        gateway.me = null;
         await signIn(error);
         continue;
       }
     }
-    if (door.me) showConnection(false);
+    if (gateway.me) showConnection(false);
     await sleep(pause_ms);
     pause_ms = Math.min(pause_ms * 2, LONGEST_PAUSE_MS);
   }

@@ -1,6 +1,6 @@
 // Calls of the whole system as they end, while its containers trace them.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { $, clock, table, tell, write } from "./page.js";
 
 const MOST_CALLS = 100;
@@ -11,9 +11,9 @@ let reading = null;
 
 /** Read recorded calls; an ended connection delivers none. */
 export function readCalls() {
-  if (reading) door.cancel(reading.id);
+  if (reading) gateway.cancel(reading.id);
   ended.clear();
-  const here = door.begin({ do: "calls", reads: $("call-reads").checked }, ({ call }) => {
+  const here = gateway.begin({ do: "calls", reads: $("call-reads").checked }, ({ call }) => {
     if (here === reading && !(call.side === "asked" && ended.has(call.id))) {
       ended.delete(call.id);
       ended.set(call.id, call);
@@ -21,12 +21,12 @@ export function readCalls() {
     if (ended.size > MOST_CALLS) ended.delete(ended.keys().next().value);
   });
   reading = here;
-  here.ended.catch((error) => here === reading && door.connected && write($("call-problem"), `${error.title}: ${error.message}`));
+  here.ended.catch((error) => here === reading && gateway.connected && write($("call-problem"), `${error.title}: ${error.message}`));
 }
 
 export function showCalls() {
-  for (const button of [$("trace-calls"), $("stop-tracing")]) button.disabled = !(door.me?.instruments && door.connected);
-  if (!door.me?.reads) {
+  for (const button of [$("trace-calls"), $("stop-tracing")]) button.disabled = !(gateway.me?.instruments && gateway.connected);
+  if (!gateway.me?.reads) {
     table($("call-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
@@ -43,7 +43,7 @@ function rowOf(call) {
 
 async function trace(on) {
   try {
-    const { containers } = await door.post("/tracing", { on });
+    const { containers } = await gateway.post("/tracing", { on });
     tell(`${on ? "Calls are traced" : "Calls are no longer traced"} in ${containers.join(", ") || "no container"}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);

@@ -1,6 +1,6 @@
 // A joint, a gripper or an arm: its last measurement, and its controls.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { JOG_VALID_S, Jog } from "./jog.js";
 import { lockOn } from "./locks.js";
 import { button, degrees, draw, fixed, make, show, sleep, write } from "./page.js";
@@ -44,12 +44,12 @@ class Device {
   }
 
   async #follow(first) {
-    while (this.present && door.connected) {
+    while (this.present && gateway.connected) {
       try {
-        if (this.services.has("limits")) this.limits ??= await door.call(this.group, "limits");
+        if (this.services.has("limits")) this.limits ??= await gateway.call(this.group, "limits");
         this.write_speed();
         const stream = { do: "stream", group: this.group, name: "state", hz: STATE_HZ };
-        const { id, ended } = door.begin(stream, (message) => {
+        const { id, ended } = gateway.begin(stream, (message) => {
           this.#heard(message);
           first();
         });
@@ -73,13 +73,13 @@ class Device {
 
   leave() {
     this.present = false;
-    door.cancel(this.#stream);
+    gateway.cancel(this.#stream);
     this.element.remove();
   }
 
   async stop() {
     try {
-      await door.call(this.group, "stop", {}, { deadline_s: 5 });
+      await gateway.call(this.group, "stop", {}, { deadline_s: 5 });
     } catch (error) {
       if (error.title !== "Cancelled") this.refused(error);
     }
@@ -94,7 +94,7 @@ class Device {
   async act(name) {
     this.say("");
     try {
-      await door.call(this.group, name, {}, { deadline_s: ACTION_S });
+      await gateway.call(this.group, name, {}, { deadline_s: ACTION_S });
     } catch (error) {
       this.refused(error);
     }
@@ -112,13 +112,13 @@ class Device {
   async let_move_again() {
     let lock = "";
     try {
-      if (!door.has_locked(this.resources)) lock = await door.lock(this.group, "let it move again", 0.5);
-      await door.ask({ do: "resume", group: this.group });
+      if (!gateway.has_locked(this.resources)) lock = await gateway.lock(this.group, "let it move again", 0.5);
+      await gateway.ask({ do: "resume", group: this.group });
       this.say("It may move again.");
     } catch (error) {
       this.refused(error);
     }
-    if (lock && door.connected) await door.unlock(lock).catch((error) => this.refused(error));
+    if (lock && gateway.connected) await gateway.unlock(lock).catch((error) => this.refused(error));
   }
 
   build() {
@@ -155,10 +155,10 @@ class Device {
   }
 
   paint() {
-    const jogs = this.limits && this.may(this.constructor.moved_by) && door.connected;
+    const jogs = this.limits && this.may(this.constructor.moved_by) && gateway.connected;
     for (const jog of this.jogs) jog.let(jogs);
-    for (const [name, action] of this.actions) action.disabled = !(this.may(name) && door.connected);
-    this.stopping.disabled = !door.connected;
+    for (const [name, action] of this.actions) action.disabled = !(this.may(name) && gateway.connected);
+    this.stopping.disabled = !gateway.connected;
     const { state } = this;
     const silent = this.problem || (state ? this.stale && "not heard of lately" : "no data yet");
     const wrong = [silent, state?.fault && `fault: ${state.fault}`].filter(Boolean).join("; ");
@@ -167,7 +167,7 @@ class Device {
     show(this.badges, JSON.stringify(words), () => words.map((text) => make("span", { class: "badge" }, text)));
     const lock = lockOn(this.resources);
     write(this.locked, lock ? `${lock.owner}, ${lock.purpose}` : "—");
-    this.element.classList.toggle("stale", !state || this.stale || !door.connected);
+    this.element.classList.toggle("stale", !state || this.stale || !gateway.connected);
     if (!state) return;
     const figures = this.measured(state);
     if (this.figures.childElementCount !== figures.length) {

@@ -1,6 +1,6 @@
 // The e-stop: always visible, and Esc presses it. It reports only what robots have confirmed.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { releaseAll } from "./jog.js";
 import { $, button, clock, make, show, tell } from "./page.js";
 
@@ -13,7 +13,7 @@ async function pressEstop() {
   releaseAll();
   say({ wrong: "Stopping everything … NO ROBOT HAS CONFIRMED IT YET." });
   try {
-    say(outcomeOf(await door.estop("dashboard")));
+    say(outcomeOf(await gateway.estop("dashboard")));
   } catch (error) {
     say({ wrong: `✕ NO ROBOT CONFIRMED: ${CUT}`, rest: error.message });
   }
@@ -39,7 +39,7 @@ function outcomeOf(report) {
 }
 
 export async function lookForEstops() {
-  open_estops = await door.get("/estops");
+  open_estops = await gateway.get("/estops");
   showEstops();
 }
 
@@ -52,19 +52,19 @@ function headline() {
 
 function showEstops() {
   const open = open_estops;
-  show($("stopped"), JSON.stringify([open, pressed, door.me?.administers]), () => [
+  show($("stopped"), JSON.stringify([open, pressed, gateway.me?.administers]), () => [
     headline() ? make("strong", {}, headline()) : "",
     pressed?.rest ? make("p", {}, pressed.rest) : "",
     ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}${one.told_by ? ` (reported by ${one.told_by})` : ""}: ${one.reason}`)),
-    open.length && door.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
-    open.length && !door.me?.administers ? make("p", {}, "Clearing it needs the right to administer the system.") : "",
+    open.length && gateway.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
+    open.length && !gateway.me?.administers ? make("p", {}, "Clearing it needs the right to administer the system.") : "",
     !open.length && pressed ? button("Understood", () => say(null)) : "",
   ].filter(Boolean));
 }
 
 async function clearEstop(open) {
   try {
-    const report = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
+    const report = await gateway.post("/estop/clear", { ids: open.map((one) => one.id) });
     pressed = null;
     tell(report.complete ? "The e-stop is cleared. Nothing moves by itself; what it stopped must be resumed first." : `Not cleared by ${report.missing.join(", ") || "any visible container"}.`);
   } catch (error) {
@@ -75,7 +75,7 @@ async function clearEstop(open) {
 
 $("estop").onclick = pressEstop;
 addEventListener("keydown", (event) => {
-  if (event.key !== "Escape" || event.repeat || event.isComposing || !door.me) return;
+  if (event.key !== "Escape" || event.repeat || event.isComposing || !gateway.me) return;
   event.preventDefault();
   pressEstop();
 }, true);

@@ -1,6 +1,6 @@
 // Present and past faults of devices, from the robots' fault logs, and their acknowledgement.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { $, moment, table, tell } from "./page.js";
 import { services } from "./schemas.js";
 
@@ -17,7 +17,7 @@ export async function lookAtFaults() {
 
 async function faultsOf(log, open_only) {
   const may = services.some((one) => one.group === log.group && one.name === "acknowledge" && one.allowed);
-  const found = await door.call(log.group, "faults", { open_only }, { container: log.container });
+  const found = await gateway.call(log.group, "faults", { open_only }, { container: log.container });
   return found.map((one) => ({ ...one, may, log }));
 }
 
@@ -35,7 +35,7 @@ function said(one) {
 
 async function acknowledge(one) {
   try {
-    await door.call(one.log.group, "acknowledge", { id: one.id }, { container: one.log.container });
+    await gateway.call(one.log.group, "acknowledge", { id: one.id }, { container: one.log.container });
     await lookAtFaults();
   } catch (error) {
     tell(`${error.title}: ${error.message}`);

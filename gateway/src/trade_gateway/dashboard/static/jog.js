@@ -1,6 +1,6 @@
 // Hold to move.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { $, make, sleep, write } from "./page.js";
 
 const JOG_EVERY_MS = 80;
@@ -69,7 +69,7 @@ export class Jog {
   }
 
   press() {
-    if (this.pressed || this.button.disabled || document.visibilityState !== "visible" || !door.connected) return;
+    if (this.pressed || this.button.disabled || document.visibilityState !== "visible" || !gateway.connected) return;
     held.add(this);
     this.button.setAttribute("aria-pressed", "true");
     this.device.say("");
@@ -87,13 +87,13 @@ export class Jog {
     const { group, resources } = this.device;
     let lock = "";
     try {
-      if (!door.has_locked(resources)) lock = await door.lock(group, "jog by hand", 0.5);
+      if (!gateway.has_locked(resources)) lock = await gateway.lock(group, "jog by hand", 0.5);
       const setpoint = this.device.setpoints(this);
       while (this.pressed) {
         this.#moving = true;
         const next = sleep(JOG_EVERY_MS);
         const [name, args] = setpoint();
-        await door.call(group, name, { ...args, valid_s: JOG_VALID_S }, { deadline_s: 1 }); // one at a time: none piles up on a slow link
+        await gateway.call(group, name, { ...args, valid_s: JOG_VALID_S }, { deadline_s: 1 }); // one at a time: none piles up on a slow link
         await next;
       }
     } catch (error) {
@@ -102,7 +102,7 @@ export class Jog {
       this.release();
       this.#moving = false;
       await this.#stopped;
-      if (lock && door.connected) await door.unlock(lock).catch((error) => this.device.refused(error));
+      if (lock && gateway.connected) await gateway.unlock(lock).catch((error) => this.device.refused(error));
     }
   }
 }
@@ -110,4 +110,4 @@ export class Jog {
 addEventListener("blur", releaseAll);
 addEventListener("pagehide", releaseAll);
 document.addEventListener("visibilitychange", releaseAll);
-door.on_loss = releaseAll;
+gateway.on_loss = releaseAll;

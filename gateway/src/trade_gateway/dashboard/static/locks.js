@@ -1,6 +1,6 @@
 // Locks: their owners, and how to request, break and release them.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { $, button, clock, make, show, write } from "./page.js";
 
 let locks = [];
@@ -8,10 +8,10 @@ let locks = [];
 export const lockOn = (resources) => locks.find((one) => one.resources.some((name) => resources.includes(name)));
 
 export async function lookForLocks() {
-  locks = await door.get("/locks");
-  const mine = new Map([...door.locks].map(([lock, resources]) => [[...resources].sort().join(), lock]));
+  locks = await gateway.get("/locks");
+  const mine = new Map([...gateway.locks].map(([lock, resources]) => [[...resources].sort().join(), lock]));
   const nameOf = (one) => mine.get([...one.resources].sort().join());
-  const key = JSON.stringify([locks, [...door.locks.keys()]]);
+  const key = JSON.stringify([locks, [...gateway.locks.keys()]]);
   show($("lock-list"), key, () => (locks.length ? locks.map((one) => lockCard(one, nameOf(one))) : [make("li", { class: "note" }, "Nothing is locked.")]));
 }
 
@@ -20,7 +20,7 @@ function lockCard(one, mine) {
   const said = make("p", { role: "status" });
   const attempt = async (path, reason, done) => {
     try {
-      await door.post(path, { ...asked, reason });
+      await gateway.post(path, { ...asked, reason });
       write(said, done);
     } catch (error) {
       write(said, `✕ ${error.title}: ${error.message}`);
@@ -37,7 +37,7 @@ function lockCard(one, mine) {
     if (!breaking.hidden) reason.focus();
   });
   const hands = mine
-    ? [button("Give it back", () => door.unlock(mine).catch((error) => write(said, error.message)))]
+    ? [button("Give it back", () => gateway.unlock(mine).catch((error) => write(said, error.message)))]
     : [button("Ask for it", () => attempt("/locks/request", "asked from the dashboard", "Its owner was asked.")), begin];
   const lines = [
     ["Owner", mine ? `${one.owner} (this page)` : one.owner],
@@ -53,7 +53,7 @@ $("lock-form").onsubmit = async (event) => {
   event.preventDefault();
   write($("lock-problem"), "");
   try {
-    await door.lock($("lock-group").value, $("lock-purpose").value, 2);
+    await gateway.lock($("lock-group").value, $("lock-purpose").value, 2);
   } catch (error) {
     write($("lock-problem"), `✕ ${error.title}: ${error.message}`);
   }

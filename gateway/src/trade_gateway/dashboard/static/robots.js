@@ -2,7 +2,7 @@
 
 import { Chain, chainsOf } from "./chain.js";
 import { Arm, Gripper, Joint } from "./devices.js";
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { releaseAll } from "./jog.js";
 import { $, make, show, write } from "./page.js";
 import { lookForServices, operationOf, resolve, services } from "./schemas.js";
@@ -70,7 +70,7 @@ async function arrange(groups) {
   for (const [group, inside] of groups) {
     const kind = inside.has("state") ? kindOf(inside.get("state")) : null;
     if (kind) devices.set(group, new kind(group, inside));
-    else if (inside.has("joints")) members.set(group, await door.call(group, "joints").catch(() => []));
+    else if (inside.has("joints")) members.set(group, await gateway.call(group, "joints").catch(() => []));
   }
   const robots = new Map();
   for (const group of devices.keys()) {

@@ -1,13 +1,13 @@
 // The services, and the types of their arguments and results.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 
 export let services = [];
 let described = { paths: {}, components: { schemas: {} } };
 
 /** Fetch all of it again. */
 export async function lookForServices() {
-  [services, described] = await Promise.all([door.get("/services"), door.get("/openapi.json")]);
+  [services, described] = await Promise.all([gateway.get("/services"), gateway.get("/openapi.json")]);
 }
 
 export function resolve(schema) {

@@ -1,6 +1,6 @@
 // All services: search, and a form for each, made from its schema.
 
-import { door } from "./door.js";
+import { gateway } from "./gateway.js";
 import { $, button, make, show, write } from "./page.js";
 import { operationOf, resolve, services } from "./schemas.js";
 
@@ -51,7 +51,7 @@ function formOf(one) {
   const fields = Object.entries(schema.properties ?? {}).map(([name, inner]) => field(one, name, inner, required.has(name)));
   const result = make("output", { class: "result", role: "status" });
   const run = make("button", { type: "submit", disabled: !one.allowed }, one.effect === "read" ? "Read" : "Call");
-  const cancel = button("Cancel", () => door.cancel(Number(cancel.dataset.call)), { hidden: true });
+  const cancel = button("Cancel", () => gateway.cancel(Number(cancel.dataset.call)), { hidden: true });
   const form = make("form", { class: "call" }, ...fields.map((each) => each.element), make("div", { class: "line" }, run, cancel), result);
   form.onsubmit = async (event) => {
     event.preventDefault();
@@ -59,7 +59,7 @@ function formOf(one) {
     try {
       const args = Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
       const asked = { do: "call", group: one.group, name: one.name, container: one.container, args, deadline_s: 60 };
-      const { id, ended } = door.begin(asked, (message) => write(result, `… ${JSON.stringify(message.progress)}`));
+      const { id, ended } = gateway.begin(asked, (message) => write(result, `… ${JSON.stringify(message.progress)}`));
       cancel.dataset.call = id;
       [cancel.hidden, run.disabled] = [false, true];
       write(result, "under way …");

@@ -1,4 +1,4 @@
-"""Who is let in, as whom, and what the policy lets that one do: the client is judged, not the door (S21)."""
+"""Who is let in, as whom, and what the policy lets that one do: the client is judged, not the HTTP gateway (S21)."""
 
 import logging
 from collections.abc import Iterator
@@ -16,42 +16,44 @@ from trade_gateway.clients._system_info import newest
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Opened]:
+def served(tmp_path: Path) -> Iterator[Opened]:
     with governed(tmp_path) as made:
         yield made
 
 
-def test_a_client_may_do_what_the_policy_lets_it_and_not_what_the_door_may(door: Opened) -> None:
-    anna, bert = door.client("anna"), door.client("bert")
+def test_a_client_has_its_own_rights_and_not_those_of_the_http_gateway(served: Opened) -> None:
+    anna, bert = served.client("anna"), served.client("bert")
     assert anna.call("robot.a.move", 1.0).status == 200
     denied = bert.call("robot.a.move", 2.0)
     assert (denied.status, denied.title) == (403, "AccessDenied")
     assert denied.body["data"]["who"] == "bert"
     assert "no rule of role viewer allows call in robot.a" in denied.body["detail"]
     assert bert.call("robot.a.where_is_it").body == {"result": 1.0}
-    assert door["a"].written == [1.0]
+    assert served["a"].written == [1.0]
 
 
-def test_what_a_client_may_not_know_of_it_does_not_see(door: Opened) -> None:
-    anna, stranger = door.client("anna"), door.client("carl")
+def test_what_a_client_may_not_know_of_it_does_not_see(served: Opened) -> None:
+    anna, stranger = served.client("anna"), served.client("carl")
     assert {one["group"] for one in anna.ask("GET", "/services").body} == {"robot.a"}
     assert anna.call("robot.b.move", 1.0).title == "NoSuchService"
     assert "/call/robot.b/move" not in anna.ask("GET", "/openapi.json").body["paths"]
     assert stranger.ask("GET", "/services").body == []
-    with door.robot.me.lock([door.robot.find("b")]):
+    with served.robot.me.lock([served.robot.find("b")]):
         assert anna.ask("GET", "/locks").body == []
     with anna.socket() as page:
         say(page, do="watch", id=1, name="move", existing=True, occasions=["joined"])
         assert heard(page)["service"]["group"] == "robot.a"
-        door.robot.system.container("b").deregister(door["b"])
-        door.robot.system.container("b").register(door["b"], ["robot.b", "robot.a"])  # its first group is what counts
-        door.robot.system.container("a").deregister(door["a"])
-        door.robot.system.container("a").register(door["a"], "robot.a.again")
+        served.robot.system.container("b").deregister(served["b"])
+        served.robot.system.container("b").register(
+            served["b"], ["robot.b", "robot.a"]
+        )  # its first group is what counts
+        served.robot.system.container("a").deregister(served["a"])
+        served.robot.system.container("a").register(served["a"], "robot.a.again")
         assert heard(page)["service"]["group"] == "robot.a.again"
 
 
-def test_who_has_no_role_reads_nothing_of_the_system(door: Opened) -> None:
-    bert, stranger = door.client("bert"), door.client("carl")
+def test_who_has_no_role_reads_nothing_of_the_system(served: Opened) -> None:
+    bert, stranger = served.client("bert"), served.client("carl")
     for path in ("/containers", "/loads", "/sight", "/estops"):
         assert bert.ask("GET", path).status == 200
         refused = stranger.ask("GET", path)
@@ -59,8 +61,8 @@ def test_who_has_no_role_reads_nothing_of_the_system(door: Opened) -> None:
     assert stranger.ask("POST", "/estop", {"reason": "smoke"}).status == 200  # to stop needs no role (S07)
 
 
-def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) -> None:
-    anna, bert, chief = (door.client(name).opened(lease_s=60) for name in ("anna", "bert", "chief"))
+def test_locks_resuming_and_clearing_are_the_clients_rights_too(served: Opened) -> None:
+    anna, bert, chief = (served.client(name).opened(lease_s=60) for name in ("anna", "bert", "chief"))
     assert bert.ask("POST", "/locks", {"group": "robot.a"}).title == "AccessDenied"
     assert anna.ask("POST", "/locks", {"group": "robot"}).title == "AccessDenied"
     assert anna.ask("POST", "/locks", {"group": "trade"}).title == "AccessDenied"
@@ -83,11 +85,11 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) ->
 
 
 def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
-    door: Opened, monkeypatch: pytest.MonkeyPatch
+    served: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Event] = []
-    monkeypatch.setattr(door.robot.me._parts.audit, "_tell", told.append)
-    bert, chief = door.client("bert"), door.client("chief")
+    monkeypatch.setattr(served.robot.me._parts.audit, "_tell", told.append)
+    bert, chief = served.client("bert"), served.client("chief")
     bert.call("robot.a.move", 2.0)
     with bert.socket() as page:
         ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])
@@ -99,12 +101,12 @@ def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
     assert refused == [("bert", *move), ("bert", *move), ("bert", *clear)]
     assert "no rule of role viewer" in told[0].why
     assert [(one.who, one.about) for one in told if one.what == "e-stop clearing"] == [("chief", given["id"])]
-    Client(door.door.url, "not a token").ask("GET", "/services")
+    Client(served.gateway.url, "not a token").ask("GET", "/services")
     assert len([one for one in told if one.kind == "refused"]) == 3  # else anybody could fill the record
 
 
-def test_a_client_is_told_who_it_is_and_what_it_may_do(door: Opened) -> None:
-    anna, bert, chief = (door.client(name) for name in ("anna", "bert", "chief"))
+def test_a_client_is_told_who_it_is_and_what_it_may_do(served: Opened) -> None:
+    anna, bert, chief = (served.client(name) for name in ("anna", "bert", "chief"))
     may_nothing = {"administers": False, "reads": False, "instruments": False}
     assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing}
     assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True)}
@@ -113,10 +115,10 @@ def test_a_client_is_told_who_it_is_and_what_it_may_do(door: Opened) -> None:
     assert all(one["allowed"] for one in anna.ask("GET", "/services").body)
 
 
-def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(door: Opened) -> None:
-    anna, bert, carl, chief = (door.client(name).opened(lease_s=60) for name in ("anna", "bert", "carl", "chief"))
+def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(served: Opened) -> None:
+    anna, bert, carl, chief = (served.client(name).opened(lease_s=60) for name in ("anna", "bert", "carl", "chief"))
     asked: list[tuple[str, str]] = []
-    own = door.robot.me.lock([door.robot.find("a")], on_request=lambda who, why: asked.append((who, why))).acquire()
+    own = served.robot.me.lock([served.robot.find("a")], on_request=lambda who, why: asked.append((who, why))).acquire()
     wanted = {"resources": ["a"], "reason": "lunch"}
     assert bert.ask("POST", "/locks/request", wanted).body == {"asked": ["tester/me"]}
     wait_until(lambda: bool(asked))
@@ -131,11 +133,11 @@ def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(door
     own.release()
 
 
-def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_system(door: Opened) -> None:
-    anna, chief = door.client("anna"), door.client("chief")
+def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_system(served: Opened) -> None:
+    anna, chief = served.client("anna"), served.client("chief")
     assert {one["container"] for one in anna.ask("GET", "/loads").body} >= {"a", "b"}
-    watching = door.robot.me.every(s=60, call=door.robot.find("a", "where_is_it"))
-    hook = door.robot.me.before_service(door.robot.find("a"), door.robot.find("a", "where_is_it"))
+    watching = served.robot.me.every(s=60, call=served.robot.find("a", "where_is_it"))
+    hook = served.robot.me.before_service(served.robot.find("a"), served.robot.find("a", "where_is_it"))
     assert watching.id in [one["id"] for one in chief.ask("GET", "/notifications").body]
     assert [one["id"] for one in chief.ask("GET", "/hooks").body] == [hook.id]
     for path in ("/notifications", "/hooks", "/policy", "/audit"):
@@ -150,10 +152,10 @@ def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_s
     watching.cancel()
 
 
-def test_the_log_is_told_line_by_line_to_who_reads_the_system(door: Opened) -> None:
-    with door.client("chief").socket() as page:
+def test_the_log_is_told_line_by_line_to_who_reads_the_system(served: Opened) -> None:
+    with served.client("chief").socket() as page:
         say(page, do="logs", id=1, level=30)
-        door.robot.system.settle()
+        served.robot.system.settle()
         logging.getLogger("trade").info("not this one")
         logging.getLogger("trade").warning("the lamp is hot")
         while "the lamp is hot" not in (line := heard(page)["line"])["text"]:
@@ -162,20 +164,20 @@ def test_the_log_is_told_line_by_line_to_who_reads_the_system(door: Opened) -> N
         while (told := heard(page)).get("id") != 2:
             pass
         assert told["result"] == {"cancelled": True}
-    with door.client("anna").socket() as page:
+    with served.client("anna").socket() as page:
         assert ask(page, do="logs", id=1)["problem"]["title"] == "AccessDenied"
 
 
-def test_who_reads_the_system_is_told_its_policy(door: Opened) -> None:
-    chief = door.client("chief")
+def test_who_reads_the_system_is_told_its_policy(served: Opened) -> None:
+    chief = served.client("chief")
     told = chief.ask("GET", "/policy").body
     assert (told["governed"], told["revoked"]) == (True, [])
     anna = next(one for one in told["identities"] if one["name"] == "anna")
     assert (anna["roles"], anna["rights"]["call"], anna["rights"]["administer"]) == (["operator"], ["robot.a"], [])
 
 
-def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(door: Opened) -> None:
-    anna, chief = door.client("anna"), door.client("chief")
+def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(served: Opened) -> None:
+    anna, chief = served.client("anna"), served.client("chief")
     assert "a" in chief.ask("POST", "/tracing", {"on": True}).body["containers"]
     try:
         with chief.socket() as page:
@@ -213,18 +215,18 @@ def test_the_newest_of_all_audit_records_of_a_folder_are_told_newest_first(tmp_p
         newest(tmp_path, 3)
 
 
-def test_functions_of_the_middleware_are_nobodys_by_the_door(door: Opened) -> None:
-    """They would be judged as the door's."""
-    chief = door.client("chief")
+def test_functions_of_the_middleware_are_not_callable_over_http(served: Opened) -> None:
+    """They would be judged as the HTTP gateway's."""
+    chief = served.client("chief")
     assert chief.ask("POST", "/call/trade/terminate_container", {"args": ["x"]}).title == "NoSuchService"
     assert not [one for one in chief.ask("GET", "/services").body if one["group"] == "trade"]
 
 
-def test_streams_are_the_clients_rights_too_and_end_with_them(door: Opened, tmp_path: Path) -> None:
-    with door.client("bert").socket() as page:
+def test_streams_are_the_clients_rights_too_and_end_with_them(served: Opened, tmp_path: Path) -> None:
+    with served.client("bert").socket() as page:
         page.send('{"do": "stream", "id": 1, "group": "robot.a", "name": "where_is_it", "hz": 50}')
         assert page.recv(timeout=60)
-        govern(door.robot, tmp_path, POLICY.replace('read = ["robot"]', 'read = ["robot.b"]'))
+        govern(served.robot, tmp_path, POLICY.replace('read = ["robot"]', 'read = ["robot.b"]'))
         while b"problem" not in (told := page.recv(timeout=60, decode=False)):
             pass
         assert b"AccessDenied" in told
@@ -232,37 +234,37 @@ def test_streams_are_the_clients_rights_too_and_end_with_them(door: Opened, tmp_
         assert denied["problem"]["title"] == "NoSuchService"
 
 
-def test_who_is_revoked_is_let_in_no_more_and_what_it_moves_stops(door: Opened, tmp_path: Path) -> None:
-    anna = door.client("anna")
+def test_who_is_revoked_is_let_in_no_more_and_what_it_moves_stops(served: Opened, tmp_path: Path) -> None:
+    anna = served.client("anna")
     with anna.socket() as page:
         ask(page, do="call", id=1, group="robot.a", name="go_on", args=[1.0])
         (tmp_path / "revoked.toml").write_text('revoked = ["anna"]\n')
-        govern(door.robot, tmp_path, 'revoked_file = "revoked.toml"\n' + POLICY)
-        assert door["a"].stopped.wait(20)
+        govern(served.robot, tmp_path, 'revoked_file = "revoked.toml"\n' + POLICY)
+        assert served["a"].stopped.wait(20)
     refused = anna.ask("GET", "/services")
     assert (refused.status, refused.title) == (403, "AccessDenied")
 
 
-def test_nobody_known_is_let_in_only_by_name(door: Opened, tmp_path: Path) -> None:
-    unknown = Client(door.door.url)
+def test_nobody_known_is_let_in_only_by_name(served: Opened, tmp_path: Path) -> None:
+    unknown = Client(served.gateway.url)
     answer = unknown.ask("GET", "/services")
-    assert (answer.status, answer.title) == (401, "NotLetIn")
+    assert (answer.status, answer.title) == (401, "NotAuthenticated")
     assert answer.headers["www-authenticate"].startswith("Bearer")
-    govern(door.robot, tmp_path, POLICY + '"*" = ["viewer"]\n')
+    govern(served.robot, tmp_path, POLICY + '"*" = ["viewer"]\n')
     assert unknown.ask("POST", "/estop").status == 401  # a pattern means those whom one knows
-    govern(door.robot, tmp_path, POLICY + 'anonymous = ["viewer"]\n')
+    govern(served.robot, tmp_path, POLICY + 'anonymous = ["viewer"]\n')
     assert unknown.call("robot.a.where_is_it").status == 200
     assert unknown.call("robot.a.move", 1.0).title == "AccessDenied"
     unknown.token = "guess"
     assert unknown.ask("GET", "/services").status == 401
 
 
-def test_each_request_without_a_token_is_refused_whatever_it_asks_for(door: Opened) -> None:
-    paths = Client(door.door.url, door.client().token).ask("GET", "/openapi.json").body["paths"]
+def test_each_request_without_a_token_is_refused_whatever_it_asks_for(served: Opened) -> None:
+    paths = Client(served.gateway.url, served.client().token).ask("GET", "/openapi.json").body["paths"]
     asked = 0
     for path, operations in paths.items():
         for method in operations:
             body = None if method in ("get", "delete") else {}
-            assert Client(door.door.url).ask(method.upper(), path.replace("{lock}", "x"), body).status == 401
+            assert Client(served.gateway.url).ask(method.upper(), path.replace("{lock}", "x"), body).status == 401
             asked += 1
     assert asked > 15

@@ -1,4 +1,4 @@
-"""How one gets to the door: under which name, by which page, by what proof; and what is shown of it."""
+"""How one gets to the HTTP gateway: under which name, by which page, by what proof; and what is shown of it."""
 
 import logging
 import socket
@@ -19,11 +19,11 @@ from tests.support.two_joint_robot import Robot
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
-from trade_gateway.http import Door, Tokens, add_token
+from trade_gateway.http import HttpGateway, Tokens, add_token
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Opened]:
+def served(tmp_path: Path) -> Iterator[Opened]:
     with governed(tmp_path) as made:
         yield made
 
@@ -31,8 +31,8 @@ def door(tmp_path: Path) -> Iterator[Opened]:
 # --- under which name, by which page
 
 
-def test_strangers_take_a_bounded_number_of_descriptors(door: Opened) -> None:
-    place, strangers = urlsplit(door.door.url), list[socket.socket]()
+def test_strangers_take_a_bounded_number_of_descriptors(served: Opened) -> None:
+    place, strangers = urlsplit(served.gateway.url), list[socket.socket]()
     try:
         for _ in range(700):
             strangers.append(socket.create_connection((place.hostname, place.port), timeout=20))
@@ -41,7 +41,7 @@ def test_strangers_take_a_bounded_number_of_descriptors(door: Opened) -> None:
     finally:
         for one in strangers:
             one.close()
-    wait_until(lambda: _lets_in(door), "it answers again")
+    wait_until(lambda: _lets_in(served), "it answers again")
 
 
 def _is_closed(stranger: socket.socket) -> bool:
@@ -54,14 +54,14 @@ def _is_closed(stranger: socket.socket) -> bool:
         return True
 
 
-def _lets_in(door: Opened) -> bool:
+def _lets_in(served: Opened) -> bool:
     with suppress(OSError, HTTPException):
-        return door.client().ask("GET", "/me").status == 200
+        return served.client().ask("GET", "/me").status == 200
     return False
 
 
-def test_under_another_name_the_door_does_not_answer(door: Opened) -> None:
-    anna = door.client("anna")
+def test_requests_to_another_host_name_are_refused(served: Opened) -> None:
+    anna = served.client("anna")
     for wrong in ("evil.example", "evil.example:80", "", "127.0.0.1.evil.example"):
         answer = anna.ask("GET", "/services", Host=wrong)
         assert answer.status in (400, 403), wrong
@@ -69,25 +69,25 @@ def test_under_another_name_the_door_does_not_answer(door: Opened) -> None:
         assert anna.ask("GET", "/services", Host=right).status == 200, right
 
 
-def test_pages_of_other_sites_are_not_let_in(door: Opened) -> None:
-    anna = door.client("anna")
-    other_port = f"{door.door.url[:-1]}{(int(door.door.url[-1]) + 1) % 10}"
-    for origin in ("http://evil.example", "null", other_port, door.door.url.replace("http", "https")):
+def test_pages_of_other_sites_are_not_let_in(served: Opened) -> None:
+    anna = served.client("anna")
+    other_port = f"{served.gateway.url[:-1]}{(int(served.gateway.url[-1]) + 1) % 10}"
+    for origin in ("http://evil.example", "null", other_port, served.gateway.url.replace("http", "https")):
         refused = anna.ask("POST", "/estop", {}, Origin=origin)
-        assert (refused.status, refused.title) == (403, "WrongDoor")
+        assert (refused.status, refused.title) == (403, "WrongOrigin")
         assert "access-control-allow-origin" not in refused.headers
     assert anna.ask("GET", "/estops").body == []
 
 
-def test_the_doors_own_page_is_let_in_under_the_name_that_it_was_called_by(door: Opened) -> None:
-    anna, port = door.client("anna"), door.door.url.rpartition(":")[2]
-    assert anna.ask("GET", "/services", Origin=door.door.url).status == 200
+def test_the_gateways_own_page_is_accepted_under_the_host_name_of_its_request(served: Opened) -> None:
+    anna, port = served.client("anna"), served.gateway.url.rpartition(":")[2]
+    assert anna.ask("GET", "/services", Origin=served.gateway.url).status == 200
     assert anna.ask("GET", "/services", Origin=f"http://localhost:{port}").status == 403
     assert anna.ask("GET", "/services", Origin=f"http://localhost:{port}", Host=f"localhost:{port}").status == 200
-    with anna.socket(origin=door.door.url) as page:
+    with anna.socket(origin=served.gateway.url) as page:
         assert ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])["result"] == 1.0
     evil = f"http://evil.example:{port}"
-    assert anna.ask("GET", "/services", Origin=evil, Host=f"evil.example:{port}").title == "WrongDoor"
+    assert anna.ask("GET", "/services", Origin=evil, Host=f"evil.example:{port}").title == "WrongOrigin"
 
 
 def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:
@@ -108,25 +108,25 @@ def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:
 # --- where it listens, and the tokens
 
 
-def test_S21_a_door_to_a_network_needs_encryption_and_a_policy(tmp_path: Path) -> None:
+def test_S21_an_http_gateway_on_a_network_needs_encryption_and_a_policy(tmp_path: Path) -> None:
     tokens = tmp_path / "tokens.toml"
     add_token(tokens, "anna")
-    papers = Papers(tmp_path / "pki").of("door")
+    papers = Papers(tmp_path / "pki").of("http")
     with memory_system() as system:
         me = system.container("me")
         with pytest.raises(ConfigurationError, match="--tls"):
-            Door(me, listen="0.0.0.0:0", tokens=Tokens(tokens))
+            HttpGateway(me, listen="0.0.0.0:0", tokens=Tokens(tokens))
         with pytest.raises(ConfigurationError, match="TRADE_POLICY"):
-            Door(me, listen="0.0.0.0:0", tokens=Tokens(tokens), tls=papers)
-        with pytest.raises(ConfigurationError, match="trade door token"):
-            Door(me, listen="127.0.0.1:0", tokens=Tokens(None))
+            HttpGateway(me, listen="0.0.0.0:0", tokens=Tokens(tokens), tls=papers)
+        with pytest.raises(ConfigurationError, match="trade http token"):
+            HttpGateway(me, listen="127.0.0.1:0", tokens=Tokens(None))
         with pytest.raises(ConfigurationError, match="HOST:PORT"):
-            Door(me, listen="127.0.0.1", tokens=Tokens(tokens))
+            HttpGateway(me, listen="127.0.0.1", tokens=Tokens(tokens))
         with (
-            Door(me, listen="127.0.0.1:0", tokens=Tokens(tokens)) as first,
+            HttpGateway(me, listen="127.0.0.1:0", tokens=Tokens(tokens)) as first,
             pytest.raises(ConfigurationError, match="cannot be used"),
         ):
-            Door(me, listen=first.url.removeprefix("http://"), tokens=Tokens(tokens))
+            HttpGateway(me, listen=first.url.removeprefix("http://"), tokens=Tokens(tokens))
 
 
 def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(t
     with memory_system() as system:
         robot = Robot(system)
         govern(robot, tmp_path, POLICY)
-        with opened(robot.me, tmp_path, tls=ours.of("door", addresses=["127.0.0.1"])) as (made, tokens):
+        with opened(robot.me, tmp_path, tls=ours.of("http", addresses=["127.0.0.1"])) as (made, tokens):
             assert made.url.startswith("https://")
             trust = ssl.create_default_context(cafile=str(tmp_path / "pki" / "ca.pem"))
             token = Client(made.url, add_token(tokens, "bert"), trust=trust)
@@ -170,17 +170,17 @@ def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: 
             Tokens(path)
     with pytest.raises(ConfigurationError, match="no identity"):
         add_token(path, "an na")
-    with pytest.raises(ConfigurationError, match="trade door token"):
+    with pytest.raises(ConfigurationError, match="trade http token"):
         Tokens(tmp_path / "missing.toml")
 
 
 # --- what is shown, and what paths lead to
 
 
-def test_no_token_is_in_a_log_or_an_answer(door: Opened, caplog: pytest.LogCaptureFixture) -> None:
-    anna, wrong = door.client("anna"), "not-a-token-that-is-known"
+def test_no_token_is_in_a_log_or_an_answer(served: Opened, caplog: pytest.LogCaptureFixture) -> None:
+    anna, wrong = served.client("anna"), "not-a-token-that-is-known"
     with caplog.at_level(logging.DEBUG):
-        refused = Client(door.door.url, wrong).ask("GET", "/me")
+        refused = Client(served.gateway.url, wrong).ask("GET", "/me")
         assert (refused.status, anna.ask("GET", "/me").status) == (401, 200)
         with anna.socket(subprotocols=["trade.v1", f"bearer.{anna.token}"]) as page:
             say(page, do="nonsense", id=1)
@@ -189,13 +189,13 @@ def test_no_token_is_in_a_log_or_an_answer(door: Opened, caplog: pytest.LogCaptu
     showing = {name for name, text in told if wrong in text or anna.token in text}
     assert not showing
     assert wrong not in str(refused)
-    assert anna.token not in door.tokens.read_text()
+    assert anna.token not in served.tokens.read_text()
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        "/../door-tokens.toml",
+        "/../http-tokens.toml",
         "/..%2f..%2ftokens.toml",
         "/%2e%2e/%2e%2e/tokens.toml",
         "/static/../../_tokens.py",
@@ -205,8 +205,8 @@ def test_no_token_is_in_a_log_or_an_answer(door: Opened, caplog: pytest.LogCaptu
         "/locks/..%2f..%2fsession",
     ],
 )
-def test_no_path_leads_out_of_the_door(door: Opened, path: str) -> None:
-    anna = door.client("anna")
+def test_no_path_leads_out_of_the_served_folder(served: Opened, path: str) -> None:
+    anna = served.client("anna")
     method = "POST" if path.startswith("/call") else "DELETE" if path.startswith("/locks") else "GET"
     answer = anna.ask(method, path, {} if method == "POST" else None)
     assert answer.status in {400, 404, 405}
@@ -220,7 +220,7 @@ def test_a_client_that_breaks_off_leaves_no_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, asks: str, *, reset: bool
 ) -> None:
     monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
-    papers = Papers(tmp_path / "pki").of("door", addresses=["127.0.0.1"])
+    papers = Papers(tmp_path / "pki").of("http", addresses=["127.0.0.1"])
     trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
     with memory_system() as system, opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):
         place = urlsplit(made.url)

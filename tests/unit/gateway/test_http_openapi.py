@@ -1,4 +1,4 @@
-"""The document of the door says what there is, and the door keeps to it."""
+"""The document of the HTTP gateway says what there is, and the HTTP gateway keeps to it."""
 
 import datetime as dt
 import enum
@@ -70,7 +70,7 @@ class Lamp:
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Opened]:
+def served(tmp_path: Path) -> Iterator[Opened]:
     with memory_system() as system:
         robot = Robot(system, "")
         system.container("lamps").register(Lamp(), "lamp")
@@ -79,8 +79,8 @@ def door(tmp_path: Path) -> Iterator[Opened]:
             yield Opened(robot, made, tokens)
 
 
-def test_each_service_is_described_with_its_arguments(door: Opened) -> None:
-    told = door.client().ask("GET", "/openapi.json").body
+def test_each_service_is_described_with_its_arguments(served: Opened) -> None:
+    told = served.client().ask("GET", "/openapi.json").body
     assert told["openapi"].startswith("3.1")
     operation = told["paths"]["/call/lamp/set"]["post"]
     assert operation["summary"].startswith("set(level: float (0 to 1)")
@@ -92,19 +92,19 @@ def test_each_service_is_described_with_its_arguments(door: Opened) -> None:
     assert "lamp.set.Colour" in told["components"]["schemas"]
 
 
-def test_what_comes_and_goes_is_in_the_document_as_it_does(door: Opened) -> None:
-    anna, lamp = door.client(), Lamp()
-    home = door.robot.system.container("lamps")
+def test_what_comes_and_goes_is_in_the_document_as_it_does(served: Opened) -> None:
+    anna, lamp = served.client(), Lamp()
+    home = served.robot.system.container("lamps")
     home.register(lamp, "hall")
-    door.robot.system.settle()
+    served.robot.system.settle()
     assert "/call/hall/set" in anna.ask("GET", "/openapi.json").body["paths"]
     home.deregister(lamp)
-    door.robot.system.settle()
+    served.robot.system.settle()
     assert "/call/hall/set" not in anna.ask("GET", "/openapi.json").body["paths"]
 
 
-def test_each_operation_has_a_name_of_its_own_and_nothing_is_there_that_generators_do_not_read(door: Opened) -> None:
-    told = door.client().ask("GET", "/openapi.json").body
+def test_each_operation_has_a_name_of_its_own_and_nothing_is_there_that_generators_do_not_read(served: Opened) -> None:
+    told = served.client().ask("GET", "/openapi.json").body
     names = [operation["operationId"] for path in told["paths"].values() for operation in path.values()]
     assert len(names) == len(set(names))
     text = json.dumps(told)
@@ -114,8 +114,8 @@ def test_each_operation_has_a_name_of_its_own_and_nothing_is_there_that_generato
     assert ends["properties"]["args"]["properties"]["ends"]["maxItems"] == 2
 
 
-def test_what_is_given_by_place_only_is_called_as_the_document_says(door: Opened) -> None:
-    anna = door.client()
+def test_what_is_given_by_place_only_is_called_as_the_document_says(served: Opened) -> None:
+    anna = served.client()
     assert anna.ask("POST", "/call/lamp/dim", {"args": {"level": 0.5}}).status == 200
     assert anna.ask("POST", "/call/lamp/dim", {"args": [0.5]}).status == 200
 
@@ -127,7 +127,7 @@ TYPESCRIPT = ("npx", "--yes", "--package", "openapi-typescript@7.13.0", "--packa
 CALLS = """
 import sys
 from trade_client import AuthenticatedClient
-from trade_client.api.door import services
+from trade_client.api.gateway import services
 from trade_client.api.lamp import lamp_set
 from trade_client.models import LampSetBody, LampSetBodyArgs, LampSetColour
 with AuthenticatedClient(sys.argv[1], sys.argv[2]) as client:
@@ -149,21 +149,21 @@ def _needs(folder: Path, *command: str) -> None:
 
 
 @pytest.fixture
-def described(door: Opened, tmp_path: Path) -> Path:
-    path = tmp_path / "door.json"
-    path.write_text(json.dumps(door.client().ask("GET", "/openapi.json").body), encoding="utf-8")
+def described(served: Opened, tmp_path: Path) -> Path:
+    path = tmp_path / "served.json"
+    path.write_text(json.dumps(served.client().ask("GET", "/openapi.json").body), encoding="utf-8")
     return path
 
 
 @pytest.mark.timeout(600)
-def test_a_generated_client_in_python_calls_the_door(door: Opened, described: Path) -> None:
+def test_a_generated_client_in_python_calls_services(served: Opened, described: Path) -> None:
     folder = described.parent
     _needs(folder, *PYTHON_CLIENT, "openapi-python-client", "--version")
     words = ("generate", "--path", described.name, "--meta", "none", "--output-path", "trade_client")
     made = _run(folder, *PYTHON_CLIENT, "openapi-python-client", *words, "--fail-on-warning")
     assert made.returncode == 0, made.stdout + made.stderr
     (folder / "calls.py").write_text(CALLS, encoding="utf-8")
-    anna = door.client()
+    anna = served.client()
     called = _run(folder, *PYTHON_CLIENT, "python", "calls.py", anna.url, anna.token)
     assert called.stdout.split() == ["0.5", "InvalidArgument"], called.stderr
 
@@ -187,20 +187,20 @@ def test_a_generated_client_in_java_compiles(described: Path, library: str) -> N
 def test_generated_types_in_typescript_compile(described: Path) -> None:
     folder = described.parent
     _needs(folder, *TYPESCRIPT, "tsc", "--version")
-    made = _run(folder, *TYPESCRIPT, "openapi-typescript", described.name, "--output", "door.ts")
+    made = _run(folder, *TYPESCRIPT, "openapi-typescript", described.name, "--output", "served.ts")
     assert made.returncode == 0, made.stderr
-    checked = _run(folder, *TYPESCRIPT, "tsc", "--noEmit", "--strict", "door.ts")
+    checked = _run(folder, *TYPESCRIPT, "tsc", "--noEmit", "--strict", "served.ts")
     assert checked.returncode == 0, checked.stdout
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="schemathesis needs Python 3.11")
 @pytest.mark.parametrize("mode", ["positive", "negative"])
-def test_the_door_keeps_to_its_document(door: Opened, mode: str) -> None:
+def test_answers_match_the_openapi_document(served: Opened, mode: str) -> None:
     """Whatever schemathesis thinks of is answered as the document says; what it forbids is refused."""
     import schemathesis
     from schemathesis.checks import not_a_server_error
 
-    anna = door.client()
+    anna = served.client()
     schema = schemathesis.openapi.from_dict(anna.ask("GET", "/openapi.json").body)
     answered: set[tuple[str, int]] = set()
     for found in schema.get_all_operations():

@@ -1,4 +1,4 @@
-"""The door over a WebSocket: one connection is one session, and ends as one (S03, S05)."""
+"""The HTTP gateway over a WebSocket: one connection is one session, and ends as one (S03, S05)."""
 
 import base64
 import os
@@ -42,7 +42,7 @@ class Walker:
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Opened]:
+def served(tmp_path: Path) -> Iterator[Opened]:
     with memory_system() as system:
         robot = Robot(system)
         axis = Axis("axis")
@@ -60,8 +60,8 @@ def go_on(name: str = "a", number: int = 1) -> dict[str, object]:
     return {"do": "call", "id": number, "group": f"robot.{name}", "name": "go_on", "args": [1.0]}
 
 
-def test_calls_and_their_errors_are_answered_under_their_ids(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_calls_and_their_errors_are_answered_under_their_ids(served: Opened) -> None:
+    with served.client().socket() as page:
         say(page, do="call", id="slow", group="robot.axis", name="move_to", args={"value": 2.0}, deadline_s=60)
         moved = ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])
         assert moved == {"id": 1, "result": 1.0}
@@ -73,10 +73,10 @@ def test_calls_and_their_errors_are_answered_under_their_ids(door: Opened) -> No
         assert {"id": "slow", "result": 2.0} in told
 
 
-def test_a_call_tells_how_far_it_is(door: Opened) -> None:
-    door.robot.system.container("walker").register(Walker(), "walker")
-    door.robot.system.settle()
-    with door.client().socket() as page:
+def test_a_call_tells_how_far_it_is(served: Opened) -> None:
+    served.robot.system.container("walker").register(Walker(), "walker")
+    served.robot.system.settle()
+    with served.client().socket() as page:
         say(page, do="call", id=1, group="walker", name="walk", args=[3])
         told = [heard(page)]
         while "progress" in told[-1]:
@@ -86,20 +86,20 @@ def test_a_call_tells_how_far_it_is(door: Opened) -> None:
         assert told[:-1]
 
 
-def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(door: Opened) -> None:
-    door.robot.system.container("walker").register(Walker(), "walker")
-    door.robot.system.settle()
-    with door.client().socket() as page:
+def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(served: Opened) -> None:
+    served.robot.system.container("walker").register(Walker(), "walker")
+    served.robot.system.settle()
+    with served.client().socket() as page:
         told = ask(page, do="call", id=1, group="walker", name="map")
         assert told["problem"]["title"] == "InvalidResult"
         say(page, do="stream", id=2, group="walker", name="map")
         assert heard(page)["failed"]["title"] == "InvalidResult"
         assert ask(page, **go_on(number=3))["result"] is None
-    refused = door.client("bert").call("walker.map")
+    refused = served.client("bert").call("walker.map")
     assert (refused.status, refused.title) == (502, "InvalidResult")
 
 
-def test_S04_set_points_leave_in_the_order_in_which_they_came(door: Opened) -> None:
+def test_S04_set_points_leave_in_the_order_in_which_they_came(served: Opened) -> None:
     wanted, left = [float(number) for number in range(60)], list[float]()
 
     def note(passage: InFlightMessage) -> None:
@@ -107,8 +107,8 @@ def test_S04_set_points_leave_in_the_order_in_which_they_came(door: Opened) -> N
             call = decode_call(passage.payload)
             left.extend(msgspec.msgpack.decode(call.args) if call.service == "move" else ())
 
-    door.robot.system.tap(note)
-    with door.client().socket() as page:
+    served.robot.system.tap(note)
+    with served.client().socket() as page:
         ask(page, **go_on())  # a container's clock is asked for before the first call to it
         for number, value in enumerate(wanted, 1):
             say(page, do="call", id=number, group="robot.a", name="move", args=[value])
@@ -117,24 +117,24 @@ def test_S04_set_points_leave_in_the_order_in_which_they_came(door: Opened) -> N
     assert left == wanted
 
 
-def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(door: Opened) -> None:
+def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(served: Opened) -> None:
     """All of it is sent at once: the stop overtakes what has not begun."""
-    with door.client().socket() as page:
+    with served.client().socket() as page:
         ask(page, **go_on(number=0))
         for number in range(1, 11):
             say(page, **go_on(number=number))
         say(page, do="call", id="stop", group="robot.a", name="stop")
         told = [heard(page) for _ in range(11)]
         assert {"id": "stop", "result": None} in told
-        door.robot.system.settle()
-        wait_until(lambda: not door["a"].resource.calls, "all have ended")
-        assert not door["a"].resource.moving
+        served.robot.system.settle()
+        wait_until(lambda: not served["a"].resource.calls, "all have ended")
+        assert not served["a"].resource.moving
         assert ask(page, **go_on(number=20))["result"] is None  # what comes after it does
-        assert door["a"].resource.moving
+        assert served["a"].resource.moving
 
 
-def test_what_cannot_be_read_is_answered_and_ends_nothing(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_what_cannot_be_read_is_answered_and_ends_nothing(served: Opened) -> None:
+    with served.client().socket() as page:
         for nonsense in ("[", '{"do": "dance", "id": 1}', '{"do": "call", "id": 1}', '{"do":"estop","id":1,"x":2}'):
             page.send(nonsense)
             told = heard(page)
@@ -163,13 +163,13 @@ class Slow:
         self.inside -= 1
 
 
-def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(door: Opened) -> None:
+def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(served: Opened) -> None:
     slow, many = Slow(), 400
-    door.robot.joints["slow"] = slow  # type: ignore[assignment]
-    door.robot.system.container("slow").register(slow, "robot.slow")
-    door.robot.system.settle()
+    served.robot.joints["slow"] = slow  # type: ignore[assignment]
+    served.robot.system.container("slow").register(slow, "robot.slow")
+    served.robot.system.settle()
     before = threading.active_count()
-    with door.client().socket() as page:
+    with served.client().socket() as page:
         for number in range(many):
             say(page, do="call", id=number, group="robot.slow", name="stop")
         say(page, do="call", id="seen", group="robot.a", name="where_is_it")
@@ -190,50 +190,50 @@ def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(d
         assert ask(page, do="call", id="again", group="robot.slow", name="stop") == {"id": "again", "result": None}
 
 
-def test_S05_what_a_page_moves_stops_when_it_closes_and_nothing_else_does(door: Opened) -> None:
-    with door.client("bert").socket() as other:
+def test_S05_what_a_page_moves_stops_when_it_closes_and_nothing_else_does(served: Opened) -> None:
+    with served.client("bert").socket() as other:
         ask(other, **go_on("b"))
-        with door.client().socket() as page:
+        with served.client().socket() as page:
             ask(page, **go_on())
-            assert door["a"].resource.moving
-        assert door["a"].stopped.wait(20)
-        assert door["b"].resource.moving
+            assert served["a"].resource.moving
+        assert served["a"].stopped.wait(20)
+        assert served["b"].resource.moving
 
 
-def test_S05_a_call_ends_with_the_page_that_made_it(door: Opened) -> None:
-    door["a"].hold.clear()
-    with door.client().socket() as page:
+def test_S05_a_call_ends_with_the_page_that_made_it(served: Opened) -> None:
+    served["a"].hold.clear()
+    with served.client().socket() as page:
         say(page, do="call", id=1, group="robot.a", name="move", args=[1.0], deadline_s=300)
-        assert door["a"].entered.wait(20)
-    assert door["a"].stopped.wait(20)
-    door["a"].hold.set()
-    wait_until(lambda: not door["a"].resource.calls, "the call has ended")
-    assert door["a"].written == []
+        assert served["a"].entered.wait(20)
+    assert served["a"].stopped.wait(20)
+    served["a"].hold.set()
+    wait_until(lambda: not served["a"].resource.calls, "the call has ended")
+    assert served["a"].written == []
 
 
-def test_S05_a_page_that_freezes_is_gone_although_its_connection_stands(door: Opened) -> None:
+def test_S05_a_page_that_freezes_is_gone_although_its_connection_stands(served: Opened) -> None:
     """It answers no pings and takes nothing more; a stream fills what lies between."""
-    door.robot.system.container("walker").register(Walker(), "walker")
-    door.robot.system.settle()
-    with _Frozen(door.client()) as page:
+    served.robot.system.container("walker").register(Walker(), "walker")
+    served.robot.system.settle()
+    with _Frozen(served.client()) as page:
         page.send(b'{"do":"call","id":1,"group":"robot.a","name":"go_on","args":[1.0]}')
         page.send(b'{"do":"stream","id":2,"group":"walker","name":"look","hz":1000}')
-        wait_until(lambda: door["a"].resource.moving, "it moves")
-        assert door["a"].stopped.wait(PATIENCE_S)
+        wait_until(lambda: served["a"].resource.moving, "it moves")
+        assert served["a"].stopped.wait(PATIENCE_S)
 
 
-def test_a_call_is_cancelled_by_its_id(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_call_is_cancelled_by_its_id(served: Opened) -> None:
+    with served.client().socket() as page:
         say(page, do="call", id=1, group="robot.axis", name="move_to", args=[1.0], deadline_s=300)
-        assert door["axis"].entered.wait(20)
+        assert served["axis"].entered.wait(20)
         assert ask(page, do="cancel", id=2, which=1)["result"] == {"cancelled": True}
-        assert door["axis"].stopped.is_set()
+        assert served["axis"].stopped.is_set()
         assert ask(page, do="cancel", id=3, which="nothing")["result"] == {"cancelled": False}
 
 
-def test_a_lock_is_the_pages_and_falls_with_it(door: Opened) -> None:
-    bert = door.client("bert")
-    with door.client().socket() as page:
+def test_a_lock_is_the_pages_and_falls_with_it(served: Opened) -> None:
+    bert = served.client("bert")
+    with served.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot", purpose="walk")["result"]
         assert ask(page, **go_on())["result"] is None
         assert bert.call("robot.a.move", 1.0).title == "LockedByOther"
@@ -243,24 +243,24 @@ def test_a_lock_is_the_pages_and_falls_with_it(door: Opened) -> None:
     wait_until(lambda: bert.call("robot.b.move", 1.0).status == 200, "it fell")
 
 
-def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(served: Opened) -> None:
+    with served.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot.a")["result"]
-        door.robot.me.break_lock([door.robot.find("a")], "it is needed")
+        served.robot.me.break_lock([served.robot.find("a")], "it is needed")
         told = heard(page)
         assert (told["event"], told["lock"]) == ("lock_lost", taken["lock"])
         assert told["problem"]["title"] == "LockLost"
         assert ask(page, **go_on())["problem"]["title"] == "LockLost"
-        assert not door["a"].resource.moving
+        assert not served["a"].resource.moving
         ask(page, do="unlock", id=2, lock=taken["lock"])
         assert ask(page, **go_on())["result"] is None
 
 
-def test_a_stream_is_heard_until_it_is_ended(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_stream_is_heard_until_it_is_ended(served: Opened) -> None:
+    with served.client().socket() as page:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=100)
         assert heard(page)["sample"]["value"] == 0.0
-        door["a"].written.append(0.5)
+        served["a"].written.append(0.5)
         while heard(page)["sample"]["value"] != 0.5:
             pass
         assert ask(page, do="cancel", id=2, which=1)["result"] == {"cancelled": True}
@@ -268,31 +268,31 @@ def test_a_stream_is_heard_until_it_is_ended(door: Opened) -> None:
         assert refused["problem"]["title"] == "ConfigurationError"
 
 
-def test_a_stream_ends_with_its_service(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_stream_ends_with_its_service(served: Opened) -> None:
+    with served.client().socket() as page:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=10)
         heard(page)
-        door.robot.system.container("a").deregister(door["a"])
+        served.robot.system.container("a").deregister(served["a"])
         while "problem" not in (told := heard(page)):
             pass
         assert told["problem"]["title"] == "ServiceGone"
 
 
-def test_services_that_come_and_go_are_told_of(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_services_that_come_and_go_are_told_of(served: Opened) -> None:
+    with served.client().socket() as page:
         say(page, do="watch", id=1, group="robot", name="move", existing=True, occasions=["joined", "left"])
         there = sorted(heard(page)["service"]["group"] for _ in range(3))
         assert there == ["robot.a", "robot.axis", "robot.b"]
-        door.robot.system.container("b").deregister(door["b"])
+        served.robot.system.container("b").deregister(served["b"])
         told = heard(page)
         assert (told["id"], told["event"], told["service"]["group"]) == (1, "left", "robot.b")
-        door.robot.system.container("b").register(door["b"], "robot.c")
+        served.robot.system.container("b").register(served["b"], "robot.c")
         assert heard(page)["service"]["group"] == "robot.c"
         assert ask(page, do="cancel", id=2, which=1)["result"] == {"cancelled": True}
 
 
-def test_S07_a_page_with_all_it_may_have_under_way_can_stop(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_S07_a_page_with_all_it_may_have_under_way_can_stop(served: Opened) -> None:
+    with served.client().socket() as page:
         for number in range(64):
             say(page, do="watch", id=number, occasions=["left"])
         full = ask(page, do="call", id="more", group="robot.a", name="where_is_it")
@@ -302,19 +302,19 @@ def test_S07_a_page_with_all_it_may_have_under_way_can_stop(door: Opened) -> Non
         assert ask(page, do="cancel", id="less", which=0)["result"] == {"cancelled": True}
 
 
-def test_a_message_that_is_too_large_ends_the_connection_and_what_it_moves(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_message_that_is_too_large_ends_the_connection_and_what_it_moves(served: Opened) -> None:
+    with served.client().socket() as page:
         ask(page, **go_on())
         with suppress(ConnectionClosed):  # before all of it was sent
             page.send(" " * (2 << 20))
         with pytest.raises(ConnectionClosed) as why:
             heard(page)
         assert why.value.rcvd is None or why.value.rcvd.code == 1009
-        assert door["a"].stopped.wait(20)
+        assert served["a"].stopped.wait(20)
 
 
-def test_pages_show_their_token_as_a_subprotocol(door: Opened) -> None:
-    anna = door.client()
+def test_pages_show_their_token_as_a_subprotocol(served: Opened) -> None:
+    anna = served.client()
     url = anna.url.replace("http", "ws") + "/ws"
     with connect(url, subprotocols=["trade.v1", f"bearer.{anna.token}"]) as page:  # type: ignore[list-item]
         assert page.subprotocol == "trade.v1"
@@ -323,39 +323,39 @@ def test_pages_show_their_token_as_a_subprotocol(door: Opened) -> None:
         with pytest.raises(InvalidStatus) as why:
             connect(url, subprotocols=refused)  # type: ignore[arg-type]
         assert why.value.response.status_code == status
-        assert b"NotLetIn" in why.value.response.body
+        assert b"NotAuthenticated" in why.value.response.body
 
 
-def test_a_page_of_another_site_is_not_let_in(door: Opened) -> None:
+def test_a_page_of_another_site_is_not_let_in(served: Opened) -> None:
     with pytest.raises(InvalidStatus) as why:
-        door.client().socket(origin="http://evil.example")
+        served.client().socket(origin="http://evil.example")
     assert why.value.response.status_code == 403
-    assert b"WrongDoor" in why.value.response.body
+    assert b"WrongOrigin" in why.value.response.body
 
 
-def test_a_token_that_is_taken_back_ends_what_it_let_in(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_token_that_is_taken_back_ends_what_it_let_in(served: Opened) -> None:
+    with served.client().socket() as page:
         ask(page, **go_on())
-        door.tokens.write_text("[tokens]\n")
-        assert door["a"].stopped.wait(20)
+        served.tokens.write_text("[tokens]\n")
+        assert served["a"].stopped.wait(20)
         with pytest.raises(ConnectionClosed):
             heard(page)
 
 
-def test_a_closing_door_leaves_nothing_moving(door: Opened) -> None:
-    with door.client().socket() as page:
+def test_a_closing_http_gateway_leaves_nothing_moving(served: Opened) -> None:
+    with served.client().socket() as page:
         ask(page, **go_on())
-        door.door.close()
-        assert door["a"].stopped.wait(20)
+        served.gateway.close()
+        assert served["a"].stopped.wait(20)
 
 
-def test_a_connection_that_asks_nothing_is_closed(door: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_connection_that_asks_nothing_is_closed(served: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
-    place = urlsplit(door.door.url)
+    place = urlsplit(served.gateway.url)
     with socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S) as idle:  # type: ignore[arg-type]
         idle.sendall(b"GET /services HTTP/1.1\r\n")
         assert idle.recv(1) == b""
-    with door.client().socket() as page:
+    with served.client().socket() as page:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=20)
         numbers = [heard(page)["sample"]["number"] for _ in range(30)]  # longer than that
         assert numbers == sorted(numbers)

@@ -1,4 +1,4 @@
-"""Motion of those who come by the door ends with them; the judge is the simulator's log of bytes."""
+"""Motion of those who come by the HTTP gateway ends with them; the judge is the simulator's log of bytes."""
 
 import json
 import signal
@@ -22,17 +22,17 @@ Run = Callable[..., Program]
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
-class Doorway:
-    """``trade door`` in a process of its own."""
+class HttpProcess:
+    """``trade http`` in a process of its own."""
 
     def __init__(self, run: Run, trade_command: Command, folder: Path) -> None:
         self._tokens, self._command, self._run = folder / "tokens.toml", trade_command, run
         self.token = self.new("anna")
-        self.program = run("-m", "trade_gateway", "door", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--json")
+        self.program = run("-m", "trade_gateway", "http", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--json")
         self.url: str = self.program.json()["url"]
 
     def new(self, identity: str) -> str:
-        made = self._command("door", "token", identity, "--tokens", self._tokens, "--json")
+        made = self._command("http", "token", identity, "--tokens", self._tokens, "--json")
         assert made.returncode == 0, made.stderr
         return json.loads(made.stdout)["token"]
 
@@ -43,8 +43,8 @@ class Doorway:
 
 
 @pytest.fixture
-def doorway(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> Doorway:
-    made = Doorway(run, trade_command, tmp_path)
+def http(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> HttpProcess:
+    made = HttpProcess(run, trade_command, tmp_path)
     client = Client(made.url, made.token)
     wait_until(lambda: client.ask("GET", "/services?group=rosie.neck.pan&name=move_to").body, "it is known")
     return made
@@ -61,35 +61,35 @@ def doorway(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> D
         ("session", signal.SIGSTOP),
     ],
 )
-def test_S03_what_a_page_moves_stops_with_it_although_the_door_stands(
-    bench: Bench, doorway: Doorway, how: str, number: int
+def test_S03_motion_of_a_page_stops_with_it_while_the_http_gateway_runs(
+    bench: Bench, http: HttpProcess, how: str, number: int
 ) -> None:
-    page = doorway.page(how)
+    page = http.page(how)
     wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1)))
     ended_at = time.monotonic()
     page.signal(number)
     try:
         bench.stopped_short(ended_at, HALFWAY_RAD)
         assert not writes(bench.sim.entries(), device_id=2, register="goal_position", since=ended_at)
-        assert doorway.program.process.poll() is None
+        assert http.program.process.poll() is None
     finally:
         page.process.kill()
 
 
-def test_S03_what_a_page_moves_stops_with_the_door(bench: Bench, doorway: Doorway) -> None:
-    doorway.page("socket")
+def test_S03_motion_of_a_page_stops_when_the_http_gateway_ends(bench: Bench, http: HttpProcess) -> None:
+    http.page("socket")
     wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1)))
     ended_at = time.monotonic()
-    doorway.program.signal(signal.SIGKILL)
+    http.program.signal(signal.SIGKILL)
     bench.stopped_short(ended_at, HALFWAY_RAD)
 
 
-def test_a_door_closes_when_it_is_told_to(doorway: Doorway) -> None:
-    doorway.program.signal(signal.SIGTERM)
-    assert doorway.program.process.wait(PATIENCE_S) == 0
+def test_an_http_gateway_ends_on_sigterm(http: HttpProcess) -> None:
+    http.program.signal(signal.SIGTERM)
+    assert http.program.process.wait(PATIENCE_S) == 0
 
 
-def test_a_door_without_tokens_is_refused(trade_command: Command, tmp_path: Path) -> None:
-    refused = trade_command("door", "--listen", "127.0.0.1:0", "--tokens", tmp_path / "none.toml")
+def test_an_http_gateway_without_tokens_is_refused(trade_command: Command, tmp_path: Path) -> None:
+    refused = trade_command("http", "--listen", "127.0.0.1:0", "--tokens", tmp_path / "none.toml")
     assert refused.returncode == 1
-    assert "trade door token" in refused.stderr
+    assert "trade http token" in refused.stderr

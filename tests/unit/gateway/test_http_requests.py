@@ -1,4 +1,4 @@
-"""The door over HTTP: calls, sessions, locks and stops of clients who speak nothing else (S03, S05, S07)."""
+"""The HTTP gateway over HTTP: calls, sessions, locks and stops of clients who speak nothing else (S03, S05, S07)."""
 
 import json
 import os
@@ -44,7 +44,7 @@ class Lamp:
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Opened]:
+def served(tmp_path: Path) -> Iterator[Opened]:
     with memory_system() as system:
         robot = Robot(system)
         axis = Axis("axis")
@@ -60,15 +60,15 @@ def door(tmp_path: Path) -> Iterator[Opened]:
 
 @pytest.mark.parametrize("depth", [90, 200, 500, 900, 2000, 100_000])
 @pytest.mark.parametrize("over", ["http", "websocket"])
-def test_arguments_that_are_nested_too_deep_are_refused_by_name_and_no_fault_of_the_door(
-    door: Opened, caplog: pytest.LogCaptureFixture, depth: int, over: str
+def test_arguments_that_are_nested_too_deep_are_refused_by_name(
+    served: Opened, caplog: pytest.LogCaptureFixture, depth: int, over: str
 ) -> None:
     class Lathe:
         @service
         def take(self, shape: Any) -> None: ...
 
-    door.robot.me.register(Lathe(), "lathe")
-    anna, shape = door.client(), "[" * depth + "]" * depth
+    served.robot.me.register(Lathe(), "lathe")
+    anna, shape = served.client(), "[" * depth + "]" * depth
     if over == "http":
         answer = anna.ask("POST", "/call/lathe/take", f'{{"args": [{shape}]}}'.encode())
         status, body = answer.status, answer.body
@@ -84,30 +84,30 @@ def test_arguments_that_are_nested_too_deep_are_refused_by_name_and_no_fault_of_
     assert "Traceback" not in caplog.text
 
 
-def test_services_are_listed_and_called_by_place_and_by_name(door: Opened) -> None:
-    anna = door.client()
+def test_services_are_listed_and_called_by_place_and_by_name(served: Opened) -> None:
+    anna = served.client()
     listed = anna.ask("GET", "/services?group=robot.a&name=mo*").body
     assert [(one["group"], one["name"], one["effect"]) for one in listed] == [("robot.a", "move", "actuate")]
     assert anna.call("robot.a.move", 0.5).body == {"result": 0.5}
     assert anna.ask("POST", "/call/robot.a/move", {"args": {"value": 0.7}, "deadline_s": 5}).body == {"result": 0.7}
     assert anna.ask("POST", "/call/robot.a/where_is_it").body == {"result": 0.7}
-    assert door["a"].written == [0.5, 0.7]
+    assert served["a"].written == [0.5, 0.7]
     assert {one["name"] for one in anna.ask("GET", "/containers").body} >= {"a", "b", "me"}
 
 
-def test_the_page_about_it_does_what_it_says(door: Opened) -> None:
+def test_the_page_about_it_does_what_it_says(served: Opened) -> None:
     text = (Path(__file__).parents[3] / "docs" / "http.md").read_text(encoding="utf-8")
     [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    door.robot.system.container("lamps").register(Lamp(), "lab.desk")
-    door.robot.system.settle()
-    environment = {**os.environ, "DOOR": door.door.url, "TOKEN": door.client().token}
+    served.robot.system.container("lamps").register(Lamp(), "lab.desk")
+    served.robot.system.settle()
+    environment = {**os.environ, "URL": served.gateway.url, "TOKEN": served.client().token}
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False, env=environment
     )
     assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program), ended.stderr
 
 
-def test_its_program_comes_in_over_an_encrypted_door(tmp_path: Path) -> None:
+def test_its_program_connects_over_https(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "http.md").read_text(encoding="utf-8")
     [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     papers = Papers(tmp_path / "pki").of("page", addresses=["127.0.0.1"])
@@ -115,7 +115,7 @@ def test_its_program_comes_in_over_an_encrypted_door(tmp_path: Path) -> None:
         system.container("lamps").register(Lamp(), "lab.desk")
         system.settle()
         with opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):
-            environment = {**os.environ, "DOOR": made.url, "TOKEN": add_token(tokens, "anna")}
+            environment = {**os.environ, "URL": made.url, "TOKEN": add_token(tokens, "anna")}
             ended = subprocess.run(
                 [sys.executable, "-c", program],
                 capture_output=True,
@@ -129,13 +129,13 @@ def test_its_program_comes_in_over_an_encrypted_door(tmp_path: Path) -> None:
 
 
 def test_a_new_token_claims_no_address_that_it_cannot_know(tmp_path: Path) -> None:
-    said = CliRunner().invoke(app, ["door", "token", "anna", "--tokens", str(tmp_path / "tokens.toml")]).stdout
+    said = CliRunner().invoke(app, ["http", "token", "anna", "--tokens", str(tmp_path / "tokens.toml")]).stdout
     assert "Authorization: Bearer" in said and "127.0.0.1" not in said
 
 
-def test_services_of_no_group_and_of_one_container_among_several_are_called(door: Opened) -> None:
-    system, anna = door.robot.system, door.client()
-    system.container("one").register(Lamp(door.robot.find("a")))
+def test_services_of_no_group_and_of_one_container_among_several_are_called(served: Opened) -> None:
+    system, anna = served.robot.system, served.client()
+    system.container("one").register(Lamp(served.robot.find("a")))
     system.container("two").register(Lamp())
     system.settle()
     assert anna.call("_.shine", 0.5).title == "TooManyServices"
@@ -146,8 +146,8 @@ def test_services_of_no_group_and_of_one_container_among_several_are_called(door
     assert given == {"service": "robot.a.move", "container": "a"}
 
 
-def test_errors_are_problems_that_name_the_error_and_what_to_do(door: Opened) -> None:
-    anna = door.client()
+def test_errors_are_problems_that_name_the_error_and_what_to_do(served: Opened) -> None:
+    anna = served.client()
     refused = anna.call("robot.a.move", "far")
     assert (refused.status, refused.title) == (400, "InvalidArgument")
     assert refused.headers["content-type"] == "application/problem+json"
@@ -161,76 +161,76 @@ def test_errors_are_problems_that_name_the_error_and_what_to_do(door: Opened) ->
     assert anna.ask("GET", "/nowhere").status == 404
     assert anna.ask("DELETE", "/services").status == 405
     assert anna.ask("POST", "/estop", b"x", Content_Type="text/plain").status == 415
-    assert door["a"].written == []
+    assert served["a"].written == []
 
 
-def test_S03_a_plain_request_is_a_session_and_leaves_nothing_moving(door: Opened) -> None:
-    anna = door.client()
+def test_S03_a_plain_request_is_a_session_and_leaves_nothing_moving(served: Opened) -> None:
+    anna = served.client()
     assert anna.call("robot.a.go_on", 1.0).status == 200
-    assert door["a"].stopped.wait(20)
-    assert door.robot.me.services(where(name="go_on"))  # it is not the door that went
+    assert served["a"].stopped.wait(20)
+    assert served.robot.me.services(where(name="go_on"))  # it is not the HTTP gateway that went
 
 
-def test_S03_what_a_session_moves_stops_with_it_and_nothing_of_another_does(door: Opened) -> None:
-    one, two = door.client("anna").opened(lease_s=60), door.client("bert").opened(lease_s=60)
+def test_S03_what_a_session_moves_stops_with_it_and_nothing_of_another_does(served: Opened) -> None:
+    one, two = served.client("anna").opened(lease_s=60), served.client("bert").opened(lease_s=60)
     one.call("robot.a.go_on", 1.0)
     two.call("robot.b.go_on", 1.0)
-    assert door["a"].resource.moving
+    assert served["a"].resource.moving
     assert one.ask("DELETE", "/session").status == 204
-    assert door["a"].stopped.wait(20)
-    door.robot.system.settle()
-    assert door["b"].resource.moving
+    assert served["a"].stopped.wait(20)
+    served.robot.system.settle()
+    assert served["b"].resource.moving
     gone = one.call("robot.a.go_on", 1.0)
     assert (gone.status, gone.title) == (404, "NoSuchSession")
 
 
-def test_S05_a_session_of_which_nothing_is_heard_ends_and_one_that_is_heard_of_does_not(door: Opened) -> None:
-    heard, silent = door.client("anna").opened(lease_s=2), door.client("bert").opened(lease_s=2)
+def test_S05_a_session_of_which_nothing_is_heard_ends_and_one_that_is_heard_of_does_not(served: Opened) -> None:
+    heard, silent = served.client("anna").opened(lease_s=2), served.client("bert").opened(lease_s=2)
     heard.call("robot.a.go_on", 1.0)
     silent.call("robot.b.go_on", 1.0)
     until = time.monotonic() + 4
     while time.monotonic() < until:
         assert heard.ask("GET", "/session").status == 200
-    assert door["b"].stopped.wait(20)
-    assert door["a"].resource.moving
+    assert served["b"].stopped.wait(20)
+    assert served["a"].resource.moving
     assert silent.ask("GET", "/session").title == "NoSuchSession"
 
 
-def test_S05_who_hangs_up_during_a_call_has_it_ended(door: Opened) -> None:
-    door["a"].hold.clear()
-    request = door.client().begin("POST", "/call/robot.a/move", {"args": [1.0], "deadline_s": 300})
-    assert door["a"].entered.wait(20)
+def test_S05_who_hangs_up_during_a_call_has_it_ended(served: Opened) -> None:
+    served["a"].hold.clear()
+    request = served.client().begin("POST", "/call/robot.a/move", {"args": [1.0], "deadline_s": 300})
+    assert served["a"].entered.wait(20)
     request.close()
-    assert door["a"].stopped.wait(20)
-    door["a"].hold.set()
-    wait_until(lambda: not door["a"].resource.calls, "the call has ended")
-    assert door["a"].written == []
+    assert served["a"].stopped.wait(20)
+    served["a"].hold.set()
+    wait_until(lambda: not served["a"].resource.calls, "the call has ended")
+    assert served["a"].written == []
 
 
-def test_S05_who_hangs_up_during_a_call_of_a_session_has_that_call_ended_and_not_the_session(door: Opened) -> None:
-    session = door.client().opened(lease_s=60)
+def test_S05_who_hangs_up_during_a_call_of_a_session_has_that_call_ended_and_not_the_session(served: Opened) -> None:
+    session = served.client().opened(lease_s=60)
     session.call("robot.b.go_on", 1.0)
     request = session.begin("POST", "/call/robot.axis/move_to", {"args": [1.0], "deadline_s": 300})
-    assert door["axis"].entered.wait(20)
+    assert served["axis"].entered.wait(20)
     request.close()
-    assert door["axis"].stopped.wait(20)
+    assert served["axis"].stopped.wait(20)
     assert session.ask("GET", "/session").status == 200
-    assert door["b"].resource.moving
+    assert served["b"].resource.moving
     session.ask("POST", "/call/robot.axis/go_on", {"args": [1.0]})  # its own stop does not latch (S08)
-    assert door["axis"].resource.moving
+    assert served["axis"].resource.moving
 
 
-def test_a_session_is_its_clients_alone(door: Opened) -> None:
-    session = door.client("anna").opened(lease_s=60)
-    thief = door.client("bert")
+def test_a_session_is_its_clients_alone(served: Opened) -> None:
+    session = served.client("anna").opened(lease_s=60)
+    thief = served.client("bert")
     thief.session = session.session
     assert thief.call("robot.a.move", 1.0).title == "NoSuchSession"
     assert thief.ask("DELETE", "/session").title == "NoSuchSession"
     assert session.call("robot.a.move", 2.0).status == 200
 
 
-def test_a_lock_is_its_sessions_and_falls_with_it(door: Opened) -> None:
-    anna, bert = door.client("anna"), door.client("bert")
+def test_a_lock_is_its_sessions_and_falls_with_it(served: Opened) -> None:
+    anna, bert = served.client("anna"), served.client("bert")
     refused = anna.ask("POST", "/locks", {"group": "robot.a"})
     assert (refused.status, refused.title) == (400, "NeedsSession")
     session = anna.opened(lease_s=60)
@@ -248,11 +248,11 @@ def test_a_lock_is_its_sessions_and_falls_with_it(door: Opened) -> None:
     session.ask("POST", "/locks", {"group": "robot.a"})
     session.ask("DELETE", "/session")
     wait_until(lambda: bert.call("robot.a.move", 4.0).status == 200, "it fell")
-    assert door["a"].written[:2] == [1.0, 3.0]
+    assert served["a"].written[:2] == [1.0, 3.0]
 
 
-def test_S08_a_foreign_stop_latches_until_it_is_resumed(door: Opened) -> None:
-    session, bert = door.client("anna").opened(lease_s=60), door.client("bert")
+def test_S08_a_foreign_stop_latches_until_it_is_resumed(served: Opened) -> None:
+    session, bert = served.client("anna").opened(lease_s=60), served.client("bert")
     session.call("robot.a.go_on", 1.0)
     assert bert.call("robot.a.stop").status == 200
     held = session.call("robot.a.go_on", 1.0)
@@ -261,8 +261,8 @@ def test_S08_a_foreign_stop_latches_until_it_is_resumed(door: Opened) -> None:
     assert session.call("robot.a.go_on", 1.0).status == 200
 
 
-def test_S09_an_e_stop_holds_until_it_is_cleared(door: Opened) -> None:
-    anna = door.client()
+def test_S09_an_e_stop_holds_until_it_is_cleared(served: Opened) -> None:
+    anna = served.client()
     given = anna.ask("POST", "/estop", {"reason": "smoke"})
     assert given.body["complete"]
     assert set(given.body["confirmed"]) >= {"tester/a", "tester/b"}
@@ -274,7 +274,7 @@ def test_S09_an_e_stop_holds_until_it_is_cleared(door: Opened) -> None:
     assert anna.call("robot.a.move", 1.0).status == 200
 
 
-def test_S09_a_door_that_finds_nobody_does_not_say_that_none_is_open(tmp_path: Path) -> None:
+def test_S09_an_http_gateway_that_finds_no_container_does_not_say_that_no_e_stop_is_open(tmp_path: Path) -> None:
     with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
         refused = Client(made.url, add_token(tokens, "anna")).ask("POST", "/estop/clear")
         assert (refused.status, refused.title) == (503, "NoContainerFound")
@@ -301,20 +301,20 @@ def test_S09_an_e_stop_that_nobody_was_told_is_no_success_and_stays_open(tmp_pat
         wait_until(stopped, "it has heard of the e-stop")
 
 
-def test_S09_a_door_tells_where_it_reached_nobody_and_calls_no_e_stop_complete_then(
-    door: Opened, monkeypatch: pytest.MonkeyPatch
+def test_S09_an_http_gateway_names_unreached_containers_and_calls_the_e_stop_incomplete(
+    served: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    anna = door.client()
+    anna = served.client()
     assert anna.ask("GET", "/sight").body["apart"] == {}
     apart = {"tls/10.0.0.7:7450": "nothing accepts connections there"}
-    monkeypatch.setattr(door.robot.me, "reachability", lambda **_: Reachability(("tester/a",), apart=apart))
+    monkeypatch.setattr(served.robot.me, "reachability", lambda **_: Reachability(("tester/a",), apart=apart))
     told = anna.ask("POST", "/estop").body
     assert (told["complete"], told["apart"]) == (False, apart)
     assert set(told["confirmed"]) >= {"tester/a", "tester/b"}
 
 
-def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(door: Opened) -> None:
-    anna, bert = door.client("anna"), door.client("bert")
+def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(served: Opened) -> None:
+    anna, bert = served.client("anna"), served.client("bert")
     under_way: list[HTTPConnection] = []
 
     def full() -> bool:
@@ -325,34 +325,34 @@ def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(door: Opened)
         wait_until(full, "it is full")
         assert anna.call("robot.b.where_is_it").title == "TooMany"
         assert bert.call("robot.b.where_is_it").status == 200
-        assert not door["axis"].stopped.is_set()
+        assert not served["axis"].stopped.is_set()
         assert anna.call("robot.axis.stop").status == 200
-        assert door["axis"].stopped.is_set()
+        assert served["axis"].stopped.is_set()
     finally:
         for request in under_way:
             request.close()
 
 
-def test_S07_a_stop_needs_no_session_not_even_the_one_it_names(door: Opened) -> None:
-    ended, bert = door.client("anna").opened(lease_s=60), door.client("bert").opened(lease_s=60)
+def test_S07_a_stop_needs_no_session_not_even_the_one_it_names(served: Opened) -> None:
+    ended, bert = served.client("anna").opened(lease_s=60), served.client("bert").opened(lease_s=60)
     ended.ask("DELETE", "/session")
     bert.call("robot.a.go_on", 1.0)
     assert ended.call("robot.a.go_on", 1.0).title == "NoSuchSession"
     assert ended.call("robot.a.stop").status == 200
-    assert not door["a"].resource.moving
+    assert not served["a"].resource.moving
     assert ended.ask("POST", "/estop").body["complete"]
 
 
-def test_what_is_too_large_is_refused(door: Opened) -> None:
-    answer = door.client().ask("POST", "/estop", b" " * (2 << 20))
+def test_what_is_too_large_is_refused(served: Opened) -> None:
+    answer = served.client().ask("POST", "/estop", b" " * (2 << 20))
     assert (answer.status, answer.title) == (413, "TooLarge")
 
 
-def test_one_client_has_so_many_sessions_and_no_more(door: Opened) -> None:
-    anna = door.client()
+def test_one_client_has_so_many_sessions_and_no_more(served: Opened) -> None:
+    anna = served.client()
     sessions = [anna.opened(lease_s=60) for _ in range(16)]
     full = anna.ask("POST", "/session")
     assert (full.status, full.title) == (429, "TooMany")
-    assert door.client("bert").ask("POST", "/session").status == 201
+    assert served.client("bert").ask("POST", "/session").status == 201
     sessions[0].ask("DELETE", "/session")
     assert anna.ask("POST", "/session").status == 201

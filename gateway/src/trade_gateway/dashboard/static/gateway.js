@@ -18,7 +18,7 @@ export class Refused extends Error {
 
 const lost = () => new Refused({ title: "NotConnected", status: 0, detail: "There is no connection to the HTTP gateway." });
 
-class Door {
+class Gateway {
   token = sessionStorage.getItem("token") || "";
   me = null; // the identity that is signed in, and its rights over the system
   locks = new Map(); // those of this page: name -> resources
@@ -147,4 +147,4 @@ class Door {
   }
 }
 
-export const door = new Door();
+export const gateway = new Gateway();
