@@ -54,7 +54,7 @@ def test_S04_a_move_that_meets_its_deadline_is_reported_as_stopped(bench: Bench,
             look.with_(deadline_s=1.0)([goal, 0.0], speed_rad_s=0.1)
         told.append(ended.type)
         if ended.type is MotionStopped:
-            assert "the deadline of its call came" in str(ended.value)
+            assert "its call reached its deadline" in str(ended.value)
             break
     assert told[-1] is MotionStopped
     wait_until(lambda: not bench.moving())

@@ -94,7 +94,7 @@ class Follow(Motion[AxisT]):
         exchange, cycles = self.exchange, self.exchange.cycles_a_goal(self.devices)
         if (every_ns := cycles * exchange.period_ns) > _VALID_NS:
             problem = f"its joints take a goal every {every_ns / 1e9:.2g} s; a trajectory needs one every 0.2 s"
-            needed = f"give the bus a rate_hz of {cycles * 1e9 / _VALID_NS:g} or more"
+            needed = f"set the bus's rate_hz to {cycles * 1e9 / _VALID_NS:g} or more"
             raise ConfigurationError(where=f"bus {self.devices[0].bus}", problem=f"{problem}; {needed}")
 
     def _send(self, now_ns: int) -> None:

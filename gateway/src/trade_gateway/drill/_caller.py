@@ -24,7 +24,7 @@ __all__ = ["Order"]
 
 _FOUND_S: Final = 30.0
 _ENABLED_S: Final = 30.0
-"""How long devices may take to become enabled, in seconds: those of a lost bus return one by one."""
+"""How long devices may take to become enabled, in seconds: after a bus was lost, they return one by one."""
 _PAUSE_S: Final = 0.25
 _MOVE_S: Final = 120.0
 _PERIOD_S: Final = 0.05
@@ -32,14 +32,14 @@ _PERIOD_S: Final = 0.05
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """What to move, and how."""
+    """A request to move one group of joints."""
 
     group: str
     arm: bool
     stream: bool
-    """Whether to send set-points repeatedly instead of one move; an arm streams to a far one at full speed."""
+    """Whether to stream set-points instead of a single move; an arm gets a distant one, at full speed."""
     from_rad: list[float]
-    """Its position: one angle, or those of an arm."""
+    """The start position: one angle, or the angles of an arm's joints."""
     goal_rad: list[float]
     speed_rad_s: float
     valid_s: float
@@ -47,7 +47,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def main() -> None:
-    """Runs the caller. See the module."""
+    """Runs the caller."""
     orders = msgspec.json.decode(sys.argv[1], type=list[Order])
     hushed = threading.Event()
     try:

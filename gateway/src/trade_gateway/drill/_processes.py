@@ -33,9 +33,9 @@ class Actor:
     """``python -m WORDS`` as a child process that prints one JSON object per line.
 
     Args:
-        name: for messages.
+        name: the name of the process in messages.
         words: module and arguments.
-        environment: of the process; whole.
+        environment: all environment variables of the process.
         complaints: the file for its standard error.
     """
 

@@ -75,7 +75,7 @@ class Link(_Strict, frozen=True, kw_only=True):
 
 class _Of(_Strict, frozen=True, kw_only=True):
     group: str = ""
-    """All services of this group, and beneath it."""
+    """All services of this group and of the groups beneath it."""
     service: str = ""
     """One service instead: ``rosie.head.stop``."""
 

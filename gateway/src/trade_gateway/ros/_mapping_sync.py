@@ -75,7 +75,7 @@ class Following:
         self._say = say
         self._open: dict[_Key, Closes] = {}
         self._failed: dict[tuple[int, Place | None, Handle | None], tuple[str, float]] = {}
-        """For each failed mapping, why and when."""
+        """The reason and the time of each failure, by mapping."""
         self._look_now = threading.Event()
         self._closing = False
         self._first = threading.Event()

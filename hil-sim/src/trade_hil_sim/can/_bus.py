@@ -243,18 +243,18 @@ class CanBus(BusThread):
     # the wire's referee
 
     def corrupts(self, sender: Station, frame: Frame) -> bool:
-        """Whether a fault says so."""
+        """Whether an injected fault corrupts this frame."""
         name, ids = self._struck(sender, frame)
         return ids is not None and self._faults.strikes(faults.BadCrc, ids, name)
 
     def passed(self, sender: Station, frame: Frame, t: float) -> None:
-        """Log it; and echo it if the adapter does."""
+        """Log a frame that was sent, and echo it if the adapter echoes."""
         self._frame("", sender, frame, t)
         if self._echo and sender.device_id is None:
             sender.deliver(frame, t)
 
     def destroyed(self, sender: Station, frame: Frame, t: float) -> None:
-        """Log it and tell all clients."""
+        """Log a destroyed frame, and report it to all clients."""
         self._frame("destroyed", sender, frame, t)
         for client in self._clients:
             client.tell_error(BUS_ERROR, t + self._wall_offset_s)

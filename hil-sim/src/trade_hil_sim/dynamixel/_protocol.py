@@ -101,7 +101,7 @@ def unstuff(body: bytes) -> bytes:
 
 
 def encode(device_id: int, instruction: int, params: bytes = b"") -> bytes:
-    """One packet as it goes over the wire."""
+    """Encode one packet."""
     body = stuff(bytes([instruction]) + params)
     packet = HEADER + bytes([device_id]) + (len(body) + 2).to_bytes(2, "little") + body
     return packet + crc16(packet).to_bytes(2, "little")

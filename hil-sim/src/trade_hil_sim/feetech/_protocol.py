@@ -38,7 +38,7 @@ def checksum(body: bytes) -> int:
 
 
 def encode(device_id: int, instruction: int, params: bytes = b"") -> bytes:
-    """One packet as it goes over the wire."""
+    """Encode one packet."""
     body = bytes([device_id, 2 + len(params), instruction]) + params
     return HEADER + body + bytes([checksum(body)])
 

@@ -107,7 +107,7 @@ class Program:
             self.arm.note("program_paused" if on else "program_resumed")
 
     def written(self, ints: Mapping[int, int], doubles: Mapping[int, float]) -> None:
-        """A client has set registers."""
+        """Take the registers that a client has set."""
         self.ints.update(ints)
         self.doubles.update(doubles)
         if 0 not in ints:

@@ -103,7 +103,7 @@ class Rtde:
             case _:
                 return
         if len(answer) > MOST_PAYLOAD:
-            raise ValueError(f"an answer of {len(answer)} bytes to one of {len(packet.payload)}")
+            raise ValueError(f"the answer to a request of {len(packet.payload)} bytes has {len(answer)} bytes")
         session.say(Packet(packet.kind, answer), "rtde")
 
     def _want(self, session: RtdeSession, payload: bytes) -> bytes:

@@ -34,14 +34,16 @@ _PARTING_S: Final = 3.0
 _LONGEST: Final = 500
 _MOST_ID: Final = (1 << 63) - 1
 _JUMP_NS: Final = 2_000_000_000
-"""A wall clock that differs by this much from the monotonic one was set."""
+"""The difference from the monotonic clock above which the wall clock counts as set."""
 _FAR_NS: Final = 86_400_000_000_000
 """After a jump this large no row is dropped for its age: the clock may be wrong."""
 _EVER_DAYS: Final = 1_000_000
 
 
 class AuditWriter:
-    """Owns the record of one container. When closed, it has written what it could, and logs what it could not.
+    """Owns the record of one container.
+
+    On close, it writes what it can, and logs the number of rows that it cannot write.
 
     Args:
         path: of the file; created when the first event is written.
@@ -220,7 +222,7 @@ class AuditWriter:
             self._store = None
 
     def _log_head(self, verb: str) -> None:
-        """Log the end of the record: a witness in another place."""
+        """Log the newest row and its hash, as evidence outside the file."""
         if self._head.seq:
             _logger.info("audit: %s %s row %d, %s", self._path, verb, self._head.seq, self._head.hash.hex())
 

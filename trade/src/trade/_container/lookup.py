@@ -117,8 +117,8 @@ class Lookup:
 
         Args:
             which: a constraint (all that match now), or handles; bound calls have their own arguments.
-            args: for each call.
-            kwargs: for each call.
+            args: positional arguments of each call.
+            kwargs: arguments of each call by name.
 
         Returns:
             An outcome for each call, in order; an error is the outcome of its call and stops no other.

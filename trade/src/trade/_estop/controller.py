@@ -259,7 +259,7 @@ class EstopController:
         return [*same_version, *((state.address, state.open_estops()) for state in self._others())]
 
     def _own_records(self) -> list[Record]:
-        """One record of each container, of the provider that reports its open e-stops."""
+        """One record for each container of this version: a service of the provider that reports its open e-stops."""
         containers = self._registry.containers()
         entries = [entry for state in containers for entry in list(state.providers.values())]
         return [entry.records[0] for entry in entries if _reports(entry.records)]

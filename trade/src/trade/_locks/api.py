@@ -48,7 +48,7 @@ class LockOverview(NamedTuple):
 
 
 class LockHost(Protocol):
-    """The container, as locking uses it."""
+    """The part of a container that the lock methods use."""
 
     access: Final[Authorizer]
 
@@ -82,26 +82,27 @@ class LockApi:
     ) -> Lock:
         """Locks services for exclusive use, in all their containers or in none: ``with container.lock(...):``.
 
-        It takes nothing before the context is entered (or `Lock.acquire` is called).
+        It acquires nothing before the context is entered or `Lock.acquire` is called.
 
         Args:
-            which: handles, or a constraint: the actuating services that match when it is taken. If nothing matches yet,
-                it waits for that, and then for the whole of a robot's group. Of ``A | B`` it takes a part of each, or
-                nothing. Under it no service can be commanded that such a constraint selects and the lock does not hold.
+            which: handles, or a constraint, for the actuating services that match when the lock is acquired. If nothing
+                matches yet, the lock waits for a match, and then for the whole of a robot's group. Of ``A | B`` it
+                takes a part of each, or nothing. Under the lock, a service that such a constraint selects but the lock
+                does not hold cannot be commanded.
             purpose: the reason, as other clients see it.
             wait_s: how long to wait for other clients and missing services, in seconds; 0 does not wait. Inside a call
                 the wait ends before that call's deadline.
-            lease_s: how long it outlives its owner, in seconds.
+            lease_s: how long the lock outlives its owner, in seconds.
             priority: waiting clients with a higher one come first.
-            delegates: identities that may use it, too.
+            delegates: identities that may use the lock, too.
             partial: take a robot's group although members are missing, and of ``A | B`` the available parts;
                 `Lock.missing` then lists the others.
-            on_lost: called with the error, on another thread, when it is lost.
+            on_lost: called with the error, on another thread, when the lock is lost.
             on_request: called with the client and its reason, on another thread, when a client requests its release.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s``.
-            LockedByOther: another client holds one of them, or something still moves, after ``wait_s``.
+            LockedByOther: after ``wait_s``, another client still holds one of them, or something still moves.
             IncompleteGroup: members of the group in the robot file, or a whole alternative, are missing.
             ConfigurationError: the matching services only read, so there is nothing to lock.
             AccessDenied: the policy does not let this container lock one of them.
@@ -332,7 +333,7 @@ def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle
 
 
 def absent(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> list[str]:
-    """What a constraint names and these do not include: members of the robot file's groups, and whole alternatives."""
+    """The parts of a constraint that the services lack: members of the robot file's groups, and whole alternatives."""
     if not isinstance(which, Constraint):
         return []
     groups, there = _groups_of(which), {name for handle in handles for name in handle.record.info.uses}

@@ -26,7 +26,7 @@ _BEATS: Final = 4
 
 
 class LeaseHost(Protocol):
-    """The container, as locking uses it."""
+    """The part of a container that renewing leases uses."""
 
     @property
     def address(self) -> Address: ...

@@ -320,7 +320,7 @@ def decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Mess
 def read_any(decoder: msgspec.msgpack.Decoder[_Value], payload: bytes) -> _Value:
     """A message of any version. Raises Malformed."""
     if len(payload) > _MOST_MESSAGE_BYTES:
-        raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
+        raise Malformed(f"a message of {len(payload)} bytes exceeds the limit of {_MOST_MESSAGE_BYTES} bytes")
     try:
         return decoder.decode(payload)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:

@@ -83,7 +83,7 @@ def rate_of(sign: str) -> float:
 def decode_sample(payload: bytes) -> StreamSample:
     """Raises Malformed."""
     if len(payload) > _MOST_MESSAGE_BYTES:
-        raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
+        raise Malformed(f"a message of {len(payload)} bytes exceeds the limit of {_MOST_MESSAGE_BYTES} bytes")
     try:
         sample = _decoder.decode(payload)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:

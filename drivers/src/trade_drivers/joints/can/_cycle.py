@@ -131,7 +131,7 @@ class MotorExchange(Exchange[_Axis]):
     def after_measuring(self, now_ns: int) -> None:
         """Makes motors hold that were moving when they were accepted, since no client owns that motion.
 
-        An exchange that detects such motion elsewhere may do other work here, once per cycle.
+        A subclass that detects such motion elsewhere may override this method for other work, once per cycle.
         """
         for axis in self.devices:
             if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:

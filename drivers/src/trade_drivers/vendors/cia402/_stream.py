@@ -30,7 +30,7 @@ class Following(Ramp):
 class Turning:
     """Cyclic synchronous velocity, or profile velocity with ramps of the same steepness.
 
-    The velocity is 0 until it gets an end and a speed. It slows down early enough for the drive to stop within the
+    The velocity is 0 until the end and the speed are set. It slows down early enough for the drive to stop within the
     range even if the driver's frames stop, which the drive notices after ``blind_s``. Without a new measurement, it
     assumes that the joint follows the commanded velocity.
     """

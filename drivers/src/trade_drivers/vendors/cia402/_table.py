@@ -114,7 +114,7 @@ class Pdo(Struct, frozen=True):
     """The fields of one process data object, little-endian and without gaps."""
 
     communication: int
-    """The object with its parameters; the mapping is 200h above."""
+    """The index of its communication parameters; the index of its mapping is 200h higher."""
     base: int
     """The identifier without the node number."""
     entries: tuple[Entry, ...]
@@ -131,7 +131,7 @@ COMMAND: Final = Pdo(0x1400, 0x200, (CONTROLWORD, TARGET_POSITION), struct.Struc
 PROFILE: Final = Pdo(0x1401, 0x300, (PROFILE_VELOCITY, ACCELERATION), struct.Struct("<II"))
 BRAKING: Final = Pdo(0x1402, 0x400, (DECELERATION,), struct.Struct("<I"))
 TURNING: Final = Pdo(0x1402, 0x400, (DECELERATION, TARGET_VELOCITY), struct.Struct("<Ii"))
-"""The replacement for drives with a velocity mode."""
+"""Replaces ``BRAKING`` on drives with a velocity mode."""
 FOLLOWING: Final = Pdo(0x1403, 0x500, (TARGET_POSITION,), struct.Struct("<i"))
 UNUSED: Final = (0x1802, 0x1803)
 AT_NEXT_SYNC: Final = 1

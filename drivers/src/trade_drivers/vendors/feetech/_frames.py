@@ -1,7 +1,8 @@
-"""The packets of SCS and STS servos: bytes in, packets out; no I/O and no clock.
+"""Encodes and decodes the packets of SCS and STS servos, without I/O and without a clock.
 
-``FF FF | ID | LEN | INST | parameters | CK``; LEN counts from INST on, CK is the inverted sum of all between header and
-itself. An answer has the device's status in place of INST. Nothing is stuffed: a header may stand in the parameters.
+``FF FF | ID | LEN | INST | parameters | CK``. LEN is the number of bytes from INST on. CK is the inverted sum of the
+bytes between header and CK. An answer has the device's status in place of INST. There is no byte stuffing, so the
+parameters may contain the bytes of a header.
 """
 
 from collections.abc import Container
@@ -17,7 +18,7 @@ _BEFORE_PARAMETERS: Final = 5
 
 
 class Instruction:
-    """What this driver asks for."""
+    """The instructions that this driver sends."""
 
     READ: Final = 0x02
     WRITE: Final = 0x03
@@ -26,7 +27,7 @@ class Instruction:
 
 
 class Corrupt(Exception):
-    """An answer of the right kind arrived whose checksum is wrong."""
+    """The checksum of an answer is wrong."""
 
 
 class Status(NamedTuple):
@@ -34,35 +35,35 @@ class Status(NamedTuple):
 
     device_id: int
     status: int
-    """Bits of what the device complains of; the instruction was carried out all the same."""
+    """Error bits of the device; it carries out the instruction nevertheless."""
     data: bytes
 
 
 def checksum(body: bytes) -> int:
-    """The last byte of a packet, over all between its header and itself."""
+    """The checksum of the bytes between the header and the checksum."""
     return ~sum(body) & 0xFF
 
 
 def packet(device_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """One packet as it goes over the wire."""
+    """Encodes one packet."""
     body = bytes((device_id, len(parameters) + 2, instruction)) + parameters
     return HEADER + body + bytes((checksum(body),))
 
 
 def take_status(buffer: bytearray, ids: Container[int], size: int, sent: bytes = b"") -> Status | None:
-    """The first whole answer of one of these devices with so many bytes of data; None while it is incomplete.
+    """Removes the first answer of these devices with ``size`` bytes of data from the buffer; None if it is incomplete.
 
-    It is taken out of the buffer with all that comes before it: noise, answers of another length, and what was sent,
-    where the adapter echoes.
+    All bytes before the answer are removed, too: noise, answers of another length, and the request if the adapter
+    echoes it.
 
     Raises:
-        Corrupt: an answer with a wrong checksum was taken out.
+        Corrupt: an answer with a wrong checksum was removed.
     """
     whole = OVERHEAD + size
     while True:
         start = buffer.find(HEADER)
         if start < 0:
-            del buffer[: max(0, len(buffer) - 1)]  # half a header may stand at the end
+            del buffer[: max(0, len(buffer) - 1)]  # the buffer may end with half a header
             return None
         del buffer[:start]
         if len(buffer) <= _LENGTH:
@@ -82,4 +83,4 @@ def take_status(buffer: bytearray, ids: Container[int], size: int, sent: bytes =
         if HEADER.startswith(behind):
             del buffer[:whole]
             raise Corrupt
-        del buffer[0]  # noise that looks like a header: the answer is still to come
+        del buffer[0]  # noise that looks like a header: the answer follows

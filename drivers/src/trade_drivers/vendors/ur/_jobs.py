@@ -82,7 +82,7 @@ class Motion(ArmCommand):
         except TradeError as problem:
             return problem
         if until_ns is not None and now_ns >= until_ns:
-            return MotionStopped(device=self.limb.name, reason="the deadline of its call came; give it a longer one")
+            return MotionStopped(device=self.limb.name, reason="its call reached its deadline; set a longer one")
         return None
 
     def astray(self, sample: Sample) -> LimitExceeded | None:
