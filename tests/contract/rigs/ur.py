@@ -32,8 +32,8 @@ class UrRig(SafetyRig):
     readying = ("freedrive", True)
     lacks: ClassVar = {
         "test_a_lost_answer_is_forgiven": "TCP repeats what is lost",
-        "test_S01_a_plain_call_waits_one_second_for_its_turn_at_most": "the controller's states that no process reads "
-        "for a second end the connection, and the call with it",
+        "test_S01_a_plain_call_waits_one_second_for_its_turn_at_most": "if no process reads the controller's states "
+        "for a second, the connection ends, and the call with it",
         "test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why": "its processes are frozen apart: "
         "unit/drivers/test_ur_safety.py suspends the host",
         "test_S06_every_enabled_joint_has_its_watchdog_armed": "the watchdog is armed by the process that "

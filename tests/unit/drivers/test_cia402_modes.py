@@ -299,7 +299,7 @@ def test_a_drive_that_does_not_show_its_mode_is_not_enabled_in_it(leg: Leg) -> N
     hip = leg.attach().motor("leg.hip")
     leg.sim.do(Mute(ids=(HIP,), instruction="tpdo2"))
     mark = written_now()
-    with pytest.raises(DeviceFault, match=r"does not go into mode 9 \(6061h\)"):
+    with pytest.raises(DeviceFault, match=r"does not enter mode 9 \(6061h\)"):
         hip.set_velocity(0.2, valid_s=1.0)
     assert not leg.events("torque_on", HIP, mark)
 

@@ -62,7 +62,7 @@ def test_what_a_device_needs_is_said_as_it_is_typed(capsys: pytest.CaptureFixtur
     remedy = "remove the cause, then call power_on() and release_brakes()"
     say_error(DeviceFault(device="rosie.arm", bus="/dev/x", fault="overload", remedy=remedy))
     say_error(Stopped(resource="rosie.pan", by="anna/desk", reason="stop"))
-    say_error(MotionStopped(device="rosie.pan", reason="its call reached its deadline; set a longer one"))
+    say_error(MotionStopped(device="rosie.pan", reason="its call reached its deadline; give it a longer one"))
     fault, stopped, ended = capsys.readouterr().err.splitlines()
     assert fault.endswith(
         "remove the cause, then `trade call rosie.arm.power_on` and `trade call rosie.arm.release_brakes`"
@@ -79,7 +79,7 @@ def test_every_remedy_that_is_put_in_other_words_is_one_of_an_error() -> None:
         TooManyServices(constraint="a", matches=["b"]),
         OutcomeUnknown(service="a", deadline_s=1),
         Stopped(resource="a", by="b", reason="c"),
-        MotionStopped(device="a", reason="its call reached its deadline; set a longer one"),
+        MotionStopped(device="a", reason="its call reached its deadline; give it a longer one"),
         InvalidArgument(service="a", argument="b", problem="with_(deadline_s=...) gives it more"),
     )
     assert all(any(remedy in str(error) for error in errors) for remedy in REMEDIES)

@@ -51,7 +51,7 @@ class ArmLimits(Struct, frozen=True, kw_only=True):
     joints: list[JointLimits]
     """From the base to the tool."""
     max_speed_m_s: float
-    """Of the tool, on a straight line."""
+    """The maximum speed of the tool on a straight line."""
     max_accel_m_s2: float
     poses: dict[str, list[float]]
     """Joint angles in rad, by name of the pose."""

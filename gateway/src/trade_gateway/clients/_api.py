@@ -89,7 +89,7 @@ class ClientApi:
         """Finds a service by group and name; one of exactly this group has priority over those beneath it.
 
         Raises:
-            NoSuchService, TooManyServices: the client may know of none, or of several.
+            NoSuchService, TooManyServices: none, or several, of the services that the client may see match.
         """
         inside = self.seen(who, None if group == _NO_GROUP else group)
         found = [one for one in inside if one.name == name and container in ("", one.container)]
@@ -259,7 +259,7 @@ class ClientApi:
         return [messages.lock_view(info) for info in broken]
 
     def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
-        """The services that use exactly these. Raises NoSuchService: an identity knows of no such service."""
+        """The services that use only these resources. Raises NoSuchService: the client may see no such service."""
         wanted = set(resources)
         actuating = [one for one in self.seen(who) if one.effect == "actuate"]
         found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]

@@ -129,7 +129,7 @@ class Around(Struct, frozen=True, kw_only=True):
     system: str
     """The system id."""
     tls: str = ""
-    """The default of containers of this host; likewise the policy and the folder of audit records."""
+    """The default folder of certificates for containers of this host. ``policy`` and ``audit`` are defaults, too."""
     policy: str = ""
     audit: str = ""
     connect: Sequence[str] = ()

@@ -1,4 +1,4 @@
-"""Checks of the container as a caller: of a service of the suite, under its lock, and on behalf of others."""
+"""Checks of the container as a caller: calls of the suite's service, under its lock, and on behalf of others."""
 
 import threading
 from collections.abc import Generator

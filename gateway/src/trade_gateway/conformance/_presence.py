@@ -21,7 +21,7 @@ ARM: Final = {
 }
 """The services of the container under test: effect and parameters."""
 MOVES: Final = ("turn", "angle", "turns", "halt")
-"""Of these, the services for motion."""
+"""The names of the services for motion."""
 OWN: Final = {
     "clock": "read",
     "acquire": "actuate",

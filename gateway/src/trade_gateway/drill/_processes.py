@@ -111,7 +111,7 @@ class Actor:
         self._process.send_signal(signal.SIGCONT)
 
     def close(self, *, gently: bool) -> None:
-        """Ends it, in order if requested, and waits for that. Idempotent."""
+        """Terminates the process, or kills it unless ``gently``, and waits for its end. Idempotent."""
         self.wake()
         if gently:
             self._process.terminate()

@@ -112,7 +112,7 @@ def page(report: Report) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>Drill of {escape(report.robot)}</title><style>{_STYLE}</style></head><body>",
         f"<h1>Drill of {escape(report.robot)}: {verdict}</h1><p>{facts}</p>",
-        "<p>Simulated devices; the times are from their log: from the failure until a joint was finally at rest.",
+        "<p>The devices were simulated. By their log, each time is from the failure until the joint was at rest.",
         "The mark in a bar is the limit. This measurement is not safety-rated.</p>",
         *(_scene(played) for played in sorted(report.scenes, key=_severity)),
         _left_out(report),

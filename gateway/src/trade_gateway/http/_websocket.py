@@ -97,7 +97,7 @@ class _Line:
         return self._next is not None
 
     async def take(self, do: Callable[[], Awaitable[Any]]) -> Any:
-        """Runs or shares a stop; it begins after this call in any case."""
+        """Runs a stop, or shares one that has not begun yet."""
         if self._next is not None:
             return await asyncio.shield(self._next)
         shared = self._next = asyncio.get_running_loop().create_future()

@@ -199,7 +199,7 @@ QUESTIONS: Final[Mapping[str, Question]] = {
     "load": Question(("container",), ("count", "loads", "busiest"), _load),
     "estop": Question(("reason",), ("count", "report", "id"), _estop, is_order=True),
 }
-"""By the name in the lexicon."""
+"""Questions and orders by their names in the lexicon."""
 
 
 def _others(container: Container) -> list[Handle]:

@@ -128,7 +128,7 @@ class Sources:
             yield source.read(handle, sample)
 
     def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
-        """Yields a change of a fault, compared by ``what``, as the whole text may contain times."""
+        """Yields a message if a fault has changed; compares ``what``, because the whole text may contain times."""
         now, before = what or text, self._wrong.get((about, kind))
         self._wrong[about, kind] = now
         if now != (before or ""):
@@ -155,7 +155,7 @@ class Sources:
 
 
 def within(label: str, groups: Iterable[str]) -> bool:
-    """Whether a service, by its group and name, belongs to one of these groups; without groups always."""
+    """Whether a service, by its group and name, belongs to one of these groups; True if there are no groups."""
     asked = list(groups)
     return not asked or any(label == group or label.startswith(f"{group}.") for group in asked)
 

@@ -155,7 +155,7 @@ class Graph(Protocol):
         ...
 
     def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
-        """Serves a service; stops: each request is answered at once, on its own thread, without a queue."""
+        """Serves a service; with ``stops``, each request is answered at once, on its own thread, without a queue."""
         ...
 
     def call(

@@ -89,11 +89,11 @@ class Following:
         return self._first.wait(timeout_s)
 
     def opened(self) -> dict[str, str]:
-        """Open mappings, by kind and name: the TRADE service."""
+        """The TRADE service of each open mapping, by the kind and name of its ROS counterpart."""
         return {f"{key.place.kind} {key.place.name}": key.what for key in list(self._open)}
 
     def problems(self) -> list[str]:
-        """Failed mappings, and why."""
+        """The reasons of failed mappings."""
         return [text for text, _ in list(self._failed.values())]
 
     def _follow(self) -> None:

@@ -74,7 +74,7 @@ class Unit:
 
     @property
     def to_begin(self) -> bool:
-        """Whether it is to be started for the first time, or again after it was elsewhere."""
+        """Whether it has to be started: for the first time, or again after it ran elsewhere."""
         return not self.begun and not self.life.alive and not self.given_up
 
     @property

@@ -49,7 +49,7 @@ class Transition(enum.Enum):
 
 
 class _After(enum.Enum):
-    """What follows its end."""
+    """The action that follows the end of a child."""
 
     STOPPED = enum.auto()
     START = enum.auto()

@@ -64,7 +64,7 @@ class JointDevice(JointModel):
         shaft: what it moves.
         joint: name of the joint, for the log.
         model: what it is called.
-        rad_per_unit: what one unit of its shaft's position is at the joint, negative if that turns against it.
+        rad_per_unit: angle of the joint per unit of the shaft's position; negative if they turn in opposite directions.
         offset_rad: the joint's angle at position 0.
     """
 
@@ -92,7 +92,7 @@ class JointDevice(JointModel):
 
     @abstractmethod
     def _plan(self, t: float) -> None:
-        """Log what is new, and say when to come again."""
+        """Log new events, and set the time of the next call."""
 
     @abstractmethod
     def _place(self, position: float, t: float) -> None:

@@ -23,7 +23,7 @@ class Frame:
     remote: bool = False
     """Whether it asks for data; it carries none."""
     length: int = 0
-    """Of a remote frame: how many bytes it asks for."""
+    """The number of bytes that a remote frame requests."""
 
     @property
     def rank(self) -> tuple[int, bool, int, bool]:

@@ -25,7 +25,7 @@ class JointBus(CanBus):
     """Devices that each move one joint."""
 
     kind: ClassVar[str]
-    """What they are, for messages: ``ODrives``."""
+    """The kind of devices, in messages: ``ODrives``."""
 
     @classmethod
     @abstractmethod

@@ -16,7 +16,7 @@ __all__ = ["Referee", "Station", "Wire"]
 ERROR_BITS: Final = 20
 """Bit times of an error frame and the pause after it."""
 PER_ERROR: Final = 8
-"""What a destroyed frame adds to its sender's error counter; one that gets through takes 1 off (ISO 11898-1)."""
+"""Increase of the sender's error counter per destroyed frame; each sent frame decreases it by 1 (ISO 11898-1)."""
 BUS_OFF: Final = 256
 UNHEARD: Final = 10
 """How many unacknowledged frames a sender keeps: the usual length of a transmit queue on Linux."""

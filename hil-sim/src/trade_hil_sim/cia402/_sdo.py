@@ -15,7 +15,7 @@ REQUEST: Final = 8
 
 
 class Dictionary(Protocol):
-    """What is read and written; both raise `Abort`."""
+    """The object dictionary that SDOs read and write; both methods raise `Abort`."""
 
     def read(self, index: int, sub: int, t: float) -> bytes:
         """The bytes of an object."""

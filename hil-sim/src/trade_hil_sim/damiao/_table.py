@@ -33,7 +33,7 @@ TICKS_PER_S: Final = 20_000
 
 
 class Register(IntEnum):
-    """Registers whose contents matter here."""
+    """Registers whose contents this simulator uses."""
 
     ACCELERATION = 4
     DECELERATION = 5

@@ -1,7 +1,7 @@
 """Feetech's protocol: bytes to packets and back. Pure: no port, no clock.
 
 ``FF FF | ID | LEN | INST | parameters | CK``; LEN counts what follows it, CK is the inverted sum of all between header
-and itself. Written on its own, so that drivers and simulator can check each other.
+and itself. Independent of the driver's code, so that each can check the other.
 """
 
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ class DeviceModel(ABC):
     """A device on a bus, as faults and orders see it."""
 
     thing = "a device"
-    """What it is, in messages."""
+    """The kind of device, in messages."""
     healthy: tuple[float, int] = (24.0, 30)
     """Its supply in V and its temperature in C when nothing is wrong."""
 
@@ -139,8 +139,8 @@ class JointModel(DeviceModel):
 
     Args:
         joint: name of the joint.
-        model: of the device.
-        rad_per_unit: what one unit of its shaft's position is at the joint, negative if that turns against it.
+        model: model of the device.
+        rad_per_unit: angle of the joint per unit of the shaft's position; negative if they turn in opposite directions.
         offset_rad: the joint's angle at position 0.
     """
 

@@ -109,7 +109,7 @@ class Motor:
         self.shaft.forget(t)
 
     def jam(self, on: bool, t: float) -> None:
-        """Jam it, or release it: then it moves to its target."""
+        """Jam the shaft, or release it; a released shaft moves to its target."""
         if on or self.shaft.jammed:
             goal = self.shaft.demand.goal
             self.shaft.jam(on, t)

@@ -36,7 +36,7 @@ class Command(IntEnum):
 
 
 class State(IntEnum):
-    """Of an axis."""
+    """The state of an axis."""
 
     IDLE = 1
     CLOSED_LOOP_CONTROL = 8
@@ -60,7 +60,7 @@ class Input(IntEnum):
 
 
 class Result(IntEnum):
-    """Of a change of state."""
+    """The result of a change of state."""
 
     SUCCESS = 0
     DISARMED = 3

@@ -79,7 +79,7 @@ class Arm:
 
     @property
     def series(self) -> Series:
-        """Of its controller."""
+        """The series of its controller."""
         return E_SERIES if self.model.endswith("e") else CB3
 
     @property
@@ -108,7 +108,7 @@ class Arm:
         return self.qd if self._pace else (0.0,) * 6
 
     def pose(self, q: Sequence[float] | None = None) -> Six:
-        """Of the flange: x, y, z in m, and a rotation vector in rad."""
+        """The pose of the flange: x, y, z in m, and a rotation vector in rad."""
         return pose_of(flange(MODELS[self.model], self.q if q is None else q))
 
     def joints_for(self, pose: Sequence[float], near: Sequence[float] | None = None) -> Six | None:
@@ -158,7 +158,7 @@ class Arm:
         self.qd = (0.0,) * 6
         self._jammed_s += dt
         if self._jammed_s >= _JAMMED_S:
-            self.protective_stop("it is where it should not be: is something in its way?")
+            self.protective_stop("it is far from its set-point; check for an obstacle")
 
     # --- commands
 

@@ -130,7 +130,7 @@ def _norm(vector: Sequence[float]) -> float:
 
 
 def _least_squares(columns: Sequence[Sequence[float]], error: Sequence[float]) -> list[float]:
-    """The step that best reduces the error, a little shorter where none can: (J'J + damping) step = J' error."""
+    """The damped least-squares step, which is short near singularities: (J'J + damping) step = J' error."""
     rows = [[_dot(one, other) for other in columns] + [_dot(one, error)] for one in columns]
     for i, row in enumerate(rows):
         row[i] += _DAMPING

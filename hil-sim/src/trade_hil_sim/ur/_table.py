@@ -111,7 +111,7 @@ class SafetyMode(IntEnum):
 
     @property
     def cuts_power(self) -> bool:
-        """Whether the arm has no power in it, and none afterwards."""
+        """Whether this mode cuts the arm's power, which then stays off."""
         return self > SafetyMode.SAFEGUARD_STOP
 
 

@@ -101,7 +101,7 @@ class AuditStore:
 
         Args:
             keep: the limits, at the time of ``row``.
-            row: the row to add; this fills in what it is about.
+            row: the row to add; this method sets ``kind``, ``what`` and ``about``.
 
         Returns:
             The number of rows dropped; there may be more to drop.

@@ -142,7 +142,7 @@ def _networks(bridge: Sequence[str]) -> list[list[str]]:
 def _check_bridged(bridge: Sequence[str], links: Links) -> None:
     """Raises ConfigurationError if no container can connect through one of the interfaces.
 
-    An endpoint that this container cannot reach itself may be flooded by strangers; the bridge starts all the same.
+    An endpoint that this container cannot reach itself may be flooded by strangers; the bridge starts nevertheless.
     """
     if not bridge or any(own.everywhere for own in links.listen):
         return
@@ -154,7 +154,7 @@ def _check_bridged(bridge: Sequence[str], links: Links) -> None:
     for name in bridge:
         if not any(name in names for names in heard.values()):
             problem = (
-                f"nothing listens on it, only on {', '.join(map(str, links.listen))}; let TRADE_LISTEN name an address "
-                f"of {name}, too (in a gateway file: listen), or {links.listen[0].protocol}/0.0.0.0:PORT"
+                f"nothing listens on it, only on {', '.join(map(str, links.listen))}; add an address of {name} to "
+                f"TRADE_LISTEN (in a gateway file: listen), or {links.listen[0].protocol}/0.0.0.0:PORT"
             )
             raise ConfigurationError(where=f"bridge {name}", problem=problem)

@@ -27,7 +27,7 @@ Speaking = Callable[[CallContext], AbstractContextManager[None]]
 
 
 class _ProxyMethod(Signature):
-    """A signature that checks nothing: the service's home does, and handles are translated on the way."""
+    """A signature that translates handles and checks nothing, because the service's own container checks."""
 
     def __init__(self, info: ServiceInfo, codec: Codec) -> None:
         self.info = info

@@ -262,7 +262,7 @@ class System:
             who: the requesting client; it is logged.
 
         Returns:
-            What could not be stopped, and why; it ends all the same.
+            The stops that failed, with their reasons; the container ends nevertheless.
 
         Raises:
             InUse: a resource is locked or moves, with ``only_at_rest``.

@@ -48,9 +48,9 @@ class CallContext(Struct, frozen=True, gc=False):
     ongoing: ActiveCall | None = None
     """The middleware's own record of it."""
     behalf: Behalf | None = None
-    """What it inherited; the calls that it makes inherit it, too."""
+    """The context that the call inherited; its nested calls inherit it, too."""
     permit: Permitted | None = None
-    """What it may do to the resources of its service."""
+    """The permit for the resources of its service."""
     events: list[tuple[int, str]] | None = None
     """Its trace events, with times of ``time.monotonic_ns()``; None if it is not traced."""
 

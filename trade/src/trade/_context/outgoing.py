@@ -57,7 +57,7 @@ class Held(Protocol):
 
     @property
     def claim(self) -> Claim:
-        """What it selects, and which part of that it holds."""
+        """The selection of the lock, and the part of it that the lock holds."""
         ...
 
     def tokens(self) -> Iterable[Token]:
@@ -101,12 +101,12 @@ class Inherited(Struct, gc=False):
         return self.client.name
 
     def behalf(self, record: Record, own: Address) -> Behalf | None:
-        """What the call passes on: also the locks around it, unless it is a stop, which needs none.
+        """The context that the call passes on; for a stop, it does not include locks.
 
         Raises:
-            LockLost: it actuates under a lock that no longer holds.
-            NotLocked: it actuates, and the locks around it select its service but do not hold it.
-            Cancelled: it actuates, and its outer call was cancelled.
+            LockLost: the call actuates under a lock that no longer holds.
+            NotLocked: the call actuates, and the locks around it select its service but do not hold it.
+            Cancelled: the call actuates, and its outer call was cancelled.
         """
         effect = record.info.effect
         commands = effect == "actuate" and record.key.domain != DOMAIN  # the middleware's own functions have no owner

@@ -37,7 +37,7 @@ class Round:
 
     @property
     def serves(self) -> bool:
-        """Whether an e-stop that arrives now can share it, if one was open here ever since it began."""
+        """Whether an e-stop that arrives now can share this result, if an e-stop was open here since its start."""
         limit_s = _ANSWER_S if self._problems is None else SHARED_S
         return time.monotonic() < self._begun + limit_s
 

@@ -32,7 +32,7 @@ class Selection(NamedTuple):
     resources: dict[Address, list[str]]
     """By the container that grants their locks."""
     missing: tuple[str, ...] = ()
-    """What belongs to the selection but is missing."""
+    """Missing parts of the selection."""
 
 
 Wanted = Callable[[], Selection]
@@ -72,7 +72,7 @@ class Lock:
         """What its constraint names and was missing when it was taken with ``partial=True``: members of a robot's
         group, and alternatives."""
         self.claim = claim
-        """What it selects, and which resources of that it holds in which container."""
+        """The selection, and the resources of it that the lock holds in each container."""
         self._granted: dict[Address, Token] = {}
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None

@@ -206,7 +206,7 @@ class ActiveNotification(Notification):
         return self.terms.constraint.matches(record)
 
     def add(self, handle: Handle) -> None:
-        """Report a service at the next run, too."""
+        """Include a service in the report of the next run."""
         self._concerned.append(handle)
 
     def _act(self) -> int | None:

@@ -42,7 +42,7 @@ class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
 
     @property
     def who(self) -> str:
-        """The container in whatever boot, as reports and messages name it."""
+        """The container's name in reports and messages, the same in every boot."""
         return f"{self.identity}/{self.container}"
 
 

@@ -133,7 +133,9 @@ def _check_no_pattern(field: str, text: str) -> None:
     if is_exact(text):
         return
     whole = re.split(r"\.?[^.]*[*?\[]", text)[0]
-    problem = f"{field}={text!r} would match nothing: it is whole dotted segments, and one selects all beneath it"
+    problem = (
+        f"{field}={text!r} would match nothing: name whole dotted segments; each name includes everything beneath it"
+    )
     raise ConfigurationError(problem=f"{problem}; write {field}={whole!r}" if whole else f"{problem}, as rosie does")
 
 

@@ -114,7 +114,7 @@ _SLASHES: Final = 4
 _MOST_GUESTS: Final = 64
 """The most containers of one identity without services that are registered."""
 _MOST_PROVIDERS: Final = 65_536
-"""Of one container: further announcements are ignored, and further withdrawals not remembered."""
+"""The most providers of one container: further announcements are ignored, and further withdrawals not stored."""
 
 
 class Registry:

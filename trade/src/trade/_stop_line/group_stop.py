@@ -20,9 +20,9 @@ class StopReport(Struct, frozen=True):
 
     group: str
     stopped: tuple[str, ...] = ()
-    """The services that ended without an error: what they stop is at rest."""
+    """The services that ended without an error, so that their resources are at rest."""
     failed: dict[str, str] = {}
-    """The other ones, and why they failed."""
+    """The services that failed, with the reason of each."""
 
     @property
     def complete(self) -> bool:

@@ -24,16 +24,16 @@ class LoadInfo(Struct, frozen=True):
 
     container: str
     over_s: float
-    """At least a second, once it is that old: a client that asks every second gets the values of that second."""
+    """The measured time: at least a second, unless the container is younger."""
     cpu_percent: float
-    """Of its process; 100 is one core."""
+    """The processor load of its process; 100 is one core."""
     host_cpu_percent: float | None
-    """Of its host; 100 is all cores."""
+    """The processor load of its host; 100 is all cores."""
     load_1min: float | None
     """Processes of its host that run or wait for a core, a mean of the last minute."""
     cores: int
     memory_bytes: int | None
-    """Of its process, resident."""
+    """The resident memory of its process."""
     calls: int
     """Calls from other containers since the start, stops and the middleware's own included."""
     calls_per_s: float
@@ -49,7 +49,7 @@ class _Sample(Struct, frozen=True):
     process_s: float
     busy: int
     ticks: int
-    """Of the host, by its own clock; both 0 where it does not report them."""
+    """Processor ticks of the host; 0, like ``busy``, if the host does not report them."""
     calls: int
 
 

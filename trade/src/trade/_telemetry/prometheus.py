@@ -74,7 +74,7 @@ class Metrics:
 def open_metrics(
     settings: Settings, calls: CallCounters | None, measures: Callable[[], Iterable[Measure]], leaving: ExitStack
 ) -> int:
-    """Serve ``/metrics`` if configured; its closing goes onto the stack. Returns the port, 0 if not configured.
+    """Serve ``/metrics`` until the stack closes, if configured. Returns the port; 0 if not configured.
 
     Raises:
         ConfigurationError: the extra is not installed, or the port is taken.

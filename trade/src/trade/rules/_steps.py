@@ -56,7 +56,7 @@ class LoopDetector:
         return past
 
     def forget(self, rule: str) -> None:
-        """A rule starts again: its earlier firings are no causes any more."""
+        """Forgets the firings of a rule that starts again, so that they no longer count as causes."""
         with self._lock:
             kept = [past for past in self._past if all(mark.rule != rule for mark in past.way)]
             self._past = deque(kept, maxlen=_MOST)

@@ -52,7 +52,7 @@ class DriveAxis(MotorAxis):
         """In a mode without a goal: the generator of its cyclic set-points."""
         self.velocity = 0
         self.controlword = 0
-        """What was commanded last."""
+        """The last controlword that was sent."""
         self.target = 0
         self.raised_ns = 0
         """When its set-point bit was raised; 0 after the drive acknowledged it."""
@@ -72,7 +72,7 @@ class DriveAxis(MotorAxis):
     # --- received frames
 
     def take_status(self, data: bytes) -> None:
-        """Handles TPDO1. Only the first one after a SYNC counts; later ones are not trusted."""
+        """Handles TPDO1. Only the first TPDO1 after each SYNC counts."""
         asked_ns, self.asked_ns = self.asked_ns, 0
         if not asked_ns:
             return

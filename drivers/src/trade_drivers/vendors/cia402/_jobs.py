@@ -130,7 +130,7 @@ def _reset(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps
 def set_mode(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
     """Changes the mode of operation, and waits until the drive reports it."""
     yield from write(bus, job, axis, table.MODE, mode)
-    yield from until(bus, axis, lambda: axis.mode == mode, f"it does not go into mode {mode} (6061h)")
+    yield from until(bus, axis, lambda: axis.mode == mode, f"it does not enter mode {mode} (6061h)")
 
 
 def relaxing(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:

@@ -57,7 +57,7 @@ class DamiaoBench(CanBench):
             software = self._register(device_id, Register.SOFTWARE)[0][1]
             status = self._status(device_id)
         except _Silent:
-            return self.found(device_id, problem="it answers now and then; check its cable and the terminations")
+            return self.found(device_id, problem="it answers only sometimes; check its cable and the terminations")
         reported = Ranges(position, *rest)
         names = [name for name, ranges in MODELS.items() if all(map(_alike, ranges, reported))]
         return self.found(
@@ -65,7 +65,7 @@ class DamiaoBench(CanBench):
             " or ".join(names),
             firmware=f"{software:g}",
             torque=status == Status.ENABLED,
-            problem="" if names else f"its numbers (registers 21 to 23) go to {reported}, which is no model known here",
+            problem="" if names else f"no known model has its limits (registers 21 to 23): {reported}",
         )
 
     def _register(self, motor: int, number: Register) -> list[tuple[int, float]]:

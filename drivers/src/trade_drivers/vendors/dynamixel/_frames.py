@@ -18,7 +18,7 @@ _LONGEST: Final = 1024
 
 
 class Corrupt(Exception):
-    """A packet arrived whose CRC is wrong."""
+    """The CRC of a packet is wrong."""
 
 
 def _table() -> tuple[int, ...]:

@@ -95,7 +95,7 @@ MOVING: Final = Register(122, "u1")
 PRESENT_LOAD: Final = Register(126, "i2", si_per_count=0.001, unit="of full load")
 PRESENT_CURRENT: Final = Register(126, "i2", si_per_count=0.00269, unit="A")
 PRESENT_CURRENT_24V: Final = Register(126, "i2", si_per_count=0.00134, unit="A")
-"""Of XH430-V."""
+"""The register of the XH430-V."""
 PRESENT_CURRENT_330: Final = Register(126, "i2", si_per_count=0.001, unit="A")
 PRESENT_CURRENT_MX: Final = Register(126, "i2", si_per_count=0.00336, unit="A")
 PRESENT_VELOCITY: Final = Register(128, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")

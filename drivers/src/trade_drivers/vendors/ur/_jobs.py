@@ -82,7 +82,7 @@ class Motion(ArmCommand):
         except TradeError as problem:
             return problem
         if until_ns is not None and now_ns >= until_ns:
-            return MotionStopped(device=self.limb.name, reason="its call reached its deadline; set a longer one")
+            return MotionStopped(device=self.limb.name, reason="its call reached its deadline; give it a longer one")
         return None
 
     def astray(self, sample: Sample) -> LimitExceeded | None:
@@ -187,7 +187,7 @@ class Move(Motion):
 
 
 class LineMove(Move):
-    """A move with an end, of the tool in a line."""
+    """A move of the tool along a line, to a goal."""
 
     def order(self, number: int) -> MoveLine:
         accel = self.limb.arm.max_accel_m_s2

@@ -37,7 +37,7 @@ class Opened:
     received: Callable[[Head, bytes], object]
     most: int = 0
     last: bytes | None = None
-    """Of a latched topic."""
+    """The last message of a latched topic."""
 
     def send(self, body: bytes) -> None:
         """Publish."""

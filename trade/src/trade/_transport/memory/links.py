@@ -82,7 +82,7 @@ class Way:
         self.drop()
 
     def send(self, kind: Kind, arrive: Arrive) -> None:
-        """Deliver a message after its delay, behind earlier messages of its lane; leaving goes behind all lanes."""
+        """Deliver a message after its delay, after earlier messages of its lane; LEAVE waits for all lanes."""
         if self.cut:
             if kind is not Kind.DROPPABLE:
                 self._held.append((kind, arrive))

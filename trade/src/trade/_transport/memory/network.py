@@ -253,7 +253,7 @@ class Network:
         """Drop selected messages in flight; both ends stay linked.
 
         Args:
-            which: decides before a message is sent whether it is lost. It may do what a tap may.
+            which: decides before a message is sent whether it is lost. The same restrictions apply as for a tap.
 
         Returns:
             A function that ends the loss.
