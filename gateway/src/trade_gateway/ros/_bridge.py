@@ -116,7 +116,7 @@ class Bridge:
 
     @service(effect="read")
     def bridged(self) -> Bridged:
-        """What is mapped, for which nodes, and what is not."""
+        """The mapped entries, the nodes that use them, and the entries that are not mapped."""
         offered = {one.where: one.groups for one in self._offered}
         return Bridged(self._following.opened(), offered, self._nodes.names(), self._following.problems())
 

@@ -26,7 +26,7 @@ _PORTS_TRIED: Final = 4
 
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
-    """Opens the transport; the stack gets what closes with the container."""
+    """Opens the transport, and adds to the stack what has to close with the container."""
     networks, certificate = _networks(settings.bridge), settings.certificate()
     transport = _join(settings, certificate, networks, leaving)
     try:

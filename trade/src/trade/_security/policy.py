@@ -33,7 +33,7 @@ class Role(Struct, frozen=True):
     rights: Mapping[str, Sequence[str]]
     """Verb to groups."""
     includes: Sequence[str] = ()
-    """Roles whose rights this one has, too; without cycles."""
+    """Roles whose rights this role includes; without cycles."""
 
 
 _Rights = dict[tuple[str, str], str]
