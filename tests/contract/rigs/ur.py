@@ -31,7 +31,7 @@ class UrRig(SafetyRig):
     says_absent = ("arm.toml: bus.ur.host",)
     readying = ("freedrive", True)
     lacks: ClassVar = {
-        "test_a_lost_answer_is_forgiven": "TCP repeats what is lost",
+        "test_a_lost_answer_is_forgiven": "TCP repeats lost packets",
         "test_S01_a_plain_call_waits_one_second_for_its_turn_at_most": "if no process reads the controller's states "
         "for a second, the connection ends, and the call with it",
         "test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why": "its processes are frozen apart: "

@@ -25,7 +25,7 @@ class Measure(Struct, frozen=True):
 
 
 class Timer:
-    """The durations and failures of one service. A list item is incremented in one step of Python's."""
+    """The durations and failures of one service. ``counts`` is a list, whose items Python increments atomically."""
 
     __slots__ = ("counts", "failures", "sum_ns")
 
