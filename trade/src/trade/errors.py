@@ -757,7 +757,7 @@ class NoContainerFound(SetupError, ConnectionError):
 
     system: str
     so: str = ""
-    """What is unknown therefore, and what to do."""
+    """The resulting uncertainty, and what to do."""
     others: bool = False
     """Whether another container was found."""
     silent: Sequence[str] = ()
