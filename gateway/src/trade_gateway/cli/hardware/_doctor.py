@@ -26,7 +26,7 @@ def doctor(
     context: typer.Context,
     robot_file: Annotated[
         Path | None,
-        typer.Argument(metavar="[ROBOT.toml]", help="Robot file whose lines and devices to check."),
+        typer.Argument(metavar="ROBOT.toml", help="Robot file whose lines and devices to check."),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -33,7 +33,9 @@ DriverName = Annotated[
 ]
 Baud = Annotated[
     int | None,
-    typer.Option(rich_help_panel=CONNECTION, help="Current rate of the device, in baud; by default searched for."),
+    typer.Option(
+        rich_help_panel=CONNECTION, metavar="BAUD", help="Current rate of the device, in baud; by default searched for."
+    ),
 ]
 Model = Annotated[str | None, typer.Option(rich_help_panel=SELECT, help="Refuse if the device is of another model.")]
 
@@ -103,7 +105,7 @@ def scan(
 
 def set_id(
     port: Port,
-    old: Annotated[int, typer.Option("--from", rich_help_panel=SELECT, help="Current id of the device.")],
+    old: Annotated[int, typer.Option("--from", help="Current id of the device.")],
     new: Annotated[int, typer.Option("--to", help="New id of the device.")],
     baud: Baud = None,
     driver: DriverName = None,
@@ -125,8 +127,8 @@ def set_id(
 
 def set_baud(
     port: Port,
-    device_id: Annotated[int, typer.Option("--id", rich_help_panel=SELECT, help="Id of the device.")],
-    to: Annotated[int, typer.Option(help="New rate, in baud.")],
+    device_id: Annotated[int, typer.Option("--id", help="Id of the device.")],
+    to: Annotated[int, typer.Option(metavar="BAUD", help="New rate, in baud.")],
     baud: Baud = None,
     driver: DriverName = None,
     model: Model = None,

@@ -18,11 +18,11 @@ from trade_gateway.cli._system_choice import choice_of, visitor
 def estop(
     context: typer.Context,
     ids: Annotated[
-        list[str] | None, typer.Argument(metavar="[ID]...", help="With --clear: e-stop ids; by default all.")
+        list[str] | None, typer.Argument(metavar="ID", help="With --clear: e-stop ids; by default all.")
     ] = None,
     reason: Annotated[str, typer.Option(help="Reason, shown to people.")] = "",
     clear: Annotated[bool, typer.Option("--clear", help="Clear open e-stops. This moves nothing.")] = False,
-    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Time limit, in seconds.")] = 3.0,
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="SECONDS", help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,
 ) -> None:
     """Stop the whole system at once. Nothing moves until the e-stop is cleared.

@@ -54,7 +54,12 @@ def lock(
     purpose: Annotated[str | None, typer.Option(help="Purpose, shown to other clients. Default: the command.")] = None,
     wait: Annotated[
         float,
-        typer.Option(min=0.0, rich_help_panel=TIMING, help="Time to wait for owners and missing services, in seconds."),
+        typer.Option(
+            min=0.0,
+            rich_help_panel=TIMING,
+            metavar="SECONDS",
+            help="Time to wait for owners and missing services, in seconds.",
+        ),
     ] = 10.0,
     lease: Annotated[
         float,
@@ -62,6 +67,7 @@ def lock(
             min=0.1,
             max=60.0,
             rich_help_panel=TIMING,
+            metavar="SECONDS",
             help="Time that the lock survives if this command dies, in seconds.",
         ),
     ] = 2.0,

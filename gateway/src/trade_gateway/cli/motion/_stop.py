@@ -16,7 +16,7 @@ def stop(
     context: typer.Context,
     group: Annotated[str, typer.Argument(metavar="GROUP", help="Group to stop, and the groups beneath it.")],
     reason: Annotated[str, typer.Option(help="Reason, for the audit record.")] = "",
-    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Time limit, in seconds.")] = 3.0,
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="SECONDS", help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,
 ) -> None:
     """Stop all motion in a group at once. This needs no lock.

@@ -27,7 +27,7 @@ def export(
     group: Annotated[
         list[str] | None, typer.Option(help="Export only these joints or this arm. Repeatable. Default: all.")
     ] = None,
-    fps: Annotated[int, typer.Option(min=1, max=1000, help="Frame rate, in Hz.")] = 30,
+    fps: Annotated[int, typer.Option(min=1, max=1000, metavar="HZ", help="Frame rate, in Hz.")] = 30,
     cut: Annotated[
         Cut, typer.Option("--episodes", help="whole: one episode; locks: one per lock of the joints.")
     ] = Cut.WHOLE,

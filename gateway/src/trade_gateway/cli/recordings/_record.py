@@ -24,24 +24,37 @@ def record(
     group: Groups = None,
     services: Readers = None,
     hz: Annotated[
-        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Highest rate of joint samples, in Hz.")
+        float,
+        typer.Option(
+            rich_help_panel=_RATES, min=0.001, max=1000.0, metavar="HZ", help="Highest rate of joint samples, in Hz."
+        ),
     ] = 50.0,
     camera_hz: Annotated[
-        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Highest rate of pictures, in Hz.")
+        float,
+        typer.Option(
+            rich_help_panel=_RATES, min=0.001, max=1000.0, metavar="HZ", help="Highest rate of pictures, in Hz."
+        ),
     ] = 5.0,
     service_hz: Annotated[
-        float, typer.Option(rich_help_panel=_RATES, min=0.001, max=1000.0, help="Rate of --services samples, in Hz.")
+        float,
+        typer.Option(
+            rich_help_panel=_RATES, min=0.001, max=1000.0, metavar="HZ", help="Rate of --services samples, in Hz."
+        ),
     ] = 10.0,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.1, rich_help_panel=TIMING, help="Duration, in seconds; by default until Ctrl-C."),
+        typer.Option(
+            min=0.1, rich_help_panel=TIMING, metavar="SECONDS", help="Duration, in seconds; by default until Ctrl-C."
+        ),
     ] = None,
     attach: Annotated[
         list[Path] | None, typer.Option(help="File to embed in the recording: rosie.toml. Repeatable.")
     ] = None,
     keep_last: Annotated[
         float | None,
-        typer.Option(rich_help_panel=_RING, min=1.0, max=3600.0, help="Time to keep in memory, in seconds."),
+        typer.Option(
+            rich_help_panel=_RING, min=1.0, max=3600.0, metavar="SECONDS", help="Time to keep in memory, in seconds."
+        ),
     ] = None,
     at_fault: Annotated[
         Path | None, typer.Option(rich_help_panel=_RING, metavar="FOLDER", help="Folder for a file at each fault.")

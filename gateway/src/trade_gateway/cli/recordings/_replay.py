@@ -32,7 +32,7 @@ def replay(
         bool, typer.Option("--go-to-start", help="First move slowly to the start of the recording.")
     ] = False,
     tolerance_rad: Annotated[
-        float, typer.Option(min=0.0, help="Largest deviation in rad; above it, the exit code is 1.")
+        float, typer.Option(min=0.0, metavar="RAD", help="Largest deviation in rad; above it, the exit code is 1.")
     ] = 0.1,
     as_json: Json = False,
 ) -> None:

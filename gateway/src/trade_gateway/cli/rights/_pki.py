@@ -30,7 +30,7 @@ Folder = Annotated[Path, typer.Option("--ca", help="Folder of the authority.")]
 
 
 @app.command()
-def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of the authority.")] = _DEFAULT) -> None:
+def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the authority.")] = _DEFAULT) -> None:
     """Create a certificate authority.
 
     Its ca.key can issue any identity of the system.

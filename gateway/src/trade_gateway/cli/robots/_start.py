@@ -27,7 +27,13 @@ def start(
     ] = None,
     wait: Annotated[
         float,
-        typer.Option(min=0.0, max=600.0, rich_help_panel=TIMING, help="Time until it must be visible, in seconds."),
+        typer.Option(
+            min=0.0,
+            max=600.0,
+            rich_help_panel=TIMING,
+            metavar="SECONDS",
+            help="Time until it must be visible, in seconds.",
+        ),
     ] = 10.0,
     as_json: Json = False,
 ) -> None:

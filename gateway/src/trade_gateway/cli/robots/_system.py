@@ -33,7 +33,10 @@ def up(
     check: Annotated[bool, typer.Option("--check", help="Check the file and its hosts, and exit.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="If one fails, keep those already started.")] = False,
     wait: Annotated[
-        float, typer.Option(min=0.1, max=600.0, help="Time limit for each container and object, in seconds.")
+        float,
+        typer.Option(
+            min=0.1, max=600.0, metavar="SECONDS", help="Time limit for each container and object, in seconds."
+        ),
     ] = 30.0,
     ssh_config: SshConfig = None,
     as_json: Json = False,

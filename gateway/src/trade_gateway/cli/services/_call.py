@@ -32,8 +32,12 @@ def call(
         list[str] | None,
         typer.Argument(help="Arguments as JSON, by position ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
     ] = None,
-    deadline: Annotated[float, typer.Option(min=0.001, help="Deadline of the call, in seconds.")] = 10.0,
-    wait: Annotated[float, typer.Option(min=0.0, help="Time to wait for the service to appear, in seconds.")] = 2.0,
+    deadline: Annotated[
+        float, typer.Option(min=0.001, metavar="SECONDS", help="Deadline of the call, in seconds.")
+    ] = 10.0,
+    wait: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="Time to wait for the service to appear, in seconds.")
+    ] = 2.0,
     container: Annotated[str | None, typer.Option(help="Call the service of this container.")] = None,
     as_json: Json = False,
 ) -> None:

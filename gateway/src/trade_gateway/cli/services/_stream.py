@@ -18,7 +18,8 @@ def stream(
     context: typer.Context,
     service: Annotated[str, typer.Argument(help="Group and name of a read-only service: rosie.head.state.")],
     hz: Annotated[
-        float, typer.Option(min=0.001, max=1000.0, rich_help_panel=TIMING, help="Highest sample rate, in Hz.")
+        float,
+        typer.Option(min=0.001, max=1000.0, rich_help_panel=TIMING, metavar="HZ", help="Highest sample rate, in Hz."),
     ] = 10.0,
     on_change: Annotated[
         bool, typer.Option("--on-change", rich_help_panel=OUTPUT, help="Print a sample only if it changed.")
@@ -28,7 +29,13 @@ def stream(
         typer.Option(min=1, rich_help_panel=OUTPUT, help="End after this many samples; by default at Ctrl-C."),
     ] = None,
     wait: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="Time to wait for the service to appear, in seconds.")
+        float,
+        typer.Option(
+            min=0.0,
+            rich_help_panel=TIMING,
+            metavar="SECONDS",
+            help="Time to wait for the service to appear, in seconds.",
+        ),
     ] = 2.0,
     container: Annotated[
         str | None, typer.Option(rich_help_panel=SELECT, help="Stream the service of this container.")

@@ -61,7 +61,7 @@ class Shown(Struct, frozen=True):
 
 def top(
     context: typer.Context,
-    every: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Interval, in seconds.")] = 2.0,
+    every: Annotated[float, typer.Option(min=1.0, max=3600.0, metavar="SECONDS", help="Interval, in seconds.")] = 2.0,
     count: Annotated[int | None, typer.Option(min=1, help="Number of refreshes; by default until Ctrl-C.")] = None,
     as_json: Json = False,
 ) -> None:
