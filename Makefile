@@ -18,7 +18,7 @@ MUTANT ?=
 MINIMISE ?=
 
 .PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation
-.PHONY: chaos chaos-locks chaos-robots siege
+.PHONY: chaos chaos-locks chaos-robots siege mutants
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
@@ -64,6 +64,9 @@ siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
+
+mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's; 20 min)
+	@$(RUN) pytest -m mutant -p tests.support.mutant_table -p no:tests.support.rerun tests tests/endurance/siege_mutants.py $(ARGS)
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
 	@$(RUN) --group fuzz python -m tests.endurance.fuzz --minutes $(MINUTES) $(ARGS)

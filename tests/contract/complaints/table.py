@@ -46,7 +46,9 @@ def complaint(
     table = [Row(*row) for row in rows]
     kinds = dict.fromkeys([*(row.kind for row in table), *also])
     runs = [pytest.param(kind, None, id=f"{kind}-the_product") for kind in kinds]
-    runs += [pytest.param(row.kind, row, id=f"{row.kind}-{row.mutant.__name__}") for row in table]
+    runs += [
+        pytest.param(row.kind, row, id=f"{row.kind}-{row.mutant.__name__}", marks=pytest.mark.mutant) for row in table
+    ]
 
     def decorate(check: Check) -> Check:
         @pytest.mark.parametrize(("kind", "row"), runs)

@@ -42,6 +42,7 @@ def test_locks_hold_under_fifty_faults_of_each_kind() -> None:
     assert min(count(kind) for kind in ("grant", "held", "command", "byte")) > 20  # it was about something
 
 
+@pytest.mark.mutant
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_broken_locks_are_found(mutant: str) -> None:
     """Within a few short runs: one alone may pass before the moment comes in which it shows."""
