@@ -43,7 +43,7 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) 
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
     expect(part(vera, "call-list")).to_contain_text("the right to read the system")
     expect(part(anna, "trace-calls")).to_be_disabled()  # she does not instrument the system
-    expect(part(chief, "call-list")).to_have_text("No call has been noted yet.")
+    expect(part(chief, "call-list")).to_have_text("No call has been traced yet.")
     part(chief, "trace-calls").click()
     expect(part(chief, "notice")).to_contain_text("Calls are traced in")
     card = anna.service(PAN, "move_to")

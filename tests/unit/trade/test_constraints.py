@@ -365,8 +365,11 @@ def test_host_container_and_local_select_in_a_system(here: Container, there: Con
 @pytest.mark.parametrize(
     ("asked", "remedy"),
     [
-        ({"group": "x*"}, "one selects all beneath it, as rosie does"),
-        ({"group": "rosie.*"}, "whole dotted segments, and one selects all beneath it; write group='rosie'"),
+        ({"group": "x*"}, "each name includes everything beneath it, as rosie does"),
+        (
+            {"group": "rosie.*"},
+            "each name includes everything beneath it; write group='rosie'",
+        ),
         ({"group": "rosie.neck.p?n"}, "write group='rosie.neck'"),
         ({"uses": "rosie.left*"}, "write uses='rosie'"),
         ({"group": "rosie."}, "is no group; use words joined by dots"),
