@@ -52,7 +52,7 @@ def succeed(_: object) -> None:
     print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
 
 
-def test_a_part_that_fails_twice_is_told_and_the_others_go_on(
+def test_a_part_that_fails_twice_is_reported_and_the_others_continue(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(_: object) -> None:
@@ -68,7 +68,7 @@ def test_a_part_that_fails_twice_is_told_and_the_others_go_on(
     assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
 
 
-def test_a_part_that_fails_once_is_measured_anew(tmp_path: Path) -> None:
+def test_a_part_that_fails_once_is_measured_again(tmp_path: Path) -> None:
     attempts = iter((True, False))
 
     def fail_first(_: object) -> None:

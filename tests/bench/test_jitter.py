@@ -79,7 +79,7 @@ def test_a_bus_is_measured_in_each_case_and_so_is_a_loop_with_nothing_in_it(
     assert capsys.readouterr().out.count("quiet  ") >= 1
 
 
-def test_without_leave_of_the_system_no_case_is_in_real_time_and_the_reason_is_told(
+def test_no_case_runs_in_real_time_without_permission_and_the_reason_is_shown(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -114,7 +114,7 @@ def test_what_is_off_is_the_time_between_two_cycles_less_the_period() -> None:
         off_us([1.0], 100)
 
 
-def test_one_late_cycle_of_a_thousand_is_told_and_a_period_that_is_not_kept_shows_in_the_mean() -> None:
+def test_the_spread_shows_one_late_cycle_in_a_thousand_and_the_mean_shows_a_missed_period() -> None:
     assert spread_of([0.0] * 999 + [700.0]) == {
         **dict.fromkeys(("p50", "p95", "p99"), 0.0),
         **dict.fromkeys(("p99.9", "most"), 700.0),

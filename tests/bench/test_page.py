@@ -135,7 +135,7 @@ def test_the_command_writes_the_page_and_names_what_is_missed_without_a_reason(
     ]
 
 
-def test_parts_that_are_measured_anew_take_the_place_of_those_before_and_the_page_says_so() -> None:
+def test_parts_measured_again_replace_the_earlier_ones_and_the_page_says_so() -> None:
     anew = a_run(
         commit="fedcba",
         arguments=["can", "servo"],

@@ -141,7 +141,7 @@ def run(shared: SafetyRig, planner: Container) -> Any:
 
 
 @pytest.mark.usefixtures("run")
-def test_S05_a_motion_ends_with_its_session_whoever_else_used_the_device_meanwhile(
+def test_S05_a_motion_ends_with_its_session_despite_use_by_another_client(
     shared: SafetyRig, planner: Container, operator: Container
 ) -> None:
     shared.asked(operator, shared.harmless)

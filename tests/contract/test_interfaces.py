@@ -117,7 +117,7 @@ def hil(file: Path, sim: SimProcess, *words: str, says: str = "") -> "subprocess
 
 def test_the_contracts_run_on_every_joint_and_group_of_a_robot_file(system: str, head_file: Path) -> None:
     with SimProcess(head_file, paced=False) as sim:
-        ended = hil(head_file, sim, "--yes", "-k", "state_tells or order_of or enable_holds")
+        ended = hil(head_file, sim, "--yes", "-k", "state_is_the_truth or order_of or enable_holds")
         assert ended.returncode == 0, ended.stdout + ended.stderr
         for device in ("rosie.neck.pan", "rosie.neck.tilt", "rosie.head"):
             assert f"[{device}] PASSED" in ended.stdout
@@ -137,16 +137,16 @@ def test_grippers_are_opened_and_closed_only_after_a_word_of_their_own(system: s
         assert ended.stdout.count("[rosie.left.hand] PASSED") == 2
 
 
-def test_a_contract_that_is_broken_is_told_of(system: str, head_file: Path) -> None:
+def test_a_broken_contract_is_reported(system: str, head_file: Path) -> None:
     head_file.write_text(HEAD.replace("min_rad = -1.4", "min_rad = 0.2"))  # it is found outside of its range
     with SimProcess(head_file, paced=False) as sim:
-        ended = hil(head_file, sim, "--yes", "-k", "state_tells")
+        ended = hil(head_file, sim, "--yes", "-k", "state_is_the_truth")
         assert ended.returncode == 1
         assert "[rosie.neck.pan] FAILED" in ended.stdout
 
 
 @pytest.mark.parametrize("answer", ["", "no\n", "y\n"])
-def test_nothing_moves_unless_somebody_says_yes(system: str, head_file: Path, answer: str) -> None:
+def test_nothing_moves_without_confirmation(system: str, head_file: Path, answer: str) -> None:
     with SimProcess(head_file, paced=False) as sim:
         ended = hil(head_file, sim, says=answer)
         assert ended.returncode == 2

@@ -143,7 +143,7 @@ def test_S06_an_unhealthy_process_holds_once_and_falls_silent(rig: SafetyRig, ho
     assert not rig.heard(since)
 
 
-def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
+def test_S06_a_defect_in_the_bus_thread_silences_the_bus_and_raises_for_every_caller(
     rig: SafetyRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig.attach()

@@ -47,7 +47,7 @@ NOT_TYPED: Final = {
 }
 
 
-def test_every_line_is_typed_or_it_is_said_who_types_it_or_why_nobody_does() -> None:
+def test_every_command_line_is_typed_by_a_test_or_listed_with_the_reason() -> None:
     found = sections((DOCS / page for page in PAGES), "sh")
     assert found == said(globals()) | TYPED_ELSEWHERE.keys() | NOT_TYPED.keys()
     assert not [name for names in TYPED_ELSEWHERE.values() for name in names if not (ROOT / "tests" / name).exists()]

@@ -168,7 +168,7 @@ class Knowledge:
 
 
 @of(PAGE, "Notifications")
-def test_be_told(play: Play, printed: Said) -> None:
+def test_notifications_arrive_for_services_health_and_time(play: Play, printed: Said) -> None:
     listener, eye = Listener(), Eye()
     play.offer("library", Knowledge(), "library")
     play.offer("mind", listener, "mind")

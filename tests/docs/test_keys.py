@@ -25,7 +25,7 @@ RECORDS: Final[dict[str, type[Struct]]] = {
 
 
 @pytest.mark.parametrize("table", RECORDS)
-def test_each_key_is_told_with_its_default_and_range(table: str) -> None:
+def test_each_key_is_shown_with_its_default_and_range(table: str) -> None:
     assert shown()[table] == dict(keys(RECORDS[table]))
 
 

@@ -100,7 +100,7 @@ def test_the_main_rules_run_on_socketcan_too() -> None:
 def test_a_test_of_one_wire_is_none_of_another() -> None:
     on_can = {shown.name for shown in TESTS if "CiA 402" in shown.wires}
     assert "test_S22_one_value_outside_refuses_the_whole_group" not in on_can
-    assert "test_S18_a_drive_found_moving_and_owned_by_nobody_is_stopped_and_left_enabled" in on_can
+    assert "test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled" in on_can
 
 
 def test_tests_without_a_number_exist() -> None:

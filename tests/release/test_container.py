@@ -30,7 +30,7 @@ def copied() -> list[str]:
     return [source for rest in words if not rest[0].startswith("--from") for source in rest[:-1]]
 
 
-def test_what_it_takes_is_there_and_not_ignored() -> None:
+def test_the_files_that_the_containerfile_copies_exist_and_are_not_ignored() -> None:
     lines = (ROOT / ".containerignore").read_text(encoding="utf-8").splitlines()
     let_in = {line.removeprefix("!") for line in lines if line.startswith("!")}
     assert "*" in lines

@@ -63,7 +63,7 @@ def _run(tmp_path: Path, body: str, times: int = 1, options: tuple[str, ...] = (
         "it was away; remove the cause",
     ],
 )
-def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path, said: str) -> None:
+def test_a_test_that_is_late_once_reruns_and_is_reported(tmp_path: Path, said: str) -> None:
     code, told = _run(tmp_path, f"assert not first, 'its driver {said}'")
     assert code == 0, told
     assert "ran twice: 1" in told
@@ -95,7 +95,7 @@ def test_what_is_late_twice_has_failed(tmp_path: Path) -> None:
     assert "1 failed" in said
 
 
-def test_what_a_module_shares_is_made_anew_if_it_was_late(tmp_path: Path) -> None:
+def test_a_late_module_fixture_is_set_up_again(tmp_path: Path) -> None:
     (tmp_path / "test_shared.py").write_text(
         "import pytest\n"
         "made = []\n"

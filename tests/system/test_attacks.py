@@ -116,7 +116,7 @@ def test_who_may_not_administer_switches_nothing_of_others(attack: Attack) -> No
         attack.chief.ask("call", name, "trade", "arm", argument)
 
 
-def test_everybody_stops_everything_and_who_may_not_clears_nothing(attack: Attack) -> None:
+def test_any_client_can_estop_and_an_unauthorized_one_cannot_clear_it(attack: Attack) -> None:
     stopped = attack.dash.ask("estop")
     attack.dash.ask("estop_clear", stopped)
     assert attack.arm.ask("estops") == [stopped]
@@ -127,7 +127,7 @@ def test_everybody_stops_everything_and_who_may_not_clears_nothing(attack: Attac
     attack.planner.ask("move", ARM, "1")
 
 
-def test_who_may_not_offer_is_seen_by_nobody(attack: Attack) -> None:
+def test_services_of_a_container_without_the_right_to_offer_are_invisible(attack: Attack) -> None:
     attack.dash.ask("register_one", "rosie.leg")
     attack.dash.ask("register_one", "lab.dash")
     for reader in (attack.arm, attack.planner):
@@ -171,7 +171,7 @@ def test_a_notification_elsewhere_may_what_who_asked_for_it_may(attack: Attack) 
     assert attack.chief.ask("once_at", "planner", "echo", ARM, "4") == "done"
 
 
-def test_a_nested_call_may_what_its_container_may_whoever_asked_for_it(attack: Attack) -> None:
+def test_a_nested_call_has_the_rights_of_its_container_and_not_of_the_first_caller(attack: Attack) -> None:
     attack.dash.ask("register_relay", "lab.dash.relay", ARM)
     attack.planner.ask("register_relay", "lab.planner.relay", ARM)
     before = attack.moved()
@@ -261,7 +261,7 @@ def test_an_answer_comes_from_who_was_asked_and_is_heard_by_who_asked(
     assert not any("/planner/" in key for key, _ in attack.intruder.ask("heard", as_dash))
 
 
-def test_an_answer_cannot_be_sent_to_somebody_else(attack: Attack, as_dash: str) -> None:
+def test_a_reply_cannot_be_sent_to_another_client(attack: Attack, as_dash: str) -> None:
     """The channel that a call names is one of its caller's own."""
     attack.planner.ask("started", "nap", ARM, "0.5")
     channel, _ = attack.planner.ask("waits")

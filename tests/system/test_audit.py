@@ -87,7 +87,7 @@ def test_who_called_locked_stopped_and_was_refused_and_why(
     assert (estop["session"], estop["why"]) == (str(berta.address), "the door")
 
 
-def test_a_robot_that_is_killed_leaves_a_record_that_verifies_and_goes_on_with_the_next_boot(
+def test_a_killed_robot_leaves_a_verifiable_audit_record_that_the_next_boot_continues(
     rosie: Rosie,
     rosie_up: Callable[[], Rosie],
     start_container: Callable[..., Container],

@@ -118,7 +118,7 @@ def test_when_a_bridge_dies_neighbours_work_on_and_the_far_come_back_with_the_ne
         assert left[0].ask("use") == 3
 
 
-def test_containers_on_the_bridges_own_host_take_part_whoever_came_first(
+def test_containers_on_the_host_of_the_bridge_take_part_in_any_start_order(
     member: StartMember, two_networks: None
 ) -> None:
     early = up(member("between", "early"))
@@ -202,7 +202,11 @@ def test_of_two_bridges_side_by_side_one_may_die_and_no_call_runs_twice(
     ("bridge", "listen", "problem"),
     [
         ("net1,net9", BRIDGE, "bridge net9: this host has no such interface, or not yet; it has .*net1, net2"),
-        ("net1,net2", "10.231.1.1:7450", "bridge net2: nothing listens on it, only on tcp/10.231.1.1:7450; let TRADE_"),
+        (
+            "net1,net2",
+            "10.231.1.1:7450",
+            "bridge net2: nothing listens on it, only on tcp/10.231.1.1:7450; add an address of net2 to TRADE_",
+        ),
         ("net1,net2", "", r"bridge net1: nothing listens on it, only on tcp/127.0.0.1:\d+; add an address of"),
         ("net1", BRIDGE, "bridge net1: joins networks, and this is only one; name a second interface, or connect"),
     ],
@@ -222,7 +226,7 @@ def test_a_bridge_may_listen_on_all_networks_of_its_host(member: StartMember, tw
     all_work_together([bridge, left, right])
 
 
-def test_on_one_network_everybody_is_linked_to_everybody(networks: Networks, member: StartMember) -> None:
+def test_all_containers_on_one_network_are_linked_to_each_other(networks: Networks, member: StartMember) -> None:
     networks.lay("net", left="10.231.1.1", right="10.231.1.2")
     # Two of them can dial, but not be dialled.
     members = [

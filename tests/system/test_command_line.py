@@ -133,7 +133,7 @@ def test_tables_in_a_pipe_are_whole_lines(rosie_up, trade_command: Command) -> N
     assert "move_to(positions_rad: list[float], speed_rad_s: float (> 0) | None = None) -> list[float]  act" in moves[0]
 
 
-def test_a_group_nobody_is_in_is_answered_with_those_there_are(rosie_up, trade_command: Command) -> None:
+def test_an_unknown_group_is_answered_with_the_known_groups(rosie_up, trade_command: Command) -> None:
     rosie_up()
     said = trade_command("services", "--group", "roise").stdout
     assert (
@@ -141,7 +141,7 @@ def test_a_group_nobody_is_in_is_answered_with_those_there_are(rosie_up, trade_c
     )
 
 
-def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_command: Command) -> None:
+def test_faults_that_latch_and_heal_are_reported_with_their_remedy(rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
     assert trade_command("call", "rosie.neck.pan.enable").returncode == 0
     with SimControl(rosie.ready["control"]) as control:
@@ -153,7 +153,7 @@ def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_com
     assert rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan")["fault"] == ""
 
 
-def test_S19_silence_is_told_once_and_with_its_time_and_who_was_not_seen_at_rest_is_named(rosie_up) -> None:
+def test_S19_silence_is_reported_once_with_its_time_and_joints_not_seen_at_rest_are_named(rosie_up) -> None:
     rosie = rosie_up()
     with SimControl(rosie.ready["control"]) as control:
         control.mute([1, 2])
@@ -165,7 +165,7 @@ def test_S19_silence_is_told_once_and_with_its_time_and_who_was_not_seen_at_rest
     assert said == ["warning: shut down without confirmation that these are at rest: rosie.neck.pan, rosie.neck.tilt\n"]
 
 
-def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(system: str, run, tmp_path) -> None:
+def test_a_watchdog_that_expired_under_an_earlier_driver_is_reported_at_attach(system: str, run, tmp_path) -> None:
     with SimProcess(ROSIES_HEAD) as sim:
         robot_file = tmp_path / "rosie.toml"
         text = ROSIES_HEAD.read_text(encoding="utf-8")

@@ -42,7 +42,7 @@ def function(name: str, container: str) -> Any:
     return trade.find(where(name=name, group="trade", container=container), wait_s=30)
 
 
-def test_an_empty_container_takes_providers_and_its_process_ends_when_it_is_told_to(run, vision: Path) -> None:
+def test_an_empty_container_takes_providers_and_its_process_ends_on_request(run, vision: Path) -> None:
     eyes = run("-m", "trade_gateway", "container", "--name", "eyes", "--allow", "sight.*", "--json")
     ready = eyes.json()
     assert (ready["container"], ready["instantiable"]) == ("eyes", ["sight.*"])

@@ -95,7 +95,7 @@ def test_what_is_not_exported_is_neither_seen_nor_called_and_comes_with_the_expo
     assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
 
 
-def test_who_may_not_call_is_refused_by_himself_by_the_callee_and_by_the_gateway(
+def test_an_unauthorized_call_is_refused_by_the_caller_the_callee_and_the_gateway(
     site: Site, arm: Member, planner: Member
 ) -> None:
     planner.ask("move", "rosie.arm", "1")
@@ -157,9 +157,7 @@ def test_a_file_with_its_interfaces_swapped_starts_nothing(site: Site) -> None:
         assert "network.private.listen: tls/10.231.1.1:7450 is an address of net1 on this host" in ended.stderr
 
 
-def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(
-    site: Site, arm: Member, planner: Member
-) -> None:
+def test_S12_a_gateway_that_reloads_loses_no_client_call_or_lock(site: Site, arm: Member, planner: Member) -> None:
     arm.ask("register_one", "rosie.arm.p0")
     planner.ask("group", "rosie.arm.p0", "arm")
     planner.ask("watch")

@@ -107,7 +107,7 @@ def move(joint: str = "pan") -> float:
     return trade.find(where(name="move_to", group=f"rosie.neck.{joint}"), wait_s=30).with_(deadline_s=30)(0.05)
 
 
-def test_a_program_under_a_lock_moves_and_nobody_else_does(locked, trade_command: Command) -> None:
+def test_a_program_that_holds_a_lock_moves_and_other_callers_are_refused(locked, trade_command: Command) -> None:
     program = locked(MOVES, "rosie.neck.pan", "--purpose", "look around")
     assert program.line() == "moved 0.1"
     with pytest.raises(LockedByOther, match="look around"):
@@ -204,7 +204,7 @@ def test_wrong_words_are_answered_in_one_line(
 
 
 @pytest.mark.parametrize("words", [["services"], ["containers"], ["locks"], ["resume", "rosie"], ["faults"]], ids=str)
-def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
+def test_a_listing_without_containers_is_empty_and_names_the_silent_endpoint(
     trade_command: Command, nobody_there: str, words: list[str]
 ) -> None:
     said = trade_command("--connect", nobody_there, *words)
@@ -213,7 +213,7 @@ def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
     assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
 
 
-def test_a_call_of_nobody_says_where_nobody_answers(trade_command: Command, nobody_there: str) -> None:
+def test_a_call_without_containers_names_the_silent_endpoint(trade_command: Command, nobody_there: str) -> None:
     said = trade_command("--connect", nobody_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
     assert said.returncode == 1
     assert said.stderr.startswith("NoSuchService: no service matches")
@@ -229,7 +229,7 @@ def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], tra
         assert "Did you mean rosie.neck" in said.stderr
 
 
-def test_where_there_is_a_link_and_nobody_it_may_be_another_system(
+def test_a_link_without_containers_is_reported_as_a_possible_other_system(
     trade_command: Command, start_container: Callable[..., Container]
 ) -> None:
     door = start_container("door", listen=[free_endpoint()])
@@ -285,13 +285,15 @@ def test_S09_a_robot_that_comes_up_with_one_open_says_so_and_how_it_is_cleared(
     assert up.line() == f"when it is safe: trade estop --clear {opened.id}\n"
 
 
-def test_S09_who_finds_nobody_cannot_tell_whether_an_estop_is_open(trade_command: Command) -> None:
+def test_S09_an_estop_clear_without_containers_reports_the_estop_state_as_unknown(trade_command: Command) -> None:
     said = trade_command("estop", "--clear", "--limit", "0.2", "--json")
     assert (said.returncode, said.stdout) == (1, "")
     assert "so it is unknown whether an e-stop is open; none was cleared" in said.stderr
 
 
-def test_S09_who_finds_nobody_where_it_is_to_connect_says_where(trade_command: Command, nobody_there: str) -> None:
+def test_S09_an_estop_clear_without_containers_names_the_silent_endpoint(
+    trade_command: Command, nobody_there: str
+) -> None:
     said = trade_command("--connect", nobody_there, "estop", "--clear", "--limit", "0.2")
     assert (said.returncode, said.stdout) == (1, "")
     assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
@@ -309,7 +311,7 @@ def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Comm
     assert re.search(f"rosie did not answer; .*it is unknown|{may_seem_gone}", said.stderr)
 
 
-def test_S09_what_was_found_is_stopped_and_cleared_and_what_is_missing_is_told(
+def test_S09_an_estop_reaches_the_containers_found_and_names_the_silent_endpoint(
     rosie_up, trade_command: Command, start_container: Callable[..., Container], nobody_there: str
 ) -> None:
     door = start_container("door", listen=[free_endpoint()])
@@ -328,7 +330,7 @@ def test_S09_what_was_found_is_stopped_and_cleared_and_what_is_missing_is_told(
     assert move() == pytest.approx(0.05, abs=0.02)
 
 
-def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_up, trade_command: Command) -> None:
+def test_S09_an_estop_that_misses_a_container_or_finds_none_fails(rosie_up, trade_command: Command) -> None:
     nobody = trade_command("estop", "--limit", "0.2")
     assert nobody.returncode == 1
     assert "no container was found" in nobody.stdout
@@ -343,7 +345,7 @@ def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_u
     assert missed.returncode == 1
 
 
-def test_S08_what_somebody_else_stopped_moves_again_after_resume(
+def test_S08_a_device_stopped_by_another_client_moves_again_after_resume(
     rosie_up, trade_command: Command, start_container: Callable[..., Container]
 ) -> None:
     rosie_up()

@@ -124,7 +124,7 @@ STAGES: dict[str, list[str]] = {
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_whoever_is_killed_at_whatever_stage_it_is_alive_once_at_most(
+def test_a_provider_is_alive_at_most_once_when_a_process_is_killed_at_any_stage(
     two: dict[str, Any], folder: Path, stage: str
 ) -> None:
     pids = {name: program.process.pid for name, program in two.items()}
@@ -147,7 +147,7 @@ def test_whoever_is_killed_at_whatever_stage_it_is_alive_once_at_most(
 
 @pytest.mark.parametrize("who", ["source", "target"])
 @pytest.mark.parametrize("delay_s", [0.002, 0.004, 0.008, 0.016])
-def test_whoever_is_killed_about_when_it_changes_hands_it_is_alive_once_at_most(
+def test_a_provider_is_alive_at_most_once_when_a_process_is_killed_near_the_handover(
     two: dict[str, Any], folder: Path, who: str, delay_s: float
 ) -> None:
     pids = {name: program.process.pid for name, program in two.items()}

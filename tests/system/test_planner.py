@@ -12,7 +12,7 @@ from trade._transport.endpoints import free_endpoint
 PLANNER = Path(__file__).parents[2] / "examples" / "planner.py"
 
 
-def test_a_planner_that_cannot_see_finds_somebody_who_can(
+def test_a_planner_without_a_camera_finds_a_provider_that_can_see(
     run: Callable[..., Program], monkeypatch: pytest.MonkeyPatch, start_container: Callable[..., Container]
 ) -> None:
     arm = run(PLANNER, "arm")

@@ -123,7 +123,7 @@ def test_what_the_robot_file_forbids_is_refused_before_anything_moves(
     assert motion_writes(read_log(log)) == []
 
 
-def test_a_robot_that_is_elsewhere_moves_only_if_it_is_told_to_go_to_the_start(
+def test_a_replay_far_from_its_start_moves_only_with_go_to_start(
     recorded: tuple[Path, Path],
     rosie_up: Callable[[], Rosie],
     trade_command: Callable[..., subprocess.CompletedProcess[str]],
@@ -247,7 +247,7 @@ def test_a_viewer_sees_live_what_a_recording_would_have(
     assert showing.errors == []
 
 
-def test_beyond_this_host_the_live_view_warns_that_everybody_can_look_on(
+def test_a_live_view_that_other_hosts_can_reach_prints_a_warning(
     run: Callable[..., Program],
 ) -> None:
     showing = run("-m", "trade_gateway", "foxglove", "--host", "127.1", "--port", "0", "--json")

@@ -220,7 +220,7 @@ def _pan(name: str) -> Handle:
 
 
 @known
-def test_S03_what_a_node_moves_stops_when_it_is_killed_and_goes_on_with_the_next_one(bridged: Bridged) -> None:
+def test_S03_the_motion_of_a_killed_node_stops_and_the_next_node_moves_again(bridged: Bridged) -> None:
     node = bridged.ros.node("teleop")
     node.repeat("/pan", FAR_RAD, 10)
     bridged.begun()
@@ -263,7 +263,7 @@ def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_wi
 
 
 @unknown
-def test_S03_what_a_node_that_nobody_knows_moves_stops_with_its_silence(bridged: Bridged) -> None:
+def test_S03_the_motion_of_an_unidentified_node_stops_when_the_node_falls_silent(bridged: Bridged) -> None:
     node = bridged.ros.node("teleop")
     node.repeat("/pan_by_hand", FAR_RAD, 20)
     bridged.begun()
@@ -280,7 +280,7 @@ def test_S03_what_a_node_that_nobody_knows_moves_stops_with_its_silence(bridged:
 
 
 @known
-def test_a_lock_of_ours_holds_against_ros_and_one_of_theirs_against_us(bridged: Bridged) -> None:
+def test_a_local_lock_holds_against_ros_and_a_ros_lock_against_local_callers(bridged: Bridged) -> None:
     move = _pan("move_to")
     node = bridged.ros.node("teleop")
     locked_at = time.monotonic()

@@ -91,7 +91,7 @@ class Service:
         self.process.wait(60)
 
 
-def test_a_gateway_tells_when_it_is_up_reads_its_file_and_leaves(
+def test_a_gateway_notifies_the_service_manager_reloads_its_file_and_shuts_down(
     manager: socket.socket, file: Path, system: str
 ) -> None:
     service = Service(manager, "gateway", str(file))
@@ -127,7 +127,7 @@ def test_what_a_gateway_looks_after_does_not_speak_for_it(manager: socket.socket
         service.end()
 
 
-def test_a_robot_tells_when_it_is_up_and_leaves(manager: socket.socket, system: str) -> None:
+def test_a_robot_notifies_the_service_manager_and_shuts_down(manager: socket.socket, system: str) -> None:
     service = Service(manager, "up", str(ROOT / "examples" / "head.toml"), "--sim")
     try:
         assert service.tells()["READY"] == "1"

@@ -190,7 +190,7 @@ def test_the_judge_knows_what_is_wrong(records: tuple[Any, ...], entries: list[E
         assert found == []
 
 
-def test_motions_are_read_from_what_devices_did_and_were_told() -> None:
+def test_motions_are_derived_from_commands_and_device_events() -> None:
     entries = [told(0.5, 2100, 2048), begun(1, 2500), told(2, 2300, 2290, STOP), told(2.1, 1500, 2301), rest(3)]
     [one, two] = motions_of([*entries, told(4, 2000, 1500)])["pan"]  # its torque is off, or whatever: it stayed
     assert one == (1, 2500, 2048, 2.1, True, False)
@@ -233,7 +233,7 @@ def test_who_comes_to_rest_before_it_has_read_its_next_goal_sets_off_once_for_th
     assert [motion.t for motion in again] == [2, 3.1, 6]  # it had done what it was told
 
 
-def test_motions_of_a_drive_are_read_from_what_it_did_and_was_told() -> None:
+def test_motions_of_a_drive_are_derived_from_its_commands_and_events() -> None:
     [one, two, three] = motions_of(
         [
             commanded(1, 0x3F, 452, 0),

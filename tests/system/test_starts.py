@@ -63,7 +63,7 @@ def test_of_two_of_one_name_the_second_is_not_started(sshd: Sshd) -> None:
         assert refused.value.reason == "it did not come up"
 
 
-def test_what_does_not_come_into_the_system_is_told_with_its_process(sshd: Sshd) -> None:
+def test_a_container_that_does_not_join_the_system_is_reported_with_its_process(sshd: Sshd) -> None:
     with pytest.raises(CannotStart) as refused:
         trade.system.start_container(
             "robot",
@@ -118,7 +118,7 @@ def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.Mo
         assert refused(sshd).reason == "timeout"
 
 
-def test_a_host_that_says_nothing_is_told_of_before_the_deadline_of_the_call(
+def test_an_unresponsive_host_is_reported_before_the_deadline_of_the_call(
     sshd: Sshd, start_container: Callable[[str], trade.Container]
 ) -> None:
     """By default the call has as long as ssh waits for a link."""

@@ -158,7 +158,7 @@ def test_P70_a_child_that_is_killed_is_back_with_its_state(keeping: Callable[...
     assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.1 s", f"a is back, process {again.pid}"]
 
 
-def test_what_was_before_the_last_save_that_is_told_comes_back(keeping: Callable[..., Keeping]) -> None:
+def test_a_restarted_child_resumes_from_its_last_reported_save(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(f"[container.a]\nsave_every_s = 1\n{COUNTER}")
     first = kept.become("a", "up")
     call("count")
@@ -183,7 +183,7 @@ def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., K
     ]
 
 
-def test_a_child_that_ignores_being_told_to_leave_is_killed(keeping: Callable[..., Keeping]) -> None:
+def test_a_child_that_ignores_the_shutdown_request_is_killed(keeping: Callable[..., Keeping]) -> None:
     kept = keeping('[container.a]\nallow = ["tiny:*"]\nproviders = []\n', grace_s=0.5)
     stays = kept.become("a", "up")
     os.kill(stays.pid, signal.SIGSTOP)
@@ -219,7 +219,7 @@ def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_agai
         (f'robot = "{ROSIES_HEAD}"', "ended (exit code 1: ConfigurationError: "),
     ],
 )
-def test_a_child_that_fails_for_ever_is_given_up_with_its_reason_and_comes_by_hand(
+def test_a_child_that_always_fails_is_given_up_with_its_reason_until_its_file_changes(
     keeping: Callable[..., Keeping], wanted: str, why: str
 ) -> None:
     kept = keeping(f"[container.a]\nrestarts = 2\n{wanted}\n")
@@ -319,7 +319,7 @@ def children() -> list[Any]:
     return trade.find(where(name="children"), wait_s=30)()
 
 
-def test_a_gateway_tells_of_its_children_and_starts_one_again_for_who_asks(
+def test_a_gateway_lists_its_children_and_restarts_one_on_request(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
     there = start_gateway(f"[container.a]\n{COUNTER}")
@@ -375,7 +375,7 @@ def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
         assert not writes(sim.entries(), register=register, since=killed_at)
 
 
-def test_P70_a_gateway_that_is_stopped_leaves_nobody_behind_and_all_is_known_when_it_is_back(
+def test_P70_a_stopped_gateway_leaves_no_process_and_restores_its_state_after_a_restart(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
     there = start_gateway(f"[container.a]\n{COUNTER}")

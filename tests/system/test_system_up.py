@@ -130,7 +130,7 @@ def test_what_fails_says_why_and_what_was_begun_is_taken_down_again(home: Deploy
     wait_until(home.gone)
 
 
-def test_a_container_that_does_not_come_up_is_told_with_the_end_of_its_log(home: Deployment) -> None:
+def test_a_container_that_does_not_start_is_reported_with_the_end_of_its_log(home: Deployment) -> None:
     home.change("sim = true\n", 'after = ["lamps"]\n')
     home.change('after = ["rosie"]\n', "")
     told, ended = home.say("up", "--keep")
@@ -163,7 +163,7 @@ def test_what_is_in_use_is_not_ended_unless_by_force(home: Deployment) -> None:
         ),
     ],
 )
-def test_a_host_that_lacks_something_is_told_before_anything_starts(
+def test_a_host_with_a_missing_requirement_is_reported_before_anything_starts(
     home: Deployment, before: str, after: str, said: str
 ) -> None:
     home.change(before, after)

@@ -179,7 +179,7 @@ def test_ctrl_c_ends_it_and_the_follower_holds(pair: Pair) -> None:
     assert pair.sim.control.device("follower.shoulder.pan").torque
 
 
-def test_who_takes_the_lock_away_has_a_follower_that_stands_and_obeys(pair: Pair) -> None:
+def test_a_follower_whose_lock_is_broken_halts_and_obeys_other_clients(pair: Pair) -> None:
     program = following(pair)
     trade.find(where(name="move_to", group="pair.follower", kind="JointGroup"), wait_s=PATIENCE_S)
     trade.break_lock(where(group="pair.follower"), reason="somebody is in the way")

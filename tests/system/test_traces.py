@@ -112,7 +112,7 @@ def test_the_commands_show_the_tree_and_the_lines_in_it(looked: Container) -> No
     )
 
 
-def test_what_is_not_as_it_was_learned_is_told(looked: Container, tmp_path: Path) -> None:
+def test_a_call_that_deviates_from_the_learned_profile_is_reported(looked: Container, tmp_path: Path) -> None:
     [look] = [row for row in json.loads(_says("profile", "--json")) if row["service"] == "mind.look"]
     assert (look["calls"], look["errors"]) == (1, 0)
     learned = tmp_path / "usual.json"

@@ -201,9 +201,7 @@ def unwell(stand: Stand, name: str, since: float, until: float) -> list[str]:
 
 
 @pytest.mark.parametrize("first", ["gateway", "driver"])
-def test_a_system_goes_to_another_version_and_back_while_what_is_not_concerned_goes_on(
-    stand: Stand, first: str
-) -> None:
+def test_a_system_changes_version_and_back_while_unaffected_parts_keep_running(stand: Stand, first: str) -> None:
     stand.behave("near", NOW, ["dora"])
     stand.behave("wide", NOW, ["rosie", "dora"])
     stand.behave("far", NOW, ["dora"])

@@ -34,7 +34,9 @@ def hall(start_container: StartContainer) -> Container:
     return hall
 
 
-def test_what_happens_is_told_in_its_words(hall: Container, run: Run, start_container: StartContainer) -> None:
+def test_watch_prints_each_kind_of_event_with_its_own_name(
+    hall: Container, run: Run, start_container: StartContainer
+) -> None:
     me = start_container("me")
     with me.lock(where(group="hall.lamp"), purpose="reading", wait_s=30):
         watching = run("-m", "trade_gateway", "watch", "--json")
@@ -62,7 +64,7 @@ def test_what_happens_is_told_in_its_words(hall: Container, run: Run, start_cont
     assert watching.wait() == 130
 
 
-def test_only_what_is_asked_for_is_told_and_much_at_once_is_one_line(
+def test_watch_prints_only_the_requested_group_and_sums_up_a_burst_in_one_line(
     hall: Container, run: Run, start_container: StartContainer
 ) -> None:
     watching = run("-m", "trade_gateway", "watch", "--group", "hall.row")

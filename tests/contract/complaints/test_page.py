@@ -29,7 +29,7 @@ def names(cell: str) -> list[str]:
     return re.findall(r"`(\w+)`", cell)
 
 
-def test_there_are_fifteen_complaints_each_of_somebody() -> None:
+def test_all_fifteen_complaints_name_a_linked_source() -> None:
     assert len({row[0] for row in ROWS}) == len(ROWS) == 15
     linked = dict(re.findall(r"^\[(.+)\]: (https://github\.com/.+)$", PAGE, re.MULTILINE))
     named = [re.findall(r"\[([^]]+)\]", row[1]) for row in ROWS]

@@ -64,7 +64,7 @@ def test_two_owners_are_found_behind_a_third_one_within() -> None:
     assert len(wrong(*several)) == 2
 
 
-def test_a_byte_of_another_while_somebody_has_it() -> None:
+def test_a_write_without_the_lock_is_a_violation_while_another_client_holds_it() -> None:
     assert any("got a byte of free" in text for text in wrong(lock("one", 0, 1, 3, 4), write("free", 1.5, 2.0)))
     assert wrong(lock("one", 0, 1, 3, 4), write("free", 3.1, 3.2)) == []
 

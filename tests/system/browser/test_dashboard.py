@@ -108,7 +108,7 @@ def test_S04_a_page_that_is_frozen_moves_nothing(bench: Bench, browsers: Browser
             process.send_signal(signal.SIGCONT)
 
 
-def test_who_has_no_lock_moves_nothing_and_is_told_who_has_it(bench: Bench, browsers: Browsers) -> None:
+def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, browsers: Browsers) -> None:
     anna, bert = browsers.view("anna"), browsers.view("bert")
     jog(bench, anna, anna.plus)
     expect(bert.pan.locator(".locked")).to_contain_text("for anna")
@@ -228,7 +228,7 @@ def test_a_service_is_called_by_a_form_made_from_its_schema(bench: Bench, browse
     expect(group.locator(".result")).to_contain_text("→ [")
 
 
-def test_locks_are_taken_asked_for_and_broken_where_everybody_sees_it(browsers: Browsers) -> None:
+def test_locks_are_taken_requested_and_broken_in_view_of_all_users(browsers: Browsers) -> None:
     anna, chief = browsers.view("anna"), browsers.view("chief")
     anna.page.get_by_label("Group").fill("rosie.head")
     anna.page.get_by_label("Purpose").fill("a portrait")
@@ -245,7 +245,7 @@ def test_locks_are_taken_asked_for_and_broken_where_everybody_sees_it(browsers: 
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
-def test_a_wrong_token_is_told_and_another_one_is_asked_for(browsers: Browsers, http: HttpProcess) -> None:
+def test_a_wrong_token_is_reported_and_another_one_is_accepted(browsers: Browsers, http: HttpProcess) -> None:
     anna = browsers.view("anna")
     anna.page.get_by_role("button", name="Sign out").click()
     anna.sign_in("guess")

@@ -16,9 +16,7 @@ def part(view: View, name: str) -> Any:
     return view.page.locator(f"#{name}")
 
 
-def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_remedy(
-    bench: Bench, browsers: Browsers
-) -> None:
+def test_a_fault_is_shown_with_its_remedy_and_the_user_who_acknowledged_it(bench: Bench, browsers: Browsers) -> None:
     anna, vera = browsers.view("anna"), browsers.view("vera")
     hers, veras = (part(view, "fault-list").locator("tr", has_text="overload") for view in (anna, vera))
     bench.sim.control.hardware_fault(OVERLOAD, [1])
@@ -39,7 +37,7 @@ def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_r
     expect(hers).to_have_count(0)
 
 
-def test_calls_are_told_as_they_end_to_who_reads_the_system(browsers: Browsers) -> None:
+def test_finished_calls_are_shown_to_users_who_may_read_the_system(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
     expect(part(vera, "call-list")).to_contain_text("the right to read the system")
     expect(part(anna, "trace-calls")).to_be_disabled()  # she does not instrument the system

@@ -18,7 +18,7 @@ def robot(leg: Leg, adapter: SlcanAdapter) -> AttachedRobot:
     return leg.attach(ports={"legs": f"socketcan:{adapter.interface}"})
 
 
-def test_error_states_of_a_controller_are_told_as_they_come_and_go(
+def test_changes_of_a_controllers_error_state_are_reported(
     leg: Leg, adapter: SlcanAdapter, robot: AttachedRobot
 ) -> None:
     monitor = robot.monitor("legs")
@@ -35,7 +35,7 @@ def test_error_states_of_a_controller_are_told_as_they_come_and_go(
     assert robot.motor("leg.hip").move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
-def test_S18_a_bus_off_while_moving_is_told_and_nothing_moves_when_it_is_over(
+def test_S18_a_bus_off_while_moving_is_reported_and_nothing_moves_afterwards(
     leg: Leg, adapter: SlcanAdapter, robot: AttachedRobot
 ) -> None:
     hip, monitor = robot.motor("leg.hip"), robot.monitor("legs")

@@ -41,7 +41,7 @@ def test_a_receive_that_waits_and_a_send_end_when_the_interface_goes(interface: 
 
 
 @pytest.mark.parametrize("going", ["down", "deleted"])
-def test_S18_an_interface_that_goes_while_moving_is_told_and_comes_back_by_itself(leg: Leg, going: str) -> None:
+def test_S18_an_interface_lost_while_moving_is_reported_and_reconnects_by_itself(leg: Leg, going: str) -> None:
     robot = leg.attach()
     hip = robot.motor("leg.hip")
     moving = Outcome(lambda: hip.move_to(0.9, 0.2))

@@ -28,7 +28,7 @@ from tests.unit.drivers.test_cia402_motor import (
 from tests.unit.drivers.test_cia402_safety import (
     test_S06_the_watchdog_of_every_drive_is_armed_at_attach_and_fed_from_then_on,
     test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire,
-    test_S18_a_drive_found_moving_and_owned_by_nobody_is_stopped_and_left_enabled,
+    test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled,
     test_S18_attaching_commands_nothing,
     test_S19_leaving_while_moving_stops_first_and_disarms_what_holds,
 )

@@ -240,7 +240,7 @@ def test_servo_is_followed_on_both_buses_and_S04_ends_on_both(walker: Walker) ->
     assert all(walker.truth(name.removeprefix("rosie.")) > -1.2 for name in NAMES)
 
 
-def test_servo_that_cannot_be_told_to_one_side_stops_the_other(walker: Walker) -> None:
+def test_a_servo_stream_that_one_side_cannot_follow_stops_the_other_side(walker: Walker) -> None:
     walker.legs.enable()
     walker.sims["right"].do(trade_hil_sim.HardwareFault(ids=(2,), bits=0x20))
     wait_until(lambda: walker.legs.state()[2].fault, "the fault is known")
@@ -279,7 +279,7 @@ def _announced(walker: Walker, driver: Container, system: MemorySystem) -> None:
     system.settle()
 
 
-def test_S11_a_joint_that_somebody_else_has_refuses_the_whole_group(walker: Walker) -> None:
+def test_S11_a_joint_locked_by_another_client_makes_the_whole_group_refuse(walker: Walker) -> None:
     with memory_system() as system:
         driver, owner, other = (system.container(name) for name in ("driver", "owner", "other"))
         _announced(walker, driver, system)
@@ -290,7 +290,7 @@ def test_S11_a_joint_that_somebody_else_has_refuses_the_whole_group(walker: Walk
         assert move.with_(deadline_s=20)([0.3] * 4) == pytest.approx([0.3] * 4, abs=0.04)
 
 
-def test_S08_a_stop_by_somebody_else_latches_on_both_buses(walker: Walker) -> None:
+def test_S08_a_stop_by_another_client_latches_on_both_buses(walker: Walker) -> None:
     with memory_system() as system:
         driver, mover, other = (system.container(name) for name in ("driver", "mover", "other"))
         _announced(walker, driver, system)

@@ -36,7 +36,7 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
 # --- who is there
 
 
-def test_a_model_nobody_knows_is_named_by_its_number(head: Rig) -> None:
+def test_an_unknown_model_is_named_by_its_number(head: Rig) -> None:
     head.sim.do(sim.WrongModel(ids=(1,), number=4711))
     assert "model number 4711" in refused(head)
 

@@ -168,7 +168,7 @@ def test_S03_what_its_caller_moves_stops_when_he_is_gone(hand: Hand) -> None:
     assert hand.widths_m[-1] > 0.05
 
 
-def test_S11_who_has_locked_the_hand_moves_it_and_nobody_else_does(hand: Hand) -> None:
+def test_S11_only_the_owner_of_the_lock_moves_the_hand(hand: Hand) -> None:
     other = hand.system.container("other")
     with other.lock(where(group="rosie.hand")):
         with pytest.raises(LockedByOther):

@@ -73,7 +73,7 @@ def test_a_server_without_host_and_channel_is_refused(channel_text: str) -> None
         CanPort(f"socketcand:{channel_text}", 1_000_000, "legs.toml: bus.legs").open()
 
 
-def test_an_interface_nobody_knows_is_named_with_its_key() -> None:
+def test_an_unknown_interface_is_named_with_its_key() -> None:
     with pytest.raises(ConfigurationError, match=r"legs\.toml: bus\.legs\.interface: nonsense:can0"):
         CanPort("nonsense:can0", 1_000_000, "legs.toml: bus.legs").open()
 
@@ -227,7 +227,7 @@ def test_a_server_that_does_not_greet_is_a_loss_and_not_a_hang(greeting: bytes) 
     ],
     ids=lambda value: f"{value:04X}" if isinstance(value, int) else str(value),
 )
-def test_a_statusword_tells_the_state_whatever_its_other_bits(statusword: int, state: State | None) -> None:
+def test_a_statusword_gives_the_state_whatever_its_other_bits(statusword: int, state: State | None) -> None:
     assert state_of(statusword) is state
 
 

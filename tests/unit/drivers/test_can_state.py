@@ -46,7 +46,7 @@ def test_error_frames_are_counted(leg: Leg) -> None:
     assert monitor.bus_state().state == "error-active"
 
 
-def test_a_bus_off_is_told_until_the_bus_is_heard_again(leg: Leg) -> None:
+def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     leg.sim.do(BusOff())
     wait_until(lambda: monitor.bus_state().state == "bus-off", "it is known")
@@ -119,7 +119,9 @@ def answer(flags: int, *attributes: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(("number", "state"), [(0, ErrorState.ACTIVE), (3, ErrorState.BUS_OFF), (4, None)])
-def test_the_state_of_a_controller_is_read_out_of_what_the_system_tells(number: int, state: ErrorState | None) -> None:
+def test_the_state_of_a_controller_is_parsed_from_the_reply_of_the_kernel(
+    number: int, state: ErrorState | None
+) -> None:
     data = attribute(2, attribute(1, bytes(32)) + attribute(4, number.to_bytes(4, "little")))
     told = answer(1, attribute(3, b"can0\0"), attribute(18, attribute(1, b"can") + data))
     assert parse_link(told) == Link(True, state)
@@ -137,7 +139,7 @@ def test_no_cut_in_an_answer_is_a_crash() -> None:
     assert {parse_link(whole[:end]).up for end in range(32, len(whole))} == {True}
 
 
-def test_an_interface_that_is_there_is_found_and_one_that_is_not_is_named() -> None:
+def test_an_existing_interface_is_found_and_a_missing_one_is_named() -> None:
     assert look_at("lo").state is None
     with pytest.raises(OSError, match="there is no interface nothere0"):
         look_at("nothere0")

@@ -79,7 +79,7 @@ def test_a_setting_that_is_wrong_for_us_is_named(rig: Leg, values: dict[str, int
         ('interface = "socketcan"\nchannel = "can0"', 'port = "/dev/tty"', "driver cia402 needs a CAN bus: interface"),
     ],
 )
-def test_what_the_file_alone_tells(leg: Leg, before: str, after: str, complaint: str) -> None:
+def test_an_error_in_the_file_is_found_without_a_drive(leg: Leg, before: str, after: str, complaint: str) -> None:
     leg.configure((before, after))
     assert complaint in refused(leg)
 

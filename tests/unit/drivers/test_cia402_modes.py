@@ -83,7 +83,7 @@ def swing(group: JointGroup) -> Outcome:
 # --- trajectories
 
 
-def test_a_trajectory_is_sent_a_position_for_every_sync_where_drives_know_that(leg: Leg) -> None:
+def test_drives_that_support_it_receive_a_trajectory_position_at_every_sync(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.move_to([0.3, 0.1])
     mark = written_now()
@@ -243,7 +243,7 @@ def test_a_mode_never_changes_while_the_drive_moves(leg: Leg, first: str, name: 
     assert hip.state().fault == ""
 
 
-def test_a_drive_that_stands_after_a_trajectory_is_told_so_and_moves_on(leg: Leg) -> None:
+def test_a_drive_holds_its_position_after_a_trajectory_and_moves_again(leg: Leg) -> None:
     robot = leg.attach()
     group, hip = robot.group("leg"), robot.motor("leg.hip")
     assert swing(group).wait().error is None
@@ -355,7 +355,7 @@ def test_a_smooth_way_is_followed_to_the_count_and_after_a_gap_again() -> None:
     ("rate_hz", "period"),
     [(100, (10, -3)), (500, (2, -3)), (400, (25, -4)), (20, (50, -3)), (1000, (1, -3)), (80, (125, -4)), (3, (33, -2))],
 )
-def test_the_period_is_told_as_object_60C2_has_it(rate_hz: float, period: tuple[int, int]) -> None:
+def test_the_interpolation_period_has_the_format_of_object_60C2(rate_hz: float, period: tuple[int, int]) -> None:
     assert interpolation_period(rate_hz) == period
 
 
@@ -365,7 +365,7 @@ def test_a_speed_is_slower_the_nearer_the_end_and_zero_behind_it() -> None:
     assert [run(stream, 1, at)[0] for at in (0, 900, 1000)] == [500, pytest.approx(100 / 0.3, rel=0.01), 0]
 
 
-def test_a_joint_that_is_not_measured_is_taken_to_go_on_as_it_was_told() -> None:
+def test_an_unmeasured_joint_is_assumed_to_follow_its_commands() -> None:
     stream = Turning(1, accel=10**9, period_s=0.01, blind_s=0.3)
     stream.end, stream.fastest = 1000, 500.0
     sample, unpack = Sample(0, 0, 0, 1), table.TURNING.layout.unpack

@@ -188,7 +188,7 @@ def test_home_with_a_method_the_drive_does_not_know_is_a_fault_and_moves_nothing
     assert not leg.events("motion_started", HIP, mark)
 
 
-def test_enable_ends_a_search_for_home_and_whoever_waits_for_it_is_told(leg: Leg) -> None:
+def test_enable_ends_homing_and_the_waiting_call_raises(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)
     hip.enable()

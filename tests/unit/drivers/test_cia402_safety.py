@@ -134,7 +134,7 @@ def test_S18_attaching_commands_nothing(leg: Leg) -> None:
     assert {e.data for e in leg.frames("nmt")} == {bytes((1, HIP)), bytes((1, KNEE))}
 
 
-def test_S18_a_drive_found_moving_and_owned_by_nobody_is_stopped_and_left_enabled(leg: Leg) -> None:
+def test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled(leg: Leg) -> None:
     with leg.listen() as other:
 
         def write(index: int, size: int, value: int) -> None:

@@ -68,7 +68,7 @@ def test_what_was_written_is_read(server: Server, index: int, data: bytes) -> No
     assert server.run(upload(index, 0)) == data
 
 
-def test_a_refusal_tells_its_code(server: Server) -> None:
+def test_an_sdo_abort_carries_its_code(server: Server) -> None:
     with pytest.raises(Aborted) as refused:
         server.run(upload(0x2000, 0))
     assert refused.value.code == 0x06020000

@@ -85,7 +85,7 @@ def test_a_scan_names_who_answers_and_writes_nothing(line: Line) -> None:
     assert not line.written
 
 
-def test_a_scan_tells_after_each_rate_what_it_found_there(line: Line) -> None:
+def test_a_scan_reports_after_each_rate_what_it_found(line: Line) -> None:
     line.plug(1, 2, bauds=(line.make.factory_baud, line.make.other_baud))
     told: list[tuple[int, int]] = []
     rates = [line.make.factory_baud, line.make.other_baud]
@@ -134,7 +134,7 @@ def test_a_new_id_outlives_the_power_and_nothing_moves(line: Line) -> None:
     assert not motion_writes(list(line.sim.log.entries))
 
 
-def test_two_factory_fresh_servos_are_told_apart_one_after_the_other(line: Line) -> None:
+def test_two_factory_fresh_servos_get_their_ids_one_at_a_time(line: Line) -> None:
     line.plug(1, 1)
     with pytest.raises(ConfigurationError, match="Unplug all devices but one"):
         line.set_id(1, 2)
@@ -194,7 +194,7 @@ def test_an_answer_that_gets_lost_while_it_is_read_is_asked_for_again(line: Line
     assert (found.model, found.problem) == (line.make.model, "")
 
 
-def test_one_that_answers_a_ping_and_never_a_read_is_told_from_that(line: Line) -> None:
+def test_a_servo_that_answers_pings_but_not_reads_is_listed_with_that_problem(line: Line) -> None:
     line.plug(1)
     line.sim.do(Mute(instruction="read"))
     problems = ["register 68" in found.problem for found in line.scan(1)]
@@ -231,7 +231,7 @@ def test_a_feetech_servo_is_shut_against_writes_again(tmp_path: Path) -> None:
         assert line.sim.devices[0].memory.get("lock") == 1
 
 
-def test_where_nobody_answers_a_ping_of_all_no_id_is_asked(tmp_path: Path) -> None:
+def test_a_scan_pings_no_single_id_when_the_broadcast_ping_gets_no_answer(tmp_path: Path) -> None:
     with ExitStack() as undo:
         line = Line(MAKES["dynamixel"], tmp_path, undo)
         line.plug(1)

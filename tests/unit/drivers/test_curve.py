@@ -44,7 +44,7 @@ def test_it_goes_through_its_points_at_the_speeds_given(given: tuple[list[float]
 
 
 @given(points())
-def test_the_extremes_told_are_those_of_the_curve(given: tuple[list[float], list[float], list[float]]) -> None:
+def test_the_reported_extremes_are_those_of_the_curve(given: tuple[list[float], list[float], list[float]]) -> None:
     curve = Curve.through(*given)
     samples = [curve.at(time_s) for time_s in fine(curve)[:-1]]
     for which, told in (
@@ -77,7 +77,7 @@ def test_without_speeds_it_overshoots_no_point_and_is_at_rest_at_both_ends(
     assert curve.at(0)[1] == curve.at(curve.duration_s)[1] == 0
 
 
-def test_two_points_at_rest_make_the_cubic_everybody_knows() -> None:
+def test_two_points_at_rest_give_the_standard_cubic() -> None:
     curve = Curve.through([0, 2], [0, 1])
     assert curve.at(1) == pytest.approx((0.5, 0.75))  # one and a half times the mean speed
     assert curve.pieces[0].accels() == pytest.approx((1.5, -1.5))  # six times the distance by the time squared

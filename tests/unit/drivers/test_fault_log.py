@@ -107,7 +107,7 @@ def only(log: FaultLog) -> FaultInfo:
     return info
 
 
-def test_a_fault_is_told_with_what_was_measured_before_it_the_first_time_and_the_latest(bench: Bench) -> None:
+def test_a_fault_keeps_the_measurements_before_its_first_and_its_latest_occurrence(bench: Bench) -> None:
     log = bench.open()
     bench.begin(moments=[state(0.1, 99.5), state(0.2, 99.98)])
     bench.clocks.s += 10
@@ -181,7 +181,7 @@ def test_numbers_make_no_other_kind_but_codes_do(one: str, other: str, same: boo
     assert (len(kinds) == 1) is same
 
 
-def test_people_are_told_what_was_said_last_with_its_numbers(bench: Bench) -> None:
+def test_a_fault_shows_its_latest_message_with_the_numbers(bench: Bench) -> None:
     log = bench.open()
     for short in ("0.3", "0.12"):
         error = DeviceFault(device=PAN, bus="x", fault=f"it makes no progress, {short} rad short of its goal")
@@ -272,7 +272,7 @@ def test_what_was_open_and_is_found_again_at_once_is_the_same_fault_and_not_anot
     assert only(log).acknowledged_by == "its own process"
 
 
-def test_what_was_open_and_is_not_found_any_more_is_gone_and_begins_anew_later(bench: Bench) -> None:
+def test_an_open_fault_that_is_not_found_again_is_closed_and_can_reopen(bench: Bench) -> None:
     bench.open()
     bench.begin()
     bench.clocks.s += 60

@@ -114,7 +114,7 @@ def test_who_looks_on_and_fails_ends_no_motion(
     assert robot.motor("neck.pan").move_to(0.3) == pytest.approx(0.3, abs=0.03)
 
 
-def test_what_befalls_a_joint_while_it_is_left_is_there_for_the_next_process(head: Rig, tmp_path: Path) -> None:
+def test_a_fault_during_shutdown_is_recorded_for_the_next_process(head: Rig, tmp_path: Path) -> None:
     robot = head.attach(state_dir=tmp_path)
     bus: Any = robot._buses["neck"]
     leave = bus._thread.exchange.leave
@@ -155,7 +155,7 @@ def test_a_fault_that_is_still_there_at_the_next_attach_is_the_same_and_one_that
     assert not gone.open
 
 
-def test_a_gripper_tells_of_its_faults(hand: HandRig) -> None:
+def test_a_gripper_reports_its_faults(hand: HandRig) -> None:
     robot = hand.attach()
     robot.gripper("left.hand").activate()
     hand.sim.do(sim.HardwareFault(bits=14))

@@ -274,7 +274,7 @@ def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Ri
         exchange.wire.close()
 
 
-def test_enabling_starts_a_servo_anew_that_has_shut_down_and_nothing_else_does(head: Rig, robot: AttachedRobot) -> None:
+def test_enabling_alone_reboots_a_servo_that_has_shut_down(head: Rig, robot: AttachedRobot) -> None:
     pan, tilt = robot.motor("neck.pan"), robot.motor("neck.tilt")
     pan.move_to(0.2)
     head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
@@ -300,7 +300,7 @@ def test_a_servo_whose_fault_comes_back_at_once_is_not_enabled(head: Rig, robot:
     assert not head.truth(1).torque
 
 
-def test_a_servo_that_complains_and_has_not_let_go_is_not_started_anew(head: Rig, robot: AttachedRobot) -> None:
+def test_a_faulty_servo_with_torque_on_is_not_rebooted(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     pan.relax()
     head.sim.devices[0].write(63, b"\0", time.monotonic())  # shut down for nothing

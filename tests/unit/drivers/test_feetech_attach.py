@@ -54,7 +54,7 @@ def test_another_baud_rate_is_silence(rig: TailRig) -> None:
     assert "no device answers to id 1" in refused(rig)
 
 
-def test_two_of_one_id_are_told_of(rig: TailRig) -> None:
+def test_two_devices_of_one_id_are_reported(rig: TailRig) -> None:
     rig.plug(Servo(1), Servo(1), Servo(2))
     assert "two devices may share this id" in refused(rig)
 
@@ -72,7 +72,7 @@ def test_two_of_one_id_are_told_of(rig: TailRig) -> None:
         ("id = 1", "id = 1\ngear = 2", "are for other devices"),
     ],
 )
-def test_what_the_file_alone_can_tell_is_told_before_the_port_is_opened(
+def test_errors_of_the_file_alone_are_reported_before_the_port_is_opened(
     rig: TailRig, before: str, after: str, complaint: str
 ) -> None:
     rig.plug()

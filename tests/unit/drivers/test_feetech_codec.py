@@ -83,7 +83,7 @@ def test_what_was_sent_itself_is_no_answer() -> None:
     assert take_status(buffer, (1,), 2, asked) == Status(1, 0, b"\x09\x03")
 
 
-def test_a_damaged_answer_is_told_of_and_the_next_one_read() -> None:
+def test_a_damaged_answer_is_reported_and_the_next_one_read() -> None:
     whole = status(1, 0, b"\1\2")
     buffer = bytearray(whole[:-1] + b"\0" + whole)
     with pytest.raises(Corrupt):
@@ -164,9 +164,7 @@ def test_a_step_leads_towards_the_aim_and_far_enough_to_keep_its_speed(
 
 
 @pytest.mark.parametrize(("passed_s", "hold"), [(0.1, 2200), (0.42, 2200), (0.43, None), (9.0, None)])
-def test_a_joint_that_is_not_heard_is_told_to_hold_until_it_surely_rests_by_itself(
-    passed_s: float, hold: int | None
-) -> None:
+def test_an_unheard_joint_gets_hold_commands_until_it_surely_rests_by_itself(passed_s: float, hold: int | None) -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
     axis.note(Sample(2200, 160, 0, 10**9))
     axis.sent_ns = 10**9 + 1
@@ -175,7 +173,7 @@ def test_a_joint_that_is_not_heard_is_told_to_hold_until_it_surely_rests_by_itse
     assert axis.hold_counts(axis.sent_ns + 10**10, BLIND_NS) == 2300
 
 
-def test_a_joint_that_is_not_heard_on_its_way_is_not_told_to_hold_beyond_where_it_was_sent() -> None:
+def test_a_joint_unheard_on_its_way_gets_no_hold_beyond_its_last_goal() -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
     axis.note(Sample(2200, 160, 0, 10**9))
     axis.motion = SimpleNamespace(goal_of=lambda _: 4000)  # type: ignore[assignment]

@@ -99,7 +99,7 @@ def test_a_silent_joint_leaves_the_other_usable(tail: TailRig, robot: AttachedRo
     assert robot.motor("tail.tip").move_to(0.4) == pytest.approx(0.4, abs=0.03)
 
 
-def test_a_joint_that_fell_silent_on_its_way_is_told_nothing_and_goes_no_farther_than_it_was_sent(
+def test_a_joint_that_fell_silent_gets_no_command_and_moves_no_farther_than_it_was_sent(
     tail: TailRig, robot: AttachedRobot
 ) -> None:
     moving = Outcome(lambda: robot.motor("tail.root").move_to(1.3, 1.0))
@@ -112,7 +112,7 @@ def test_a_joint_that_fell_silent_on_its_way_is_told_nothing_and_goes_no_farther
     assert tail.truth().position_rad < 1.2
 
 
-def test_a_joint_that_is_another_device_by_now_is_not_even_told_to_hold(tail: TailRig, robot: AttachedRobot) -> None:
+def test_a_joint_that_is_now_another_device_does_not_even_get_a_hold(tail: TailRig, robot: AttachedRobot) -> None:
     root = robot.motor("tail.root")
     root.enable()
     tail.sim.do(sim.Absent(ids=(1,)))

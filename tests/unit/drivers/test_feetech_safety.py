@@ -114,7 +114,7 @@ def test_S18_what_is_found_moving_is_stopped(rig: TailRig) -> None:
     assert not rig.goals(2)
 
 
-def test_S18_enabling_seeds_the_goal_with_the_measured_position_before_torque_goes_on(tail: TailRig) -> None:
+def test_S18_enabling_seeds_the_goal_with_the_measured_position_before_torque_is_on(tail: TailRig) -> None:
     root = tail.root()
     tail.sim.do(trade_hil_sim.Place(ids=(1,), counts=2400))
     root.enable()

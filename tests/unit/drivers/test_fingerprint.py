@@ -80,7 +80,7 @@ def test_a_servo_with_the_homing_offset_of_the_file_is_attached_and_enabled(tail
     tail.root().enable()
 
 
-def test_a_homing_offset_that_was_not_kept_without_power_is_noticed_before_torque_goes_on(tail: TailRig) -> None:
+def test_a_homing_offset_lost_without_power_is_noticed_before_torque_is_on(tail: TailRig) -> None:
     tail.configure(("id = 1\n", "id = 1\nhoming_counts = 100\n"))
     tail.plug()
     tail.poke(55, 1)  # the lock: what is written now is not kept

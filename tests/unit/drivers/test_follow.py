@@ -256,7 +256,7 @@ def test_a_joint_that_leaves_its_path_stops_all(head: Rig, group: JointGroup) ->
     assert short_of_its_end(head)
 
 
-def test_a_joint_that_does_not_get_to_the_end_is_told_of(head: Rig, group: JointGroup) -> None:
+def test_a_joint_that_does_not_reach_the_end_is_reported(head: Rig, group: JointGroup) -> None:
     group.enable()
     following = Outcome(lambda: group.follow(through((0.0, [0.0, 0.0]), (0.5, [0.3, 0.0])), Tolerances(path_rad=9.0)))
     head.sim.do(trade_hil_sim.Jam(ids=(1,)))

@@ -222,7 +222,7 @@ def test_S06_what_moved_when_its_host_was_suspended_does_not_go_on(
         assert "held up for 3600." in str(error)
 
 
-def test_S06_a_driver_that_is_held_up_for_less_goes_on(joint: Joint) -> None:
+def test_S06_a_driver_that_is_held_up_for_less_continues(joint: Joint) -> None:
     moving = joint.set_off(joint.move)
     job = _HoldUp(joint.motor)
     job.exchange.submit(job)

@@ -30,7 +30,7 @@ def what() -> str:
     return f"test_host_lock:{next(_numbers)}"
 
 
-def test_who_comes_second_is_told_which_process_has_it_and_gets_it_when_that_is_killed(what: str) -> None:
+def test_the_second_process_learns_which_one_has_the_port_and_gets_it_when_that_is_killed(what: str) -> None:
     lock = HostLock(what, "head.toml: bus.neck")
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", _HOLDER, what], stdin=pipe, stdout=pipe, text=True) as other:
@@ -58,7 +58,7 @@ def test_it_is_held_once_in_a_process_too_and_free_after_its_release(what: str) 
         lock.release()
 
 
-def test_a_long_or_foreign_name_of_its_holder_is_told_in_part(what: str) -> None:
+def test_a_long_or_foreign_name_of_a_port_holder_is_shown_in_part(what: str) -> None:
     lock = HostLock(what, "ä" + 300 * "x" + "/rosie.toml: bus.legs")
     lock.take()
     with pytest.raises(Taken, match=r"xx/rosie.toml: bus.legs\)$"):

@@ -108,7 +108,7 @@ def test_an_odrive_without_a_number_is_shown_by_its_serial_number() -> None:
     assert "it has no node number yet" in nameless.problem
 
 
-def test_an_odrive_whose_firmware_tells_no_version_is_shown_with_that() -> None:
+def test_an_odrive_whose_firmware_reports_no_version_is_shown_with_that() -> None:
     beat = message(7 << 5 | 1, struct.pack("<IBBBx", 0, 1, 0, 0))
     with CanBus([]) as sim, talking(sim.port, beat):
         [old] = scan(COMMISSIONERS["odrive"](), sim.port)
@@ -133,14 +133,14 @@ def test_a_motor_that_answers_with_another_identifier_is_shown_with_it() -> None
 
 
 @pytest.mark.parametrize("commissioner", [Cia402Driver.commissioner, DamiaoDriver.commissioner])
-def test_where_odrives_talk_nobody_else_is_asked(commissioner: Callable[[], Commissioner]) -> None:
+def test_where_odrives_talk_no_other_vendor_is_asked(commissioner: Callable[[], Commissioner]) -> None:
     with CanBus([Axis(5, t=time.monotonic())]) as sim:
         with pytest.raises(ConfigurationError, match=r"ODrives talk on this bus \(node 5\)"):
             scan(commissioner(), sim.port)
         assert not [frame for frame in frames(list(sim.log.entries)) if frame.source.startswith("client")]
 
 
-def test_drives_and_motors_on_one_bus_are_told_apart() -> None:
+def test_drives_and_motors_on_one_bus_are_distinguished() -> None:
     with CanBus([Motor(2, t=time.monotonic()), Drive(9)]) as sim:
         assert [one.id for one in scan(COMMISSIONERS["damiao"](), sim.port)] == [2]
         assert [one.id for one in scan(Cia402Driver.commissioner(), sim.port, ids=[2, 9])] == [9]

@@ -49,7 +49,7 @@ def dbc() -> Any:
     ],
     ids=lambda value: value.name if isinstance(value, Command) else "",
 )
-def test_an_odrive_is_told_what_the_dbc_of_odrive_can_says(
+def test_an_odrive_gets_the_commands_that_the_dbc_of_odrive_can_defines(
     dbc: Any, command: Command, data: bytes, signals: dict[str, object]
 ) -> None:
     message = dbc.get_message_by_frame_id(frame_id(1, command))
@@ -73,7 +73,7 @@ def test_driver_and_simulator_agree_on_the_numbers_of_commands() -> None:
     ("errors", "text"),
     [(0x1000000, "watchdog"), (0x300, "over voltage, under voltage"), (0x80000000, "80000000h"), (0, "")],
 )
-def test_errors_are_told_in_words(errors: int, text: str) -> None:
+def test_errors_are_explained_in_words(errors: int, text: str) -> None:
     assert odrive.Errors(errors).text == text
 
 

@@ -15,12 +15,12 @@ JPEG = b"\xff\xd8" + APP0 + TABLE + FRAME + b"\xff\xda\x00\x02pixels\xff\xd9"
 """640 x 480, progressive, with a table (whose marker looks like a frame's) before the frame."""
 
 
-def test_a_jpeg_tells_its_size_behind_other_segments() -> None:
+def test_a_jpegs_size_is_read_behind_other_segments() -> None:
     assert picture(JPEG) == Picture("jpeg", 640, 480)
     assert picture(JPEG + b"\0" * 60) == Picture("jpeg", 640, 480)
 
 
-def test_a_png_tells_its_size() -> None:
+def test_a_pngs_size_is_read() -> None:
     assert picture(png(bytes(3 * 5 * 7), 5, 7)) == Picture("png", 5, 7)
 
 
@@ -42,7 +42,7 @@ def test_whatever_bytes_come_are_a_picture_or_refused(data: bytes) -> None:
         assert 0 <= shown.height_px < 2**32
 
 
-def test_an_answer_is_there_when_all_of_it_is() -> None:
+def test_an_answer_is_complete_once_all_its_bytes_arrived() -> None:
     whole = b"HTTP/1.1 200 OK\r\nServer: eye\r\ncontent-length: 4\r\n\r\nabcd"
     for length in range(len(whole)):
         assert parse_answer(whole[:length]) is None

@@ -141,7 +141,7 @@ def test_a_file_that_says_another_number_of_probes_is_refused(oven: Oven, tmp_pa
         buses_of(read_robot(file), tmp_path)
 
 
-def test_the_contract_runs_on_it_as_on_hardware_and_asks_nobody(installed: None, system: str) -> None:
+def test_the_contract_runs_on_it_as_on_hardware_and_prompts_nothing(installed: None, system: str) -> None:
     with SimProcess(OVEN) as sim:
         [(name, port)] = sim.ports.items()
         command = [sys.executable, "-m", "trade_drivers.testing", "--hil", str(OVEN), f"--port={name}={port}"]

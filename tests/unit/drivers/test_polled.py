@@ -98,7 +98,7 @@ def test_whatever_measuring_raises_it_is_silent_until_it_is_back(
     assert scale.opened >= 2, "its wire was taken anew"
 
 
-def test_a_port_that_is_gone_is_told_with_the_reason(start: Callable[[Scale], Scale]) -> None:
+def test_a_lost_port_is_reported_with_the_reason(start: Callable[[Scale], Scale]) -> None:
     scale = start(Scale(stale_after_s=0.1))
     scale.missing = FileNotFoundError("no such port")
     scale.trouble = OSError("cable")

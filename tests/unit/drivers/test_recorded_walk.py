@@ -141,7 +141,7 @@ def test_both_joints_of_a_walk_set_off_between_the_same_two_syncs(walk: list[See
     assert [names for names in together if names] == [{"HIP_COMMAND", "KNEE_COMMAND"}] * len(STEPS)
 
 
-def test_ramps_of_a_walk_are_told_before_each_set_point_and_within_the_limits(walk: list[Seen]) -> None:
+def test_ramps_of_a_walk_are_sent_before_each_set_point_and_within_the_limits(walk: list[Seen]) -> None:
     for joint in ("HIP", "KNEE"):
         told: dict[str, Any] | None = None
         for frame in walk:

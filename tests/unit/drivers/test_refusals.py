@@ -22,7 +22,7 @@ def read(text: str, *changes: tuple[str, str]) -> Robot:
 
 
 @pytest.mark.parametrize("text", [HEAD, TAIL, HAND, LEG, PICTURES])
-def test_a_right_file_is_refused_by_nobody(text: str) -> None:
+def test_a_valid_file_is_refused_by_no_driver(text: str) -> None:
     assert not list(refusals(read(text)))
 
 
@@ -31,7 +31,7 @@ ROBOTS = [path for path in sorted(EXAMPLES.glob("*.toml")) if "\n[robot]" in pat
 
 
 @pytest.mark.parametrize("path", ROBOTS, ids=lambda path: path.stem)
-def test_the_examples_are_refused_by_nobody(path: Path) -> None:
+def test_the_examples_are_refused_by_no_driver(path: Path) -> None:
     assert not list(refusals(load(path)))
 
 
@@ -74,7 +74,7 @@ def test_what_a_driver_cannot_do_is_refused_with_file_key_and_what_would_be_righ
     assert str(raised.value) == str(refusal)
 
 
-def test_each_bus_that_has_something_wrong_is_told() -> None:
+def test_each_faulty_bus_is_reported() -> None:
     text = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1]
     robot = read(text)
     assert [part for part, _ in refusals(robot)] == ["tail", "hand"]

@@ -79,7 +79,7 @@ def test_a_late_answer_never_becomes_a_wrong_value(hand: HandRig, gripper: Gripp
     wait_until(plausible, "later measurements came in")
 
 
-def test_an_object_in_the_way_of_activation_is_no_reason_to_wait_for_ever(hand: HandRig) -> None:
+def test_an_object_in_the_way_of_activation_does_not_block_without_end(hand: HandRig) -> None:
     gripper = hand.gripper()
     hand.sim.do(sim.Jam())
     assert gripper.activate().activated
@@ -90,7 +90,7 @@ def test_fingers_held_fast_are_holding(hand: HandRig, gripper: Gripper) -> None:
     assert gripper.close().holding == "outside"
 
 
-def test_a_fault_that_stays_is_told_by_clear_fault(hand: HandRig, gripper: Gripper) -> None:
+def test_clear_fault_reports_a_fault_that_stays(hand: HandRig, gripper: Gripper) -> None:
     hand.sim.do(sim.Mute(instruction="read_write"))
     with pytest.raises(DeviceSilent):
         gripper.clear_fault()

@@ -43,7 +43,7 @@ def test_a_gripper_becomes_a_provider_in_the_group_named_after_it(hand: HandRig)
         robot.motor("left.hand")
 
 
-def test_an_object_is_held_and_where_the_fingers_are_tells_how_wide_it_is(hand: HandRig) -> None:
+def test_an_object_is_held_and_the_position_of_the_fingers_shows_its_width(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04, stiffness_n_m=1e6))
     gripper = hand.active()
     state = gripper.close(force_n=40.0)

@@ -182,7 +182,7 @@ def service(container: Container, name: str) -> Handle:
     return container.find(where(name=name, group="rosie.left.hand"), wait_s=20).with_(deadline_s=60)
 
 
-def test_S09_what_an_estop_ended_tells_of_the_estop_and_after_it_a_plain_stop_does_not(
+def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:
     run = service(planner, "close").start(SLOW_M_S)

@@ -265,7 +265,7 @@ def test_a_driver_of_cameras_is_none_of_sensors(stage: Stage) -> None:
         attach(parse(text, "seen.toml"), ports={name: str(sim.port) for name, sim in stage.sims.items()})
 
 
-def test_unless_every_camera_is_there_nothing_is_announced_and_no_motor_hears_of_it(stage: Stage) -> None:
+def test_unless_every_camera_is_present_nothing_is_announced_and_no_motor_gets_a_byte(stage: Stage) -> None:
     announced: list[object] = []
     ports = {name: str(sim.port) for name, sim in stage.sims.items()} | {"eye": "http://127.0.0.1:9/"}
     with pytest.raises(ConfigurationError):

@@ -51,7 +51,7 @@ def test_S04_it_ramps_to_its_stop_at_the_joints_acceleration(rig: Rig) -> None:
     assert rest.t - held.t > 0.8 * 1.0 / 2.0
 
 
-def test_S04_renewed_in_time_it_goes_on(head: Rig, robot: AttachedRobot) -> None:
+def test_S04_motion_continues_if_its_set_point_is_renewed_in_time(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     pan.move_to(-1.4)
     mark, renewals = written_now(), 0
@@ -95,7 +95,7 @@ def test_S04_a_renewal_that_is_refused_renews_nothing(head: Rig, robot: Attached
     assert head.truth(1).position_rad < 0.7
 
 
-def test_S04_zero_stands_still_at_once(head: Rig, robot: AttachedRobot) -> None:
+def test_S04_a_speed_of_zero_stops_at_once(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     pan.set_velocity(1.0, 1.0)
     wait_until(lambda: head.truth(1).position_rad > 0.05, "it turns")
@@ -160,7 +160,7 @@ def test_S22_it_brakes_before_the_end_of_the_range(head: Rig, robot: AttachedRob
     assert max(goal_counts(entry) for entry in head.goals(1)) <= math.ceil(2048 + 1.4 * COUNTS_PER_RAD)
 
 
-def test_a_reversed_joint_turns_the_way_it_was_told(head: Rig, robot: AttachedRobot) -> None:
+def test_a_reversed_joint_turns_in_the_commanded_direction(head: Rig, robot: AttachedRobot) -> None:
     robot.motor("neck.tilt").set_velocity(0.5)
     assert end_of(head, device_id=2) > 0.01
 

@@ -43,7 +43,7 @@ def test_S19_leaving_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> 
     assert (rig.truth.robot_mode, rig.truth.safety_mode) == ("RUNNING", "NORMAL")
 
 
-def test_S20_a_second_driver_is_refused_and_the_arm_goes_on(rig: ArmRig) -> None:
+def test_S20_a_second_driver_is_refused_and_the_arm_continues(rig: ArmRig) -> None:
     moving = Outcome(lambda: rig.arm.move_joints(NEAR, SLOW))
     wait_until(lambda: moving.error or rig.base_rad > 0.05, "it is under way")
     mark = written_now()

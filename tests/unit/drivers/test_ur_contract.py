@@ -48,7 +48,7 @@ def test_a_stream_has_the_rate_of_the_controller(model: str, text: str, most: in
         assert len(streamed) <= most * (streamed[-1] - streamed[0]) * 1.1 + 2
 
 
-def test_an_address_where_nobody_is_is_named() -> None:
+def test_an_address_without_a_listener_is_named() -> None:
     with ExitStack() as undo, pytest.raises(ConfigurationError, match=r"127\.0\.0\.213"):
         attached(undo, "127.0.0.213")
 

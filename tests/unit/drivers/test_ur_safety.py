@@ -211,7 +211,7 @@ def test_S10_a_stop_goes_through_the_dashboard_and_the_process_that_commands(rig
     rig.stands()
 
 
-def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_stands(rig: ArmRig) -> None:
+def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(rig: ArmRig) -> None:
     moving = rig.set_off()
     [pid] = children("control")
     os.kill(pid, signal.SIGSTOP)

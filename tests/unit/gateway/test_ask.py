@@ -91,7 +91,9 @@ def test_P58_what_is_new_is_what_came_and_went_since_one_asked(
     assert talk.say("What has changed?").data == {"came": [], "gone": ["dora.eyes.check_for"]}
 
 
-def test_who_has_what_and_what_is_wrong_are_told(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+def test_questions_about_lock_owners_and_faults_are_answered(
+    talk: Talk, robot: Container, memory: MemorySystem
+) -> None:
     other = memory.container("other")
     memory.settle()
     with other.lock(where(group="rosie.head"), purpose="looking", wait_s=20):

@@ -182,7 +182,7 @@ def test_a_record_that_was_moved_aside_is_not_passed_over(folder: Path) -> None:
     assert "arm.sqlite.broken-17" in done.stdout
 
 
-def test_heads_that_were_noted_elsewhere_find_a_record_written_anew(folder: Path, tmp_path: Path) -> None:
+def test_heads_noted_elsewhere_detect_a_rewritten_record(folder: Path, tmp_path: Path) -> None:
     noted = tmp_path / "heads"
     noted.write_text(trade("audit", "head", folder, "--json").stdout)
     write(folder / "arm.sqlite", [row("rosie.arm.later", time.time())])

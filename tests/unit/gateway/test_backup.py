@@ -224,7 +224,7 @@ def test_a_damaged_database_is_kept_as_it_is_and_said(config: Path, state: Path,
 # --- what is refused
 
 
-def test_a_backup_that_is_there_is_not_overwritten(config: Path, state: Path, out: Path) -> None:
+def test_an_existing_backup_is_not_overwritten(config: Path, state: Path, out: Path) -> None:
     out.write_text("the last one")
     with pytest.raises(ConfigurationError, match="exists already"):
         back_up(config, out, state)

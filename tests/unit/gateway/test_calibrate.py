@@ -101,7 +101,7 @@ def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[
         Sweep(Hand(beyond), 1, PLACE).until(done_after(1), 60.0)  # type: ignore[arg-type]
 
 
-def test_nobody_is_waited_for_without_an_end() -> None:
+def test_no_wait_is_without_an_end() -> None:
     with pytest.raises(ConfigurationError, match="no answer to the prompt"):
         Sweep(Hand([0.0, 0.0, 0.0]), 1, PLACE).until(lambda: False, 0.0)  # type: ignore[arg-type]
 
@@ -121,7 +121,7 @@ COMMENTED = HEAD.replace("min_rad = -1.4", "min_rad = -1.4   # the left shoulder
 )
 
 
-def test_only_the_values_change_and_a_new_key_stands_above_the_range() -> None:
+def test_only_the_values_change_and_a_new_key_is_above_the_range() -> None:
     changed = with_values(COMMENTED, "neck.pan", {"offset_rad": 0.2, "min_rad": -0.5})
     expected = COMMENTED.replace("min_rad = -1.4 ", "offset_rad = 0.2\nmin_rad = -0.5 ")
     assert changed == expected
@@ -151,7 +151,7 @@ def rosie(tmp_path: Path) -> Iterator[Rosie]:
         yield Rosie(tmp_path, undo)
 
 
-def test_the_zero_is_where_it_stands_and_nothing_is_written_to_the_device(rosie: Rosie) -> None:
+def test_zero_is_the_current_position_and_nothing_is_written_to_the_device(rosie: Rosie) -> None:
     rosie.sim.devices[0].place(2148, 0.0)
     said = rosie.calibrate("neck.pan", "--zero-here", "--yes")
     assert said.exit_code == 0, said.output
@@ -181,7 +181,7 @@ def test_another_model_is_not_calibrated(rosie: Rosie) -> None:
     assert isinstance(rosie.calibrate("neck.pan", "--zero-here", "--yes").exception, WrongDevice)
 
 
-def test_a_joint_that_is_not_there_is_told_from_those_that_are(rosie: Rosie) -> None:
+def test_an_unknown_joint_is_refused_with_the_known_ones(rosie: Rosie) -> None:
     error = rosie.calibrate("neck.roll", "--zero-here").exception
     assert isinstance(error, UsageError)
     assert "there is neck.pan, neck.tilt" in str(error)

@@ -12,7 +12,7 @@ from trade_gateway.dashboard import pages
 STATIC = Path(__file__).parents[3] / "gateway" / "src" / "trade_gateway" / "dashboard" / "static"
 
 
-def test_the_page_and_what_it_needs_are_given_to_everybody_and_run_no_script_but_their_own(tmp_path: Path) -> None:
+def test_the_page_and_its_files_are_public_and_run_no_foreign_script(tmp_path: Path) -> None:
     with memory_system() as system, opened(system.container("me"), tmp_path) as (gateway, _):
         anybody = Client(gateway.url)
         page = anybody.ask("GET", "/")

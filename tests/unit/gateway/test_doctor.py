@@ -44,7 +44,7 @@ def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> Non
     assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names 2, checked below")
 
 
-def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> None:
+def test_an_uncalibrated_joint_is_reported_with_the_command_that_measures_it() -> None:
     text = first_file(
         [("/dev/ttyUSB0", Found(driver="dynamixel", baud=57600, id=1, model="XL430-W250"))], Path("new.toml")
     )
@@ -54,7 +54,7 @@ def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> Non
 
 
 @pytest.mark.parametrize(("ms", "level"), [(16, "warning"), (1, "ok")])
-def test_an_adapter_that_waits_long_is_told_of(tmp_path: Path, ms: int, level: str) -> None:
+def test_an_adapter_with_a_long_latency_is_reported(tmp_path: Path, ms: int, level: str) -> None:
     timer = tmp_path / "ttyUSB0" / "latency_timer"
     timer.parent.mkdir()
     timer.write_text(f"{ms}\n", encoding="ascii")
@@ -79,7 +79,7 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(
 @pytest.mark.parametrize(
     ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "it is unknown")]
 )
-def test_the_clock_is_synchronised_or_not_or_nobody_knows(said: str, level: str, text: str) -> None:
+def test_the_clock_is_synchronised_or_not_or_unknown(said: str, level: str, text: str) -> None:
     found = only(host.clock([sys.executable, "-c", f"print({said!r})"]))
     assert (found.level, found.text.startswith(text)) == (level, True)
 
@@ -89,7 +89,7 @@ def test_a_host_without_the_tool_does_not_know() -> None:
 
 
 @pytest.mark.parametrize(("symbol", "level"), [(b"sem_clockwait", "ok"), (b"sem_timedwait", "warning")])
-def test_a_python_whose_waits_go_by_the_clock_on_the_wall_is_told_of(tmp_path: Path, symbol: bytes, level: str) -> None:
+def test_a_python_whose_waits_follow_the_wall_clock_is_reported(tmp_path: Path, symbol: bytes, level: str) -> None:
     python, other, maps = tmp_path / "libpython3.11.so.1.0", tmp_path / "libc.so.6", tmp_path / "maps"
     python.write_bytes(b"\0sem_post\0" + symbol + b"\0")
     other.write_bytes(b"\0sem_clockwait\0")
@@ -107,7 +107,7 @@ def test_a_python_whose_waits_go_by_the_clock_on_the_wall_is_told_of(tmp_path: P
         (timedelta(days=-2), "error", "is valid only from"),
     ],
 )
-def test_a_certificate_is_told_of_before_it_ends(tmp_path: Path, later: timedelta, level: str, text: str) -> None:
+def test_a_certificate_is_reported_before_it_expires(tmp_path: Path, later: timedelta, level: str, text: str) -> None:
     issued = Authority.create(tmp_path / "pki").issue("arm")
     found = only(host.certificate(issued.folder, datetime.now(timezone.utc) + later))
     assert (found.level, found.text.startswith(text)) == (level, True), found
@@ -158,7 +158,7 @@ def of_devices(robot_file: Path) -> list[Finding]:
     return list(robots.devices(parse(robot_file.read_text(encoding="utf-8"), "head.toml")))
 
 
-def test_a_port_that_is_not_there_is_told_of(robot_file: Path) -> None:
+def test_a_missing_port_is_reported(robot_file: Path) -> None:
     found = only(of_devices(robot_file))
     assert (found.level, found.about) == ("error", "bus neck")
 
@@ -204,7 +204,7 @@ def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
     assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
 
 
-def test_a_range_that_is_more_than_the_device_is_set_to_is_told_as_trade_up_tells_it(robot_file: Path) -> None:
+def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].memory.set("max_position_limit", 2500)
         pan, tilt = of_devices(robot_file)
@@ -225,7 +225,7 @@ def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: 
 WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
 
 
-def test_what_drivers_refuse_of_a_file_is_told_of_all_its_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
+def test_a_file_that_drivers_refuse_is_reported_for_all_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text(WRONG)
     said = CliRunner().invoke(app, ["doctor", str(path), "--json"])
@@ -236,7 +236,7 @@ def test_what_drivers_refuse_of_a_file_is_told_of_all_its_parts_and_ends_nothing
     assert f'{path}: gripper."left.hand".max_width_m: 85 is outside' in errors["bus hand"]
 
 
-def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
+def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     said = CliRunner().invoke(app, ["doctor", str(robot_file), "--json"])
     assert said.exit_code == 1
     found = json.loads(said.stdout)
@@ -247,7 +247,7 @@ def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
     assert "0 errors" in well.output
 
 
-def test_where_it_is_to_connect_and_nobody_answers_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = free_endpoint()
     monkeypatch.setenv("TRADE_CONNECT", nowhere)
     said = CliRunner().invoke(app, ["doctor", "--json"])
@@ -258,7 +258,7 @@ def test_where_it_is_to_connect_and_nobody_answers_is_an_error(system: str, monk
     assert "no container is visible" not in said.stdout
 
 
-def test_who_has_bad_papers_is_not_told_to_do_without(
+def test_a_client_with_bad_certificates_is_not_advised_to_connect_without(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, where, fix in (
@@ -276,7 +276,7 @@ def test_who_has_bad_papers_is_not_told_to_do_without(
     ("text", "said"),
     [('system = "lab"', "trade gateway {} --check"), ('[system]\nname = "home"', "trade system up {} --check")],
 )
-def test_a_file_of_another_kind_is_told_by_its_name(system: str, tmp_path: Path, text: str, said: str) -> None:
+def test_a_file_of_another_kind_is_refused_with_its_name(system: str, tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "some.toml"
     path.write_text(text)
     found = json.loads(CliRunner().invoke(app, ["doctor", str(path), "--json"]).stdout)

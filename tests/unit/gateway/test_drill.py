@@ -22,7 +22,7 @@ DRILL_PAGE = EXAMPLES.parent / "docs" / "drill.md"
 BY_NAME = {scene.name: scene for scene in SCENES}
 
 
-def test_each_scene_has_its_limit_in_the_robot_file_and_no_other_key_is_there() -> None:
+def test_each_scene_has_its_limit_in_the_robot_file_and_no_other_key_exists() -> None:
     assert set(BY_NAME) == set(Drill.__struct_fields__)
     assert len(BY_NAME) == len(SCENES)
 
@@ -196,7 +196,7 @@ def test_a_scene_is_tried_three_times_and_no_more() -> None:
     assert again.dismissed == 3
 
 
-def test_the_page_stands_alone_and_shows_the_worst_first() -> None:
+def test_the_page_needs_no_other_file_and_shows_the_worst_first() -> None:
     text = page(_report(_stop(1.9)))
     assert text.index("unplug") < text.index("partition")
     assert "a &lt;b&gt;" in text

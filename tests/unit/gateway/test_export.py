@@ -163,7 +163,7 @@ def test_a_gap_of_one_joint_among_others_cuts_all(tmp_path: Path) -> None:
     assert lengths == pytest.approx([4.0, 5.0], abs=0.1)
 
 
-def test_a_lock_in_which_joints_moved_unmeasured_is_cut_and_told(tmp_path: Path) -> None:
+def test_a_lock_in_which_joints_moved_unmeasured_is_cut_and_reported(tmp_path: Path) -> None:
     said = [locks(1.0, ("a", HEAD[0], 1.0)), locks(3.0, ("b", HEAD[0], 3.0)), locks(7.0)]
     file = recording(tmp_path / "a.mcap", *said, without=range(75, 115))
     done = export(file, tmp_path / "set", "--episodes", "locks", "--task", "look", "--json")
@@ -196,7 +196,7 @@ def test_the_tables_are_laid_out_as_version_3_says(tmp_path: Path) -> None:
     assert all(episode[name] == 0 for name in episode if name.endswith("_index") and name != "dataset_to_index")
 
 
-def test_what_is_needed_to_normalise_is_there(tmp_path: Path) -> None:
+def test_the_statistics_for_normalisation_are_exported(tmp_path: Path) -> None:
     export(recording(tmp_path / "walk.mcap"), tmp_path / "set", "--group", "rosie.head")
     stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
     for name in ("observation.state", "action"):

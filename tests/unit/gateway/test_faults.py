@@ -33,7 +33,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("found", "line"), BEGIN.values(), ids=BEGIN)
-def test_each_change_is_told_once_in_both_directions(
+def test_each_change_is_reported_once_in_both_directions(
     found: Found, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     watch, out = FaultWatch(log, {"rosie.pan": create_autospec(Motor, instance=True)}), Output(as_json=True)
@@ -53,7 +53,7 @@ def test_of_a_gripper_that_is_said_which_is_enough(log: FaultLog, capsys: pytest
     assert told(capsys) == [("rosie.pan", "rosie.pan: overload. When you have looked: trade call rosie.pan.activate")]
 
 
-def test_of_two_faults_the_newest_is_told_and_it_is_well_when_both_are_gone(
+def test_of_two_faults_the_newest_is_shown_and_health_returns_when_both_are_gone(
     log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     watch, out = FaultWatch(log, {}), Output(as_json=True)

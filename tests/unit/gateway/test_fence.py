@@ -59,7 +59,7 @@ def staying() -> Iterator[Staying]:
     made.close()
 
 
-def test_it_is_told_to_leave_and_then_ended(staying: Staying) -> None:
+def test_it_is_asked_to_end_and_then_killed(staying: Staying) -> None:
     staying.until(0.0, 0.5)
     assert staying.says() == "told to leave"
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
@@ -72,7 +72,7 @@ def test_S20_one_that_is_frozen_is_ended_while_it_is(staying: Staying) -> None:
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
 
-def test_one_that_is_told_in_time_stays(staying: Staying) -> None:
+def test_a_child_that_is_renewed_in_time_stays(staying: Staying) -> None:
     staying.until(0.5, 1.0)
     over_at = uptime_s() + 1.0
     staying.until(500.0, 1000.0)
@@ -80,7 +80,7 @@ def test_one_that_is_told_in_time_stays(staying: Staying) -> None:
     assert staying.process.poll() is None
 
 
-def test_the_end_of_who_started_it_is_its_end_whatever_it_was_told(staying: Staying) -> None:
+def test_a_child_ends_with_the_process_that_started_it_whatever_its_orders(staying: Staying) -> None:
     assert staying.process.stdin is not None
     staying.process.stdin.close()
     assert staying.says() == "told to leave"

@@ -76,7 +76,7 @@ def test_the_commands_in_the_example_make_all_that_it_names(tmp_path: Path, monk
     assert len(said) == 3 and "gateway.toml is right" in said[-1]
 
 
-def test_a_gateway_that_its_policy_does_not_name_is_told_of(file: Path) -> None:
+def test_a_gateway_that_its_policy_does_not_name_is_reported(file: Path) -> None:
     change(file.parent / "policy.toml", 'gateways = ["door"]', 'gateways = ["other"]')
     assert read_gateway_file(file).settings  # it goes on, as it did before
     with pytest.raises(ConfigurationError, match=r'door.*gateways = \["other", "door"\]'):
@@ -278,7 +278,7 @@ def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) 
         read_gateway_file(file)
 
 
-def test_papers_of_a_container_are_told_from_those_of_a_gateway(file: Path) -> None:
+def test_certificates_of_containers_and_gateways_are_distinguished(file: Path) -> None:
     Papers(file.parent / "more").of("rosie")
     change(file, 'tls = "pki/issued/door"', 'tls = "more/issued/rosie"')
     said = r"gateway.toml: tls: .* has the certificate of 'rosie', which the policy does not list in gateways \(door\)"
@@ -306,7 +306,7 @@ def test_a_change_is_seen_in_the_file_the_policy_the_revoked_names_and_the_certi
     assert digest(file) not in seen  # and no error
 
 
-def test_what_has_changed_is_told_by_name(file: Path) -> None:
+def test_changes_are_reported_by_name(file: Path) -> None:
     def named() -> Named:
         return named_by(file, read_gateway_file(file))
 
@@ -388,7 +388,7 @@ def test_loopback_is_of_the_first_network_and_everywhere_of_all(
     )
 
 
-def test_the_addresses_of_this_host_are_told_by_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_addresses_of_this_host_are_listed_by_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "127.0.0.1" in addresses()[loopback_interface()]
 
     def address(family: int, text: str) -> SimpleNamespace:
@@ -407,7 +407,7 @@ def test_the_addresses_of_this_host_are_told_by_interface(monkeypatch: pytest.Mo
     assert addresses() == {"eth7": {"fd00::2", "fe80::1", "192.0.2.7"}}
 
 
-def test_a_host_that_forwards_between_the_networks_is_told_of(
+def test_a_host_that_forwards_between_the_networks_is_reported(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sysctls = tmp_path / "net"
@@ -440,7 +440,7 @@ def sharing(file: Path) -> Path:
     return file
 
 
-def test_the_share_of_the_example_is_right_and_told(sharing: Path) -> None:
+def test_the_share_of_the_example_is_right_and_shown(sharing: Path) -> None:
     plan = read_gateway_file(sharing)
     guest = plan.shares["clinic"]
     assert (guest.system, guest.identity, guest.bridge) == ("clinic", "guest", ())

@@ -24,7 +24,7 @@ def test_it_is_well_until_it_takes_no_calls_any_more(running: Gateway) -> None:
     assert not running.healthy
 
 
-def test_it_is_not_well_when_nobody_looks_after_its_children(running: Gateway) -> None:
+def test_a_gateway_is_unhealthy_when_its_supervision_has_ended(running: Gateway) -> None:
     assert running._supervisor is not None
     running._supervisor.close()
     assert running.container.healthy()

@@ -103,7 +103,7 @@ def test_what_comes_and_goes_is_in_the_document_as_it_does(served: Opened) -> No
     assert "/call/hall/set" not in anna.ask("GET", "/openapi.json").body["paths"]
 
 
-def test_each_operation_has_a_name_of_its_own_and_nothing_is_there_that_generators_do_not_read(served: Opened) -> None:
+def test_each_operation_has_a_unique_name_and_generators_read_all_of_the_document(served: Opened) -> None:
     told = served.client().ask("GET", "/openapi.json").body
     names = [operation["operationId"] for path in told["paths"].values() for operation in path.values()]
     assert len(names) == len(set(names))

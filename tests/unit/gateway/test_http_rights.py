@@ -105,7 +105,7 @@ def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
     assert len([one for one in told if one.kind == "refused"]) == 3  # else anybody could fill the record
 
 
-def test_a_client_is_told_who_it_is_and_what_it_may_do(served: Opened) -> None:
+def test_a_client_learns_its_identity_and_rights(served: Opened) -> None:
     anna, bert, chief = (served.client(name) for name in ("anna", "bert", "chief"))
     may_nothing = {"administers": False, "reads": False, "instruments": False}
     assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing}
@@ -133,7 +133,7 @@ def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(serv
     own.release()
 
 
-def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_system(served: Opened) -> None:
+def test_load_is_for_all_clients_and_subscriptions_are_for_readers_of_the_system(served: Opened) -> None:
     anna, chief = served.client("anna"), served.client("chief")
     assert {one["container"] for one in anna.ask("GET", "/loads").body} >= {"a", "b"}
     watching = served.robot.me.every(s=60, call=served.robot.find("a", "where_is_it"))
@@ -152,7 +152,7 @@ def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_s
     watching.cancel()
 
 
-def test_the_log_is_told_line_by_line_to_who_reads_the_system(served: Opened) -> None:
+def test_the_log_is_sent_line_by_line_to_clients_that_read_the_system(served: Opened) -> None:
     with served.client("chief").socket() as page:
         say(page, do="logs", id=1, level=30)
         served.robot.system.settle()
@@ -168,7 +168,7 @@ def test_the_log_is_told_line_by_line_to_who_reads_the_system(served: Opened) ->
         assert ask(page, do="logs", id=1)["problem"]["title"] == "AccessDenied"
 
 
-def test_who_reads_the_system_is_told_its_policy(served: Opened) -> None:
+def test_a_client_that_reads_the_system_sees_its_policy(served: Opened) -> None:
     chief = served.client("chief")
     told = chief.ask("GET", "/policy").body
     assert (told["governed"], told["revoked"]) == (True, [])
@@ -176,7 +176,7 @@ def test_who_reads_the_system_is_told_its_policy(served: Opened) -> None:
     assert (anna["roles"], anna["rights"]["call"], anna["rights"]["administer"]) == (["operator"], ["robot.a"], [])
 
 
-def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(served: Opened) -> None:
+def test_traced_calls_are_reported_as_they_end_to_clients_that_read_the_system(served: Opened) -> None:
     anna, chief = served.client("anna"), served.client("chief")
     assert "a" in chief.ask("POST", "/tracing", {"on": True}).body["containers"]
     try:
@@ -200,7 +200,7 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(
         chief.ask("POST", "/tracing", {"on": False})
 
 
-def test_the_newest_of_all_audit_records_of_a_folder_are_told_newest_first(tmp_path: Path) -> None:
+def test_the_newest_rows_of_all_audit_records_of_a_folder_are_shown_newest_first(tmp_path: Path) -> None:
     for name, times in (("a", (1, 3, 5)), ("b", (2, 4))):
         store = AuditStore(tmp_path / f"{name}.sqlite")
         store.add(
@@ -245,7 +245,7 @@ def test_who_is_revoked_is_let_in_no_more_and_what_it_moves_stops(served: Opened
     assert (refused.status, refused.title) == (403, "AccessDenied")
 
 
-def test_nobody_known_is_let_in_only_by_name(served: Opened, tmp_path: Path) -> None:
+def test_an_unidentified_client_is_admitted_only_if_the_policy_names_anonymous(served: Opened, tmp_path: Path) -> None:
     unknown = Client(served.gateway.url)
     answer = unknown.ask("GET", "/services")
     assert (answer.status, answer.title) == (401, "NotAuthenticated")

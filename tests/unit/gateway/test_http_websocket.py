@@ -73,7 +73,7 @@ def test_calls_and_their_errors_are_answered_under_their_ids(served: Opened) -> 
         assert {"id": "slow", "result": 2.0} in told
 
 
-def test_a_call_tells_how_far_it_is(served: Opened) -> None:
+def test_a_call_reports_its_progress(served: Opened) -> None:
     served.robot.system.container("walker").register(Walker(), "walker")
     served.robot.system.settle()
     with served.client().socket() as page:
@@ -211,7 +211,7 @@ def test_S05_a_call_ends_with_the_page_that_made_it(served: Opened) -> None:
     assert served["a"].written == []
 
 
-def test_S05_a_page_that_freezes_is_gone_although_its_connection_stands(served: Opened) -> None:
+def test_S05_a_frozen_page_is_dropped_although_its_connection_is_open(served: Opened) -> None:
     """It answers no pings and takes nothing more; a stream fills what lies between."""
     served.robot.system.container("walker").register(Walker(), "walker")
     served.robot.system.settle()
@@ -278,7 +278,7 @@ def test_a_stream_ends_with_its_service(served: Opened) -> None:
         assert told["problem"]["title"] == "ServiceGone"
 
 
-def test_services_that_come_and_go_are_told_of(served: Opened) -> None:
+def test_services_that_come_and_go_are_reported(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="watch", id=1, group="robot", name="move", existing=True, occasions=["joined", "left"])
         there = sorted(heard(page)["service"]["group"] for _ in range(3))

@@ -101,7 +101,9 @@ def test_again_it_writes_only_what_has_become_different(file: Path, root: Path) 
 
 
 @pytest.mark.parametrize("kind", ["changed since", "not written by"])
-def test_what_somebody_else_wrote_or_changed_is_overwritten_only_by_force(file: Path, root: Path, kind: str) -> None:
+def test_a_file_that_another_program_wrote_or_changed_is_overwritten_only_by_force(
+    file: Path, root: Path, kind: str
+) -> None:
     install(file, root)
     theirs = rules(root).read_text() + "# mine\n" if kind == "changed since" else "# mine\n"
     rules(root).write_text(theirs)

@@ -78,7 +78,7 @@ def test_a_refusal_says_why_and_ends_nothing() -> None:
     assert holder.held(2.0)
 
 
-def test_who_stands_in_has_it_once_the_last_lease_is_over_for_certain() -> None:
+def test_a_stand_in_serves_once_the_last_lease_is_certainly_over() -> None:
     arbiter = free(0.0)
     assert arbiter.due == waits_s(LEASE_S)
     granted(arbiter, 5.0)
@@ -89,7 +89,7 @@ def test_who_stands_in_has_it_once_the_last_lease_is_over_for_certain() -> None:
     assert not arbiter.asked(100.0, "", LEASE_S)
 
 
-def test_who_stands_in_gives_nothing_until_what_a_boot_before_left_has_ended() -> None:
+def test_a_stand_in_grants_nothing_until_leases_of_an_earlier_boot_have_ended() -> None:
     arbiter = Arbiter("rover", "boot")
     assert not arbiter.asked(0.0, "", LEASE_S)
     assert not arbiter.looked(1e6)
@@ -97,7 +97,7 @@ def test_who_stands_in_gives_nothing_until_what_a_boot_before_left_has_ended() -
     assert arbiter.asked(7.0, "", LEASE_S)
 
 
-def test_it_goes_back_by_hand_and_is_here_again_if_nobody_takes_it() -> None:
+def test_it_moves_back_by_hand_and_stays_here_if_no_container_takes_it() -> None:
     arbiter = free(0.0)
     arbiter.looked(50.0)
     arbiter.ended(51.0, LEASE_S)  # a crash is no reason to give it away

@@ -69,7 +69,7 @@ def test_one_that_misses_a_question_is_silent_and_up_again_with_the_next_answer(
         assert child.state is State.UP
 
 
-def test_one_that_never_answers_is_told_to_leave_then_killed_and_started_again() -> None:
+def test_a_child_that_never_answers_is_asked_to_end_then_killed_and_restarted() -> None:
     child = up()
     for _ in range(child.terms.misses - 1):
         child.due(child.deadline)
@@ -135,7 +135,7 @@ def test_who_asks_by_hand_has_it_started_at_once_with_a_clean_slate(how: str) ->
     assert child.state is State.UP
 
 
-def test_one_that_runs_is_saved_told_to_leave_and_started_again_by_hand_which_is_no_failure() -> None:
+def test_a_running_child_is_saved_ended_and_restarted_by_hand_without_a_failure() -> None:
     child = up(restarts=0)
     assert child.start(20.0) is Transition.SAVE
     assert child.saved(21.0) is Transition.LEAVE
@@ -147,7 +147,7 @@ def test_one_that_runs_is_saved_told_to_leave_and_started_again_by_hand_which_is
     assert child.state is State.GIVEN_UP
 
 
-def test_a_save_that_does_not_end_keeps_nobody_up() -> None:
+def test_a_save_that_does_not_end_delays_no_shutdown() -> None:
     child = up()
     assert child.stop(20.0, "the gateway leaves") is Transition.SAVE
     assert child.due(child.deadline) is Transition.LEAVE

@@ -111,7 +111,7 @@ def test_who_speaks_another_protocol_is_turned_away_and_that_is_said(live: Live)
     wait_until(lambda: said.extend(live.notices()) or any("handshake failed" in line for line in said))
 
 
-def test_who_comes_later_is_told_the_locks_and_the_faults_that_stand_and_nobody_else_is(live: Live) -> None:
+def test_a_late_page_gets_the_current_locks_and_faults_and_no_other_page_does(live: Live) -> None:
     live.write(Message(LOCKS, 3, 3, encoded(Locks(locks=[]))))
     for message in (fault("hot"), fault("silent", "rosie.tail"), fault("")):
         live.write(message)
@@ -128,7 +128,7 @@ def test_who_comes_later_is_told_the_locks_and_the_faults_that_stand_and_nobody_
         assert first.message()[2]["text"] == ""
 
 
-def test_a_topic_whose_schema_has_changed_is_offered_anew(live: Live) -> None:
+def test_a_topic_whose_schema_has_changed_is_offered_again(live: Live) -> None:
     live.write(picture("rosie.eye", b"abc", "png", 1, 1, 5))
     with viewer(live.url) as looking:
         looking.subscribe("/cameras/rosie.eye")
@@ -145,7 +145,7 @@ def test_a_topic_whose_schema_has_changed_is_offered_anew(live: Live) -> None:
         assert looking.message()[2]["encoding"] == "rgb8"
 
 
-def test_a_viewer_that_does_not_read_misses_messages_and_holds_nobody_up(live: Live) -> None:
+def test_a_viewer_that_does_not_read_misses_messages_and_delays_no_other(live: Live) -> None:
     many, large = (
         400,
         Message(Channel("/large", "Large", b'{"type": "object"}'), 0, 0, b'{"a": "%s"}' % (b"x" * 500_000)),

@@ -54,7 +54,7 @@ def _state(at_s: float, position: float, name: str = "rosie.neck.pan") -> JointS
 
 
 @pytest.mark.parametrize(("hz", "jitter_s"), [(50, 0.0), (50, 0.015), (20, 0.02), (200, 0.0)])
-def test_what_a_servo_did_at_its_limits_it_can_be_told_again(hz: float, jitter_s: float) -> None:
+def test_a_servo_repeats_on_command_what_it_did_at_its_limits(hz: float, jitter_s: float) -> None:
     motion = motion_of("rosie.head", states(hz=hz, jitter_s=jitter_s))
     way, speed = fitted(motion, 1.0, [LIMITS])
     assert 0.95 <= speed <= 1.0
@@ -72,7 +72,7 @@ def test_half_the_speed_takes_twice_as_long() -> None:
     assert slow[12].velocities_rad_s == [velocity / 2 for velocity in once[12].velocities_rad_s]
 
 
-def test_of_what_stands_still_at_both_ends_half_a_second_is_left() -> None:
+def test_of_stillness_at_both_ends_half_a_second_is_kept() -> None:
     whole = motion_of("rosie.head", states(seconds=60, late_s=40))
     part = moving(whole)
     once = moving(motion_of("rosie.head", states(seconds=4)))

@@ -26,7 +26,7 @@ def heard(opened: socket.socket) -> dict[str, str]:
     return {name: value for name, _, value in (line.partition("=") for line in lines)}
 
 
-def test_each_thing_is_told_in_one_datagram(listener: tuple[str, socket.socket]) -> None:
+def test_each_thing_is_sent_in_one_datagram(listener: tuple[str, socket.socket]) -> None:
     name, opened = listener
     with Notifier({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "30000000"}) as notifier:
         notifier.ready("two networks\nSTOPPING=1")
@@ -46,7 +46,7 @@ def test_each_thing_is_told_in_one_datagram(listener: tuple[str, socket.socket])
     [{}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "soon"}, {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}],
     ids=str,
 )
-def test_a_watchdog_that_watches_somebody_else_or_nobody_is_not_fed(
+def test_a_watchdog_that_watches_another_source_or_none_is_not_fed(
     listener: tuple[str, socket.socket], asked: dict[str, str]
 ) -> None:
     name, opened = listener
@@ -66,7 +66,7 @@ def test_a_watchdog_of_this_very_process_is_fed(listener: tuple[str, socket.sock
 
 
 @pytest.mark.parametrize("name", ["", "vsock:2:9999", "/nowhere/notify"])
-def test_where_nobody_listens_nothing_is_told_and_nothing_fails(name: str) -> None:
+def test_without_listeners_nothing_is_sent_and_nothing_fails(name: str) -> None:
     with Notifier({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1000000"}) as notifier:
         notifier.ready("up")
         notifier.alive()

@@ -82,7 +82,7 @@ def test_the_next_certificate_has_the_same_key_and_hosts_and_nothing_is_left_bes
     assert first.until is not None and second.until is not None and first.until < second.until
 
 
-def test_whoever_reads_a_certificate_while_it_is_replaced_gets_a_whole_one(
+def test_a_reader_of_a_certificate_gets_a_whole_one_while_it_is_replaced(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = authority.issue("arm").folder / "cert.pem"
@@ -98,7 +98,7 @@ def test_whoever_reads_a_certificate_while_it_is_replaced_gets_a_whole_one(
     assert path.read_bytes() != before
 
 
-def test_with_another_key_it_begins_anew(authority: Authority) -> None:
+def test_a_certificate_with_another_key_keeps_no_addresses(authority: Authority) -> None:
     first = authority.issue("arm", addresses=["10.0.0.5"])
     key = (first.folder / "key.pem").read_bytes()
     second = authority.issue("arm", new_key=True)
@@ -109,7 +109,7 @@ def test_with_another_key_it_begins_anew(authority: Authority) -> None:
 
 
 @pytest.mark.parametrize("gone", ["key.pem", "cert.pem"])
-def test_what_is_not_there_any_more_is_not_renewed_but_made_anew(authority: Authority, gone: str) -> None:
+def test_a_certificate_that_no_longer_exists_is_not_renewed_but_issued_again(authority: Authority, gone: str) -> None:
     folder = authority.issue("arm").folder
     (folder / gone).unlink()
     with pytest.raises(ConfigurationError, match=f"{gone}.*--force"):
@@ -118,7 +118,7 @@ def test_what_is_not_there_any_more_is_not_renewed_but_made_anew(authority: Auth
 
 
 @pytest.mark.parametrize(("first", "second"), [("gateway", "container"), ("container", "gateway")])
-def test_the_name_of_a_gateway_is_never_signed_for_somebody_else(authority: Authority, first: Any, second: Any) -> None:
+def test_the_name_of_a_gateway_is_never_signed_for_another_owner(authority: Authority, first: Any, second: Any) -> None:
     given = authority.issue("door", purpose=first)
     before = files(given.folder)
     for force in (False, True):
@@ -214,7 +214,7 @@ def test_a_new_authority_has_a_list_of_revoked_names_that_a_policy_can_name(auth
 @pytest.mark.parametrize(
     "text", ["revoked = arm", "revoked = 'arm'", "revoked = [1]", "revoked = ['a b']", "", "names = []"]
 )
-def test_a_damaged_list_forgets_nobody(authority: Authority, text: str) -> None:
+def test_a_damaged_list_forgets_no_one_revoked(authority: Authority, text: str) -> None:
     authority.issue("arm")
     (authority.folder / "revoked.toml").write_text(text)
     for act in (lambda: authority.issue("arm"), lambda: authority.revoke("arm"), authority.issued):
@@ -307,7 +307,7 @@ def test_the_commands_make_an_identity_and_say_how_to_start_with_it(folder: Path
     assert {"TRADE_SYSTEM", "TRADE_POLICY", "TRADE_CONNECT"} <= variables.keys()
 
 
-def test_who_has_no_address_is_told_to_dial_and_not_to_listen(folder: Path) -> None:
+def test_a_host_without_address_is_advised_to_dial_and_not_to_listen(folder: Path) -> None:
     said("init", folder)
     issued = said("issue", "planner", "--ca", folder).stdout
     assert "TRADE_LISTEN" not in issued
@@ -322,7 +322,7 @@ def test_the_commands_that_it_advises_are_there(folder: Path, purpose: str) -> N
     assert advised and set(advised) <= vars(typer.main.get_command(build()))["commands"].keys()
 
 
-def test_a_gateway_is_told_of_its_file_with_all_its_addresses(folder: Path) -> None:
+def test_a_gateway_receives_its_file_with_all_its_addresses(folder: Path) -> None:
     said("init", folder)
     addresses = ["--address", "192.168.7.1", "--address", "10.0.0.7", "--host", "gate.example"]
     issued = said("issue", "gate", "--for", "gateway", *addresses, "--ca", folder).stdout
@@ -333,7 +333,7 @@ def test_a_gateway_is_told_of_its_file_with_all_its_addresses(folder: Path) -> N
     assert 'gateways = ["gate"]' in issued
 
 
-def test_of_the_next_certificate_only_what_to_copy_is_told(folder: Path) -> None:
+def test_of_the_next_certificate_only_the_files_to_copy_are_listed(folder: Path) -> None:
     said("init", folder)
     said("issue", "arm", "--address", "10.0.0.5", "--ca", folder)
     renewed = said("issue", "arm", "--ca", folder).stdout

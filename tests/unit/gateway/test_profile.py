@@ -81,7 +81,7 @@ def test_what_never_came_before_is_new_with_its_call() -> None:
     assert (back.before, back.after, back.call_id) == ("x", "a", 4)
 
 
-def test_what_has_become_much_rarer_is_told_with_what_came_instead() -> None:
+def test_a_sequence_that_became_rare_is_reported_with_what_replaced_it() -> None:
     usual = learn(played(*["a", "b", "a", "c"] * 20))
     [gone] = deviations(played(*["a", "b"] * 40), usual)
     assert (gone.kind, gone.before, gone.after, gone.now) == ("rarer", "a", "c", 0.0)

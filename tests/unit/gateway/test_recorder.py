@@ -187,7 +187,7 @@ def _move(container: Container, *args: object) -> None:
     container.find(where(name="move_to", group="rosie.neck.pan"), wait_s=PATIENCE_S)(*args)
 
 
-def test_calls_are_told_without_arguments_and_samples_are_no_calls(record: Record, robot: Container) -> None:
+def test_calls_are_reported_without_arguments_and_samples_are_no_calls(record: Record, robot: Container) -> None:
     record(lambda sink: robot._parts.caller.spans is not None)
     _move(robot, 0.5, "swordfish")
     with pytest.raises(ValueError, match="too far"):
@@ -207,7 +207,7 @@ def test_calls_are_noted_only_while_one_records(record: Record, recorder: Record
     assert robot._parts.caller.spans is None
 
 
-def test_who_noted_calls_before_goes_on_with_it(
+def test_a_client_that_traced_calls_before_continues(
     robot: Container, head: JointGroup, start_container: Callable[..., Container]
 ) -> None:
     robot.set_tracing(True, container="robot")
@@ -227,7 +227,7 @@ def test_who_noted_calls_before_goes_on_with_it(
     assert robot._parts.caller.spans is not None
 
 
-def test_locks_are_told_whenever_they_change(record: Record, robot: Container) -> None:
+def test_locks_are_sent_whenever_they_change(record: Record, robot: Container) -> None:
     record(lambda sink: sink.by_topic["/locks"] == [{"locks": []}])
     with robot.lock(where(group="rosie.neck.pan"), purpose="look"):
         seen = record(lambda sink: bool(sink.by_topic["/locks"][-1]["locks"]))
@@ -236,7 +236,9 @@ def test_locks_are_told_whenever_they_change(record: Record, robot: Container) -
     record(lambda sink: not sink.by_topic["/locks"][-1]["locks"])
 
 
-def test_changes_of_health_and_e_stops_are_told_with_their_ends(record: Record, robot: Container, pan: Motor) -> None:
+def test_changes_of_health_and_e_stops_are_reported_with_their_ends(
+    record: Record, robot: Container, pan: Motor
+) -> None:
     record(lambda sink: bool(sink.by_topic["/locks"]))
     robot.set_health(pan, "hot")
     record(lambda sink: [fault["text"] for fault in sink.by_topic["/faults"]] == ["hot"])
@@ -250,7 +252,7 @@ def test_changes_of_health_and_e_stops_are_told_with_their_ends(record: Record, 
     assert estop is not None
 
 
-def test_a_service_that_fails_is_told_once_until_it_answers_again(record: Record, pan: Motor) -> None:
+def test_a_service_that_fails_is_reported_once_until_it_answers_again(record: Record, pan: Motor) -> None:
     record(lambda sink: bool(sink.by_topic["/rosie.head/joints"]))
     pan.sick = True
     seen = record(lambda sink: bool(sink.by_topic["/faults"]))
@@ -262,7 +264,7 @@ def test_a_service_that_fails_is_told_once_until_it_answers_again(record: Record
     ]
 
 
-def test_the_fault_of_a_joint_is_told_once_and_so_is_its_end(record: Record, pan: Motor) -> None:
+def test_the_fault_of_a_joint_is_reported_once_and_so_is_its_end(record: Record, pan: Motor) -> None:
     record(lambda sink: bool(sink.by_topic["/rosie.head/joints"]))
     pan.fault = "hot"
     seen = record(lambda sink: sink.by_topic["/rosie.head/joints"][-1]["fault"] == ["hot"])
@@ -310,7 +312,7 @@ def test_the_command_says_what_it_records_how_far_it_is_and_what_there_is(tmp_pa
 
 
 @pytest.mark.usefixtures("head")
-def test_a_full_disk_is_said_and_the_exit_code_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_with_an_exit_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_progress, "RecordingFile", partial(RecordingFile, opened=lambda path: FullDisk(path, 15_000)))
     file = tmp_path / "a.mcap"
     code, _, errors = _lines(str(file), "--seconds", str(PATIENCE_S), "--camera-hz", "100")

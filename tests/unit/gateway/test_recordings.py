@@ -123,7 +123,7 @@ def test_groups_are_whole_segments() -> None:
     assert within("anything", [])
 
 
-def test_what_was_flushed_is_there_though_the_writer_never_came_to_its_end(tmp_path: Path) -> None:
+def test_flushed_records_are_present_though_the_writer_never_ended_properly(tmp_path: Path) -> None:
     file = RecordingFile(tmp_path / "a.mcap", {})
     for second in range(5):
         file.write(joints(second))
@@ -160,7 +160,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
         list(entries(tmp_path / "b.mcap"))
 
 
-def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("precious")
     with pytest.raises(ConfigurationError, match="File exists"):
         RecordingFile(tmp_path / "a.mcap", {})
@@ -251,7 +251,7 @@ def test_nothing_else_saves_anything(kept: Kept, message: Message) -> None:
     assert kept.saved == []
 
 
-def test_what_could_not_be_saved_is_told_and_kept_for_the_next_event(kept: Kept) -> None:
+def test_state_that_could_not_be_saved_is_reported_and_kept_for_the_next_event(kept: Kept) -> None:
     kept.sink.write(joints(0))
     kept.folder.rmdir()
     kept.sink.write(fault(1))

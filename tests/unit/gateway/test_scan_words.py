@@ -61,7 +61,7 @@ def test_a_program_gets_them_as_json(line: DynamixelBus) -> None:
     assert (found["port"], found["id"], found["torque"], found["problem"]) == (str(line.port), 2, False, "")
 
 
-def test_nobody_is_an_exit_code_of_its_own(line: DynamixelBus) -> None:
+def test_finding_no_container_has_an_exit_code_of_its_own(line: DynamixelBus) -> None:
     said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "7", "--driver", "dynamixel")
     assert said.exit_code == 1
     assert "no device answers" in said.output
@@ -84,7 +84,7 @@ def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: Dyna
         ({"driver": "feetech"}, "drivers dynamixel and feetech"),
     ],
 )
-def test_what_cannot_be_in_one_robot_file_is_told(second: dict[str, object], complaint: str) -> None:
+def test_contradictions_within_one_robot_file_are_reported(second: dict[str, object], complaint: str) -> None:
     one = Found(driver="dynamixel", baud=1_000_000, id=1, model="XL430-W250")
     other = Found(**{"driver": "dynamixel", "baud": 1_000_000, "id": 2, "model": "XL430-W250"} | second)  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match=complaint):
@@ -146,7 +146,7 @@ def test_a_driver_whose_devices_are_set_up_otherwise_says_so(line: DynamixelBus)
     assert "driver ur has no scan" in str(error)
 
 
-def test_a_scan_that_finds_a_problem_tells_its_exit_code(tmp_path: Path) -> None:
+def test_a_scan_that_finds_a_problem_ends_with_its_exit_code(tmp_path: Path) -> None:
     with DynamixelBus([Servo(1), Servo(1)], tmp_path / "line", paced=False) as sim:
         said = trade("scan", "--port", sim.port, "--bauds", 1_000_000, "--driver", "dynamixel")
     assert "Unplug all devices but one" in said.output
@@ -163,7 +163,7 @@ def test_a_scan_that_finds_a_problem_tells_its_exit_code(tmp_path: Path) -> None
     ],
     ids=" ".join,
 )
-def test_a_port_that_is_none_is_named_without_a_key_that_nobody_wrote(tmp_path: Path, words: tuple[str, ...]) -> None:
+def test_an_invalid_port_is_named_without_a_key_that_is_not_in_the_file(tmp_path: Path, words: tuple[str, ...]) -> None:
     (tmp_path / "no").write_text("no port", encoding="utf-8")
     error = trade(*words, "--port", tmp_path / "no").exception
     assert str(error).startswith(f"{tmp_path / 'no'}: is not a serial port")

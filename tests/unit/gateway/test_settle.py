@@ -14,7 +14,7 @@ def _thaw() -> Iterator[None]:
     gc.unfreeze()
 
 
-def test_what_stands_is_left_out_of_collections_and_what_comes_later_is_not() -> None:
+def test_existing_objects_are_left_out_of_collections_and_later_ones_are_not() -> None:
     stood = len(gc.get_objects())
     settle()
     assert len(gc.get_objects()) < stood / 20

@@ -79,7 +79,7 @@ def opened(path: Path, told: list[str]) -> Iterator[Callable[[], StateStore]]:
     made[-1].close()
 
 
-def test_what_was_saved_last_is_there_for_the_next_process(opened: Callable[[], StateStore], told: list[str]) -> None:
+def test_the_last_save_is_available_to_the_next_process(opened: Callable[[], StateStore], told: list[str]) -> None:
     store = opened()
     assert store.load("a") == {}
     assert store.save("a", {"lamp": {"on": True}, "clock": [1, 2.5, "x", b"y", None]})
@@ -149,7 +149,7 @@ def test_without_its_folder_it_says_so_once_and_again_when_there_is_one(
     assert store.load("a") == {"lamp": 1}
 
 
-def test_on_a_full_disk_the_last_save_stays_and_it_goes_on_when_there_is_room(
+def test_on_a_full_disk_the_last_save_is_kept_and_saving_resumes_when_there_is_room(
     opened: Callable[[], StateStore], told: list[str]
 ) -> None:
     store = opened()
@@ -203,7 +203,7 @@ def _whole(path: Path) -> int:
     return turn
 
 
-def test_killed_at_each_step_of_a_save_the_last_whole_save_is_there(tmp_path: Path) -> None:
+def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: Path) -> None:
     *killed, done = _saver(tmp_path, "step by step").communicate(timeout=100)[0].split()
     assert (set(killed), done) == ({str(-signal.SIGKILL)}, "0")
     outcomes = [_whole(tmp_path / f"{step}.sqlite") for step in range(1, len(killed) + 2)]
@@ -211,7 +211,7 @@ def test_killed_at_each_step_of_a_save_the_last_whole_save_is_there(tmp_path: Pa
     assert outcomes == sorted(outcomes)
 
 
-def test_killed_at_any_moment_what_was_said_to_be_saved_is_there(tmp_path: Path) -> None:
+def test_killed_at_any_moment_every_confirmed_save_is_kept(tmp_path: Path) -> None:
     path, dice = tmp_path / "state.sqlite", random.Random(7)
     for _ in range(4):
         child = _saver(path, "for ever")

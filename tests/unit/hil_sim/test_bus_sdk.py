@@ -29,7 +29,7 @@ def test_ping_answers_model_and_an_absent_id_is_silence(sdk: SimpleNamespace) ->
     assert sdk.ph.ping(sdk.port, 9)[1] == dynamixel_sdk.COMM_RX_TIMEOUT
 
 
-def test_a_broadcast_ping_finds_everybody(sdk: SimpleNamespace) -> None:
+def test_a_broadcast_ping_finds_all_servos(sdk: SimpleNamespace) -> None:
     assert sdk.ph.broadcastPing(sdk.port) == ({1: [1060, 45], 2: [1060, 45], 3: [1060, 45]}, 0)
 
 
@@ -58,7 +58,7 @@ def test_a_move_is_seen_by_client_and_log(sdk: SimpleNamespace, bus: DynamixelBu
     assert (end.device_id, end.position_counts) == (1, 2200)
 
 
-def test_the_log_says_where_a_servo_is_as_it_is_told_to_move(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
+def test_the_log_has_the_position_of_a_servo_when_it_gets_a_goal(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, TORQUE, 1) == OK
     for goal in (2200, 2100):
         assert sdk.ph.write4ByteTxRx(sdk.port, 1, GOAL, goal) == OK
@@ -143,7 +143,7 @@ def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace) -> None:
     assert sdk.ph.read1ByteTxRx(sdk.port, 1, 65) == (0, *OK)
 
 
-def test_factory_reset_spares_id_and_baud_if_told_to(sdk: SimpleNamespace) -> None:
+def test_factory_reset_spares_id_and_baud_on_request(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write4ByteTxRx(sdk.port, 2, 24, 99) == OK
     assert sdk.ph.factoryReset(sdk.port, 2, 0x02) == OK
     wait_until(lambda: sdk.ph.read4ByteTxRx(sdk.port, 2, 24) == (10, *OK), "the servo after its reset")
@@ -216,7 +216,7 @@ def test_a_new_id_is_known_at_once_by_its_new_name(sdk: SimpleNamespace) -> None
     assert sdk.ph.ping(sdk.port, 30) == (1060, *OK)
 
 
-def test_at_another_baud_rate_nobody_answers(bus: DynamixelBus, open_sdk: Any) -> None:
+def test_at_another_baud_rate_no_servo_answers(bus: DynamixelBus, open_sdk: Any) -> None:
     slow = open_sdk(bus, baud=57_600)
     assert slow.ph.ping(slow.port, 1)[1] == dynamixel_sdk.COMM_RX_TIMEOUT
     assert [e.name for e in bus.log.entries if e.kind == "event"] == ["wrong_baud"]

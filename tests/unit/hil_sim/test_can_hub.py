@@ -229,7 +229,7 @@ def test_a_wrong_channel_or_word_is_refused(make_can: Any) -> None:
     assert [e.detail for e in events(bus.log.entries, "misunderstood")] == ["rawmode", "not a frame: 999 1 1"]
 
 
-def test_a_client_that_does_not_read_holds_nobody_up(make_can: Any, connect: Any) -> None:
+def test_a_client_that_does_not_read_delays_no_other(make_can: Any, connect: Any) -> None:
     bus = make_can(1)
     awake = connect(bus)
     with socket.socket() as asleep:
@@ -347,7 +347,7 @@ def test_an_adapter_that_is_bus_off_says_so_and_carries_nothing(make_can: Any, c
     assert [f.data for f in bus.devices[0].heard] == [b"\x07"]
 
 
-def test_an_adapter_that_echoes_tells_clients_their_own_frames(make_can: Any, connect: Any) -> None:
+def test_an_adapter_that_echoes_sends_clients_their_own_frames(make_can: Any, connect: Any) -> None:
     bus = make_can(1)
     client = connect(bus)
     bus.do(Echo())

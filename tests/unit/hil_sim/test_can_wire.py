@@ -141,7 +141,7 @@ def test_a_destroyed_frame_is_sent_again_until_its_sender_is_bus_off() -> None:
     assert not third.off
 
 
-def test_frames_nobody_acknowledges_wait_as_in_a_transmit_queue_and_leave_when_somebody_comes() -> None:
+def test_unacknowledged_frames_wait_as_in_a_transmit_queue_and_leave_when_a_node_joins() -> None:
     wire = Wire(1_000_000, notes := Notes())
     one = station(wire)
     for k in range(12):

@@ -177,7 +177,7 @@ def test_canopen_reads_names_numbers_and_refusals(make_drives: Any, connect: Any
     assert refused.value.code == 0x0601_0002
 
 
-def test_canopen_enables_a_drive_moves_it_and_is_told_of_faults(
+def test_canopen_enables_a_drive_moves_it_and_receives_its_faults(
     make_drives: Any, connect: Any, open_master: Any
 ) -> None:
     bus = make_drives(5)

@@ -158,7 +158,7 @@ def test_a_set_point_may_take_over_at_once_or_be_relative() -> None:
     assert bench.position == 600
 
 
-def test_halt_stops_and_its_end_goes_on() -> None:
+def test_halt_stops_and_motion_continues_at_its_end() -> None:
     bench = enabled(Mode.PROFILE_POSITION)
     move(bench, 20_000)
     bench.run(0.3)

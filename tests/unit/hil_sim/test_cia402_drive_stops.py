@@ -131,7 +131,7 @@ FAULTS: list[Any] = [
 
 
 @pytest.mark.parametrize(("fault", "code", "register"), FAULTS)
-def test_a_fault_stops_it_is_told_and_stays_until_it_is_reset(fault: Any, code: int, register: int) -> None:
+def test_a_fault_stops_the_drive_is_reported_and_stays_until_reset(fault: Any, code: int, register: int) -> None:
     bench = enabled(Mode.PROFILE_VELOCITY)
     bench.hear(0, "0105")
     bench.put(0x60FF, 20_000, 4)
@@ -182,7 +182,7 @@ def test_a_fault_reaction_ramps_as_its_option_says(option: int, ratio: int) -> N
     assert bench.until(lambda: bench.state is State.FAULT, within_s=1) == pytest.approx(0.4 / ratio, abs=0.003)
 
 
-def test_a_held_shaft_shows_full_torque_and_goes_on_when_it_is_let_go() -> None:
+def test_a_held_shaft_shows_full_torque_and_continues_when_released() -> None:
     bench = enabled(Mode.CYCLIC_VELOCITY)
     bench.put(0x6065, 1_000_000, 4)
     bench.put(0x60FF, 5000, 4)

@@ -227,7 +227,7 @@ def remap(bench: Bench, index: int, cob_id: int, entries: list[int]) -> None:
     bench.put(index, cob_id, 4, 1)
 
 
-def test_pdos_can_be_mapped_anew(running: Bench) -> None:
+def test_pdos_can_be_remapped(running: Bench) -> None:
     remap(running, 0x1801, 0x285, [0x6064_0020, 0x6061_0008, 0x6041_0010])
     assert running.frames(0x285) == ["00000000" + "00" + "7002"]
     remap(running, 0x1401, 0x305, [0x0005_0008, 0x6040_0010, 0x607A_0020])  # a dummy skips a byte

@@ -89,7 +89,7 @@ def test_it_closes_also_if_its_last_client_woke_it_up_before_the_bell(path: Path
     assert server._rope.fileno() == -1
 
 
-def test_state_tells_the_truth_about_every_device(control: SimControl, buses: list[DynamixelBus]) -> None:
+def test_state_is_the_truth_about_every_device(control: SimControl, buses: list[DynamixelBus]) -> None:
     neck, arm = control.state()
     assert (neck.name, neck.port, neck.plugged) == ("neck", str(buses[0].port), True)
     assert [d.device_id for d in [*neck.devices, *arm.devices]] == [1, 2, 3]

@@ -26,7 +26,7 @@ def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> Non
     errands.close()
 
 
-def test_who_waits_when_it_closes_is_told_and_so_is_who_asks_later() -> None:
+def test_closing_informs_waiting_clients_and_refuses_later_ones() -> None:
     errands = Mailbox("bus leg", PATIENCE_S)
     errands.open()
     done: list[str] = []

@@ -96,7 +96,7 @@ def test_a_late_answer_is_taken_for_the_next_one(sdk: SimpleNamespace, bus: Dyna
     assert (result, profile_velocity) == (0, 2048)
 
 
-def test_a_late_answer_leaves_while_the_bus_goes_on(make_bus: Any) -> None:
+def test_a_late_answer_leaves_while_the_bus_continues(make_bus: Any) -> None:
     import serial
 
     from trade_hil_sim.dynamixel import encode
@@ -229,7 +229,7 @@ def test_a_fault_for_a_device_that_is_not_there_is_an_error(bus: DynamixelBus) -
         bus.do(Mute(ids=(9,)))
 
 
-def test_s06_an_unplugged_servo_goes_on_until_its_watchdog_stops_it(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
+def test_s06_an_unplugged_servo_continues_until_its_watchdog_stops_it(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     """The adapter is gone, the supply is not."""
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 64, 1) == (0, 0)
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, 112, 10) == (0, 0)

@@ -69,7 +69,7 @@ def test_negative_values_are_what_the_client_takes_them_for(client: Any, bus: Fe
     assert client.read_register(1, "homing_offset") == -85
 
 
-def test_the_client_is_told_of_what_a_servo_complains_of(client: Any, bus: FeetechBus) -> None:
+def test_the_client_receives_the_error_bits_of_a_servo(client: Any, bus: FeetechBus) -> None:
     bus.do(sim.HardwareFault(ids=(1,), bits=0x20))
     assert client.read_status(1) == [0x20]
     assert client.read_status(2) == [0]
@@ -126,7 +126,7 @@ def test_a_reg_write_waits_for_its_action(bus: FeetechBus) -> None:
     ],
     ids=["checksum", "unknown", "too short", "another id", "broadcast write", "cut off"],
 )
-def test_what_makes_no_sense_or_is_for_nobody_is_not_answered(bus: FeetechBus, data: bytes) -> None:
+def test_meaningless_and_unaddressed_messages_are_not_answered(bus: FeetechBus, data: bytes) -> None:
     assert nothing(bus, data)
 
 

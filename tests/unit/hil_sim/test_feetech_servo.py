@@ -121,7 +121,7 @@ def test_a_goal_switches_torque_on_as_on_real_servos(rig: Rig) -> None:
     assert rig.told == ["torque_on", "motion_started", "at_rest"]
 
 
-def test_one_told_not_to_keeps_a_goal_without_torque_and_torque_goes_for_it(clock: Any) -> None:
+def test_a_servo_set_not_to_keeps_a_goal_without_torque_and_torque_moves_it_there(clock: Any) -> None:
     rig = Rig(clock, goal_switches_on=False)
     rig.write(GOAL, 3000)
     rig.pass_s(2)
@@ -167,7 +167,7 @@ def test_straining_against_a_jam_is_an_overload_after_its_time(rig: Rig) -> None
     assert rig.told[-1] == "shutdown"
 
 
-def test_freed_after_an_overload_it_goes_on_by_itself_with_what_torque_it_has_left(rig: Rig) -> None:
+def test_released_after_an_overload_it_continues_by_itself_with_its_remaining_torque(rig: Rig) -> None:
     strain(rig)
     rig.servo.jam(False, rig.clock())
     rig.pass_s(0.5)

@@ -90,7 +90,7 @@ def test_it_sees_the_clients_baud_rate(line: SerialLine, parrot: Parrot, baud: i
     assert parrot.bauds == [baud]
 
 
-def test_unplugging_is_an_error_for_whoever_has_it_open(line: SerialLine, port: serial.Serial) -> None:
+def test_unplugging_is_an_error_for_the_process_that_has_it_open(line: SerialLine, port: serial.Serial) -> None:
     line.unplug()
     assert not line.plugged
     assert not line.link.is_symlink()
@@ -146,7 +146,7 @@ def test_an_answer_pending_at_unplugging_is_lost(line: SerialLine, port: serial.
         assert again.read(1) == b"y"
 
 
-def test_a_client_that_does_not_read_loses_bytes_and_stops_nobody(
+def test_a_client_that_does_not_read_loses_bytes_and_stops_no_other(
     line: SerialLine, port: serial.Serial, parrot: Parrot, log: ByteLog
 ) -> None:
     parrot.answering = lambda line, data: line.send(data * 50)
@@ -198,7 +198,7 @@ def test_a_line_never_opened_closes_without_ado(tmp_path: Path, parrot: Parrot) 
     SerialLine(tmp_path / "tty", parrot).close()
 
 
-def test_a_link_left_by_somebody_killed_is_replaced(tmp_path: Path, parrot: Parrot) -> None:
+def test_a_link_left_by_a_killed_process_is_replaced(tmp_path: Path, parrot: Parrot) -> None:
     (tmp_path / "tty").symlink_to("/dev/pts/99999")
     parrot.line = SerialLine(tmp_path / "tty", parrot, paced=False)
     with parrot.line, serial.Serial(str(tmp_path / "tty"), timeout=10) as port:

@@ -44,13 +44,13 @@ def test_a_line_half_written_is_left_for_later(tmp_path: Path) -> None:
     assert read_log(tmp_path / "empty") == []
 
 
-def test_bytes_are_told_by_direction_time_and_bus() -> None:
+def test_bytes_are_shown_by_direction_time_and_bus() -> None:
     assert received(STORY) == b"\x01\x02"
     assert received(STORY, bus="arm") == b""
     assert sent(STORY, since=1.05, until=1.15) == b"\xaa"
 
 
-def test_an_instruction_to_everybody_concerns_everybody_and_a_group_read_those_it_names() -> None:
+def test_a_broadcast_instruction_reaches_all_and_a_group_read_the_named_servos() -> None:
     assert [e.t for e in instructions(STORY, device_id=1)] == [1.0, 2.0, 4.0, 5.0]
     assert [e.t for e in instructions(STORY, device_id=3)] == [4.0, 5.0]
     assert [e.t for e in instructions(STORY, "ping")] == [5.0]
@@ -63,6 +63,6 @@ def test_motion_writes_are_the_writes_that_could_move_something() -> None:
     assert [e.t for e in writes(STORY, register="bus_watchdog")] == [3.0]
 
 
-def test_events_are_told_by_name_and_device() -> None:
+def test_events_are_reported_by_name_and_device() -> None:
     assert [e.name for e in events(STORY)] == ["torque_on", "at_rest"]
     assert [e.position_counts for e in events(STORY, "at_rest", device_id=3)] == [7]

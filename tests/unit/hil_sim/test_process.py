@@ -121,7 +121,7 @@ def test_it_ends_when_standard_input_does(robot_file: Path) -> None:
         assert process.wait(20) == 0
 
 
-def test_a_robot_file_it_cannot_use_is_told_on_standard_error(robot_file: Path, tmp_path: Path) -> None:
+def test_a_robot_file_it_cannot_use_is_reported_on_standard_error(robot_file: Path, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match=r"nothere\.toml"):
         SimProcess(tmp_path / "nothere.toml")
     robot_file.write_text(robot_file.read_text().replace("XM430-W350", "AX-12A"))
@@ -152,14 +152,14 @@ def test_one_that_runs_is_struck_by_a_command(robot_file: Path, words: str, done
         assert [one.name for one in sim.entries()[before:] if one.name in done] == done
 
 
-def test_the_state_is_told_by_a_command(robot_file: Path) -> None:
+def test_the_state_is_shown_by_a_command(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         assert strike(str(sim.control_path), "absent ids=1 on=false") == (0, "", "")
         code, said, _ = strike(str(sim.control_path), "state")
         assert (code, json.loads(said.splitlines()[0])["name"]) == (0, "neck")
 
 
-def test_what_the_simulator_refuses_is_told_in_one_line(robot_file: Path) -> None:
+def test_a_refusal_of_the_simulator_is_reported_in_one_line(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         for words, why in (
             ("jam ids=99", "no bus has a device [99]; there is [1, 2] on neck, [3] on arm"),
@@ -183,7 +183,7 @@ def test_what_the_simulator_refuses_is_told_in_one_line(robot_file: Path) -> Non
         ("", "--do takes the control socket"),
     ],
 )
-def test_wrong_words_are_told_in_one_line_before_anything_is_sent(
+def test_wrong_arguments_are_reported_in_one_line_before_anything_is_sent(
     words: str, why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--do", "/nowhere/_control", *words.split()]) == 2
@@ -193,7 +193,7 @@ def test_wrong_words_are_told_in_one_line_before_anything_is_sent(
     assert why in problem
 
 
-def test_a_command_for_nobody_says_where_it_looked(tmp_path: Path) -> None:
+def test_a_command_without_matching_service_says_where_it_searched(tmp_path: Path) -> None:
     code, _, problem = strike(str(tmp_path / "none"), "heal")
     assert (code, problem.count("\n")) == (1, 1)
     assert f"no simulator listens on {tmp_path / 'none'}" in problem
@@ -213,7 +213,7 @@ def test_help_lists_every_fault() -> None:
         assert all(key in line for key in kind.__struct_fields__ if key != "bus")
 
 
-def test_the_package_alone_imports_nothing_of_ours() -> None:
+def test_the_package_alone_imports_none_of_our_other_packages() -> None:
     code = "import trade_hil_sim, sys; print(sorted({'trade', 'trade_drivers', 'zenoh'} & set(sys.modules)))"
     command = [sys.executable, "-W", "error", "-c", code]
     assert subprocess.run(command, capture_output=True, timeout=60, check=True).stdout == b"[]\n"

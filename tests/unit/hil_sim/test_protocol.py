@@ -55,7 +55,7 @@ def test_packets_are_those_of_the_manual(packet: bytes, hexed: str) -> None:
     assert packet == bytes.fromhex(hexed)
 
 
-def test_the_crc_has_its_known_check_value_and_goes_on_from_a_part() -> None:
+def test_the_crc_has_its_known_check_value_and_continues_from_a_part() -> None:
     assert crc16(b"123456789") == 0xFEE8
     assert crc16(b"6789", crc16(b"12345")) == 0xFEE8
 
@@ -73,7 +73,7 @@ def test_a_packet_that_should_have_been_stuffed_is_lost_and_the_next_is_read() -
     assert reader.skipped == len(unstuffed)
 
 
-def test_a_wrong_crc_is_told_not_hidden() -> None:
+def test_a_wrong_crc_is_reported_not_hidden() -> None:
     packet = bytearray(encode(1, Instruction.PING))
     packet[-1] ^= 0xFF
     assert PacketReader().feed(bytes(packet)) == [Packet(1, 1, b"", intact=False)]

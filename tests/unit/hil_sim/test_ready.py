@@ -22,7 +22,7 @@ def pipe() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
-def test_what_can_be_read_is_told_and_the_rest_waited_for(pipe: tuple[int, int]) -> None:
+def test_readable_state_is_reported_and_the_rest_waited_for(pipe: tuple[int, int]) -> None:
     reading, writing = pipe
     assert ready([reading], timeout_s=0.0) == []
     assert ready([reading], [writing], timeout_s=60.0) == []  # it came back, because one can write

@@ -190,7 +190,7 @@ def test_an_answer_takes_the_time_its_bytes_and_the_gap_before_it_take(make_line
 # --- log and orders
 
 
-def test_the_log_tells_what_could_move_and_what_could_not(make_line: Callable[..., RobotiqBus]) -> None:
+def test_the_log_says_what_could_move_and_what_could_not(make_line: Callable[..., RobotiqBus]) -> None:
     clock = FakeClock()
     line = make_line(clock=clock)
     with serial.Serial(str(line.port), 115_200, timeout=ANSWER_S) as port:

@@ -79,7 +79,7 @@ def test_a_command_without_activation_is_a_fault_and_moves_nothing(raw: Hand) ->
     assert "motion_started" not in raw.did
 
 
-def test_until_its_next_cycle_it_tells_what_was_before(hand: Hand) -> None:
+def test_until_its_next_cycle_it_reports_the_old_state(hand: Hand) -> None:
     hand.tell(0x0900, 100, 0xFFFF, s=5.0)
     hand.tell(0x0900, 200, 0xFFFF, s=CYCLE_S / 2)
     assert hand.status == (GOING | 0xC0, 0, 100, 100)
@@ -87,7 +87,7 @@ def test_until_its_next_cycle_it_tells_what_was_before(hand: Hand) -> None:
     assert hand.status[:3] == (GOING, 0, 200)
 
 
-def test_it_goes_where_it_is_told_at_the_speed_it_is_told(hand: Hand) -> None:
+def test_it_moves_to_the_commanded_position_at_the_commanded_speed(hand: Hand) -> None:
     times: list[float] = []
     for how, goal in ((0x00FF, 200), (0xFFFF, 20)):
         hand.tell(0x0900, goal, how)
@@ -154,7 +154,7 @@ def test_taking_activation_away_ends_activation_and_motion(raw: Hand) -> None:
     assert stood[0] == 0
 
 
-def test_a_major_fault_stops_it_until_it_is_activated_anew(hand: Hand) -> None:
+def test_a_major_fault_stops_it_until_it_is_activated_again(hand: Hand) -> None:
     hand.tell(0x0900, 255, 0x00FF, s=0.5)
     hand.gripper.fail(0x0E, hand.clock.now)
     stood = hand.status[3]
@@ -197,7 +197,7 @@ def test_a_brown_out_loses_registers_and_activation(hand: Hand) -> None:
     assert hand.gripper.command == (0, 0, 0)
 
 
-def test_a_second_of_silence_is_told_in_the_next_answer_only(hand: Hand) -> None:
+def test_a_second_of_silence_is_reported_in_the_next_answer_only(hand: Hand) -> None:
     hand.gripper.heard(hand.clock.now)
     hand.wait(1.5)
     hand.gripper.heard(hand.clock.now)

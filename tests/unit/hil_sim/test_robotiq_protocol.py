@@ -81,7 +81,7 @@ def test_half_a_request_is_given_up_after_a_silence() -> None:
     assert list(reader.feed(STATUS)) == [only(STATUS)]
 
 
-def test_lengths_that_contradict_each_other_are_told() -> None:
+def test_contradicting_lengths_are_reported() -> None:
     wrong = frame(bytes.fromhex("09 10 03E8 0003 02 0900"))
     request = only(wrong)
     assert request is not None

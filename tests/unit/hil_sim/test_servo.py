@@ -26,7 +26,7 @@ __all__ = ["refused", "rig"]
 # what may be written
 
 
-def test_it_comes_with_torque_off_in_position_mode_and_its_goal_where_it_stands(clock: Any) -> None:
+def test_it_starts_with_torque_off_in_position_mode_and_its_goal_where_it_is(clock: Any) -> None:
     rig = Rig(clock, position_counts=1000)
     assert (rig.read(TORQUE), rig.read(11), rig.read(132), rig.read(GOAL)) == (0, 3, 1000, 1000)
 
@@ -83,7 +83,7 @@ def test_eeprom_survives_a_power_cycle_and_ram_does_not(rig: Rig) -> None:
     assert rig.names() == ["brown_out", "booted"]
 
 
-def test_a_factory_reset_spares_what_it_is_told_to(clock: Any) -> None:
+def test_a_factory_reset_spares_the_requested_settings(clock: Any) -> None:
     for option, expected in ((0xFF, (1, 57_600)), (1, (7, 57_600)), (2, (7, 1_000_000))):
         servo = Servo(7, baud=1_000_000)
         servo.write(24, (33).to_bytes(4, "little"), 0.0)

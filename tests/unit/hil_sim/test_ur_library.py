@@ -169,7 +169,7 @@ print(json.dumps([d.polyscopeVersion().split(".")[0], scaled, c.moveJ(goal, 2.0,
         assert controller.state().arms[0].positions_rad[0] == pytest.approx(HOME[0] + 0.1)
 
 
-def test_the_angles_for_a_pose_are_worked_out_and_what_is_out_of_reach_is_told(controller: UrBus) -> None:
+def test_the_angles_for_a_pose_are_computed_and_an_unreachable_pose_is_reported(controller: UrBus) -> None:
     told = run(
         controller,
         CONTROL
@@ -184,7 +184,7 @@ print(json.dumps([c.getInverseKinematics(pose, near), c.getInverseKinematicsHasS
     assert told[1:] == [True, False]
 
 
-def test_an_asynchronous_move_tells_its_progress_and_is_stopped(controller: UrBus) -> None:
+def test_an_asynchronous_move_reports_its_progress_and_is_stopped(controller: UrBus) -> None:
     told = run(
         controller,
         CONTROL

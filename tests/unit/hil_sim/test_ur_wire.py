@@ -173,7 +173,7 @@ def test_late_data_keeps_its_order(controller: UrBus) -> None:
         assert seen == sorted(seen)
 
 
-def test_a_frozen_stream_goes_on_with_the_same_values(controller: UrBus) -> None:
+def test_a_frozen_stream_continues_with_the_same_values(controller: UrBus) -> None:
     with client(controller) as rtde:
         rtde.stream("timestamp")
         controller.do(Freeze(tick=True))
@@ -278,7 +278,7 @@ def test_connections_of_one_kind_are_cut_and_made_again(controller: UrBus) -> No
         again.stream("timestamp")
 
 
-def test_a_safeguard_stop_holds_a_program_up_and_it_goes_on_by_itself(controller: UrBus) -> None:
+def test_a_safeguard_stop_pauses_a_program_which_then_continues_by_itself(controller: UrBus) -> None:
     dashboard(controller, "play")
     wait_until(lambda: controller.state().arms[0].moving, "its own program moves it")
     controller.do(HardwareFault(bits=5))

@@ -8,7 +8,7 @@ import pytest
 from trade._threads.condition import InterruptibleCondition
 
 
-def test_it_wakes_everybody_who_waits() -> None:
+def test_it_wakes_all_waiting_threads() -> None:
     bell, rung, woken = InterruptibleCondition(), threading.Event(), threading.Semaphore(0)
 
     def wait() -> None:
@@ -46,7 +46,7 @@ def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
     assert len(looks) == 2
 
 
-def test_nobody_is_kept_once_waiting_is_over() -> None:
+def test_no_waiter_is_kept_once_waiting_is_over() -> None:
     bell = InterruptibleCondition()
     bell.wait_for(lambda: False, 0)
     assert not bell._gates

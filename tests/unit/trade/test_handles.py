@@ -182,7 +182,7 @@ def test_handles_of_different_services_differ(here: Container) -> None:
     assert add != "add"
 
 
-def test_a_handle_tells_where_it_leads(here: Container, there: Container) -> None:
+def test_a_handle_describes_its_service(here: Container, there: Container) -> None:
     there.register(Counter(), ["rosie.head", "lab"])
     seen = found(here, "add")
     told = (seen.name, seen.label, seen.groups, seen.container, seen.local, seen.alive, seen.roles)
@@ -295,14 +295,14 @@ def test_a_handle_of_an_earlier_boot_never_reaches_the_next_one(start_container:
     assert (fresh(), fresh_counter.count) == (1, 1)
 
 
-def test_a_dead_handle_still_tells_what_it_was(here: Container) -> None:
+def test_a_dead_handle_still_describes_its_service(here: Container) -> None:
     counter = Counter()
     (add, _) = here.register(counter, "a")
     here.deregister(counter)
     assert (add.signature, add.groups, add.effect) == ("add(step: int = 1) -> int", ("a",), "actuate")
 
 
-def test_the_chain_tells_which_services_led_here(offer: Any, here: Container) -> None:
+def test_the_chain_names_the_services_that_led_here(offer: Any, here: Container) -> None:
     class Inner:
         @service
         def chain(self) -> list[str]:
@@ -348,9 +348,7 @@ def test_a_copy_of_a_handle_is_the_handle(here: Container) -> None:
     assert copy.deepcopy({"handle": handle})["handle"] is handle
 
 
-def test_whoever_is_told_of_an_end_and_fails_keeps_it_from_nobody(
-    here: Container, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failing_listener_hides_an_end_from_no_other(here: Container, caplog: pytest.LogCaptureFixture) -> None:
     [add] = [handle for handle in here.register(Counter(), "told") if handle.name == "add"]
     run = add.start(5)
     assert run.result(20) == 5

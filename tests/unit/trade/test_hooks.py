@@ -86,7 +86,7 @@ def watch(here: Container, observer: Observer) -> Callable[[str], Handle]:
 # --- what a hook is told
 
 
-def test_before_it_the_service_and_its_arguments_are_told(
+def test_a_before_hook_sees_the_service_and_its_arguments(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.before_service(plan, watch("see"))
@@ -96,7 +96,7 @@ def test_before_it_the_service_and_its_arguments_are_told(
     assert (called.caller, called.session) == (here.address.identity, here.session)
 
 
-def test_after_it_the_result_is_told_before_the_caller_has_it(
+def test_an_after_hook_sees_the_result_before_the_caller(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(plan, watch("see"))
@@ -106,7 +106,7 @@ def test_after_it_the_result_is_told_before_the_caller_has_it(
     assert called.took_s > 0
 
 
-def test_after_it_an_error_is_told_and_passes_unchanged(
+def test_an_after_hook_sees_an_error_which_passes_unchanged(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(plan, watch("see"))
@@ -116,7 +116,7 @@ def test_after_it_an_error_is_told_and_passes_unchanged(
     assert (called.ok, called.error, called.result) == (False, "ValueError: no plan for nothing", None)
 
 
-def test_what_is_secret_is_told_to_nobody(
+def test_secrets_appear_in_no_output(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(where(name="login"), watch("see"))
@@ -395,7 +395,7 @@ def test_only_handles_and_constraints_are_watched(here: Container, watch: Callab
         here.before_service("mind.plan", watch("see"))  # type: ignore[arg-type]
 
 
-def test_the_middlewares_own_services_are_watched_by_nobody(
+def test_the_middlewares_own_services_are_not_observed(
     here: Container, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(where(), watch("see"))
@@ -436,7 +436,7 @@ administer = ["*"]
     assert hook.infos()[0].services == ()
 
 
-def test_a_call_goes_on_when_the_last_hook_is_detached_as_it_begins(
+def test_a_call_continues_when_the_last_hook_is_detached_as_it_begins(
     here: Container, planner: Planner, observer: Observer, watch: Callable[[str], Handle]
 ) -> None:
     [plan, *_] = here.register(planner, "mind")

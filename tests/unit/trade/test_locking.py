@@ -51,7 +51,7 @@ def test_a_lock_is_only_held_once_it_is_whole(robot: Robot) -> None:
         lock.acquire()
 
 
-def test_whose_locks_are_not_known_is_told(
+def test_containers_whose_locks_are_unknown_are_reported(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     asleep = threading.Event()
@@ -299,7 +299,7 @@ def test_two_who_want_the_same_in_opposite_order_both_get_it(robot: Robot) -> No
     assert sorted(turns) == ["me"] * 20 + ["other"] * 20
 
 
-def test_S13_whoever_waits_in_order_keeps_what_it_has_renewed(robot: Robot) -> None:
+def test_S13_a_client_that_waits_in_order_keeps_the_locks_that_it_renews(robot: Robot) -> None:
     taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
     lock = robot.me.lock(WHOLE, wait_s=60, lease_s=1.0)
     waiting = threading.Thread(target=lock.acquire)
@@ -372,7 +372,7 @@ def walker(robot: Robot) -> Callable[[str], Handle]:
     return lambda name: robot.me.find(where(name=name, group="walker"), wait_s=20).with_(deadline_s=1.5)
 
 
-def test_S13_a_lock_that_a_service_waits_for_in_vain_is_told_before_the_deadline_of_its_call(
+def test_S13_a_lock_that_a_service_cannot_get_is_reported_before_its_calls_deadline(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
     """By default a lock waits as long as a call lasts: who has it, and what for, is told all the same."""
@@ -382,14 +382,14 @@ def test_S13_a_lock_that_a_service_waits_for_in_vain_is_told_before_the_deadline
     assert robot.me.locks() == []
 
 
-def test_whoever_asks_a_container_for_a_lock_by_itself_is_told_in_time(robot: Robot) -> None:
+def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) -> None:
     """As containers in other languages do, whose wait may be the deadline of the call."""
     acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
     with robot.other.lock(WHOLE, purpose="dance"), pytest.raises(LockedByOther, match="for 'dance'"):
         robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], LockRequest(wait_s=1.5))
 
 
-def test_what_a_service_waits_for_in_vain_is_told_before_the_deadline_of_its_call(
+def test_a_service_that_waits_in_vain_fails_before_the_deadline_of_its_call(
     walker: Callable[[str], Handle],
 ) -> None:
     with pytest.raises(NoSuchService, match=r"nothing\.there"):
@@ -419,14 +419,14 @@ def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
             robot.me.lock(nothing).acquire()
 
 
-def test_S16_a_lock_of_what_is_not_there_tells_what_there_is(robot: Robot) -> None:
+def test_S16_a_lock_of_an_unknown_group_lists_the_known_groups(robot: Robot) -> None:
     with pytest.raises(NoSuchService, match="Did you mean robot") as refused:
         robot.me.lock(where(group="robt"), wait_s=0).acquire()
     assert robot.me.locks() == []
     assert not isinstance(refused.value, ConfigurationError)
 
 
-def test_S16_a_lock_waits_until_what_it_is_for_is_there_as_a_whole(robot: Robot) -> None:
+def test_S16_a_lock_waits_until_its_whole_group_is_present(robot: Robot) -> None:
     head = robot.system.container("head")
     joints = [Joint(name) for name in ("pan", "tilt")]
     for joint in joints:
@@ -446,7 +446,7 @@ def test_S16_a_lock_waits_until_what_it_is_for_is_there_as_a_whole(robot: Robot)
         lock.release()
 
 
-def test_S16_what_came_in_part_is_told_when_the_wait_is_over(robot: Robot) -> None:
+def test_S16_an_incomplete_group_is_reported_when_the_wait_is_over(robot: Robot) -> None:
     joint, head = Joint("pan"), robot.system.container("head")
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
     lock = robot.me.lock(where(group="rosie.head"), wait_s=1)
@@ -506,7 +506,7 @@ def test_S17_reading_stays_open_unless_it_is_locked_by_its_handle(robot: Robot) 
             read()
 
 
-def test_a_stop_is_everybodys(robot: Robot) -> None:
+def test_each_client_may_stop(robot: Robot) -> None:
     with pytest.raises(ConfigurationError, match="cannot be locked"):
         robot.me.lock([robot.find("a", "stop")]).acquire()
     with robot.me.lock(WHOLE):

@@ -108,7 +108,7 @@ def test_S12_what_outlived_its_lease_is_over_even_before_anybody_looked(table: T
             permitted.gate() if use == "gate" else table.call("a", [token], call_id=1)
 
 
-def test_S12_a_renewed_lease_begins_anew_and_a_lost_one_never_does(table: Table) -> None:
+def test_S12_a_renewed_lease_restarts_and_a_lost_one_never_does(table: Table) -> None:
     token = table.take("a", lease_s=2.0)
     table.advance(1.5)
     assert table.table.renew([token.number], "tester") == [token.number]
@@ -179,7 +179,7 @@ def test_S14_what_moves_under_a_lost_lock_stops_before_it_is_given_on(table: Tab
     assert asking.result(60).resources == ("a",)
 
 
-def test_S14_who_waits_for_what_could_not_be_stopped_is_told_at_once_until_it_is_resumed(table: Table) -> None:
+def test_S14_a_client_waiting_for_an_unstoppable_device_is_refused_at_once_until_resumed(table: Table) -> None:
     token = table.take("ab")
     table.resources["a"].moving = True
     waiting = [table.ask(names, names) for names in ("a", "ab")]
@@ -266,7 +266,7 @@ def test_a_session_that_ends_while_it_waits_for_a_call_to_end_gets_nothing(table
     assert table.table.infos() == []
 
 
-def test_who_had_it_is_told_why_not_anymore_even_while_it_is_being_stopped_or_another_has_it(table: Table) -> None:
+def test_the_former_owner_learns_why_even_during_the_stop_or_under_another_owner(table: Table) -> None:
     token = table.take("a")
     table.resources["a"].moving = True
     table.table.lose(token.number, "broken by an operator: my turn")
@@ -330,7 +330,7 @@ def test_S11_equal_is_asked_for_not_at_least(table: Table) -> None:
         table.call("a", [Token("another epoch", new.number)])
 
 
-def test_S08_a_stop_voids_what_was_admitted_before_it_however_the_lock_stands(table: Table) -> None:
+def test_S08_a_stop_voids_commands_admitted_before_it_whatever_the_locks(table: Table) -> None:
     token = table.take("a")
     admitted = table.call("a", [token])
     table.resources["a"].stop("owner", ["s"])

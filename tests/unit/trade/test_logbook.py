@@ -66,13 +66,13 @@ def test_lines_are_bounded_in_number_and_length() -> None:
     assert [line.number for line in book.lines(2098)] == [2099, 2100]
 
 
-def test_a_line_that_cannot_be_written_is_kept_as_it_stands() -> None:
+def test_a_line_that_cannot_be_written_is_kept_as_it_is() -> None:
     book = Logbook()
     book.filter(_record("%d of %d", "many"))
     assert [line.text for line in book.lines()] == ["%d of %d"]
 
 
-def test_of_an_error_logged_with_a_line_its_type_is_told() -> None:
+def test_an_error_logged_with_a_line_is_sent_with_its_type() -> None:
     book = Logbook()
     book.filter(_record("it failed", exc_info=(ValueError, ValueError("swordfish"), None)))
     assert [line.text for line in book.lines()] == ["it failed (ValueError)"]

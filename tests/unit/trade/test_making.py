@@ -246,7 +246,7 @@ def test_what_was_made_is_closed_with_its_container(maker: Container, events: li
     assert events == ["closed"]
 
 
-def test_a_container_ends_at_rest_when_it_is_told_to_and_who_asked_is_answered(
+def test_a_container_ends_at_rest_on_request_and_answers_the_requester(
     asker: Container, maker: Container, memory: MemorySystem, events: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     handles = {one.name: one for one in ask(asker, "instantiate", "workshop:Wheel", (), ["cart"])}

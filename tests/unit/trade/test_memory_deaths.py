@@ -80,7 +80,7 @@ def steps() -> int:
 
 
 @pytest.mark.parametrize("victim", ["caller", "callee"])
-def test_whoever_dies_at_whatever_message_nobody_hangs_and_the_rest_goes_on(
+def test_a_death_at_any_message_hangs_no_client_and_the_rest_continues(
     victim: str,
 ) -> None:
     total = steps()
@@ -104,7 +104,7 @@ def test_whoever_dies_at_whatever_message_nobody_hangs_and_the_rest_goes_on(
 
 @pytest.mark.parametrize("arrived", [False, True])
 @pytest.mark.parametrize("answering", [False, True])
-def test_a_callee_that_dies_around_a_call_or_its_answer_is_told_as_lost(
+def test_the_death_of_a_callee_around_a_call_or_its_answer_is_reported_as_lost(
     pair: Pair, arrived: bool, answering: bool
 ) -> None:
     with memory_system() as system:

@@ -32,7 +32,7 @@ def test_containers_find_and_call_each_other() -> None:
         assert found(system.container("a"))(0.5) == 0.5
 
 
-def test_a_name_stands_for_one_running_container() -> None:
+def test_a_name_belongs_to_one_running_container() -> None:
     with memory_system() as system:
         first = system.container("a")
         assert system.container("a") is first
@@ -133,7 +133,7 @@ def test_registering_takes_one_message_for_each_other_container() -> None:
         assert system.network.sent - before == Counter({Kind.ANNOUNCE: 6})
 
 
-def test_who_joins_is_told_of_by_answers_only(lamp: Lamp) -> None:
+def test_a_joining_container_is_informed_by_answers_only(lamp: Lamp) -> None:
     with memory_system() as system:
         a = system.container("a")
         before = system.sent(Kind.ANNOUNCE)
@@ -285,9 +285,7 @@ def test_a_lost_withdrawal_is_known_with_the_next_announcement(lamp: Lamp) -> No
         assert labels(a) == ["b/heard.dim"]
 
 
-def test_when_the_last_announcement_is_lost_the_next_sign_of_how_far_it_is_tells(
-    lamp: Lamp, eventually: Eventually
-) -> None:
+def test_after_a_lost_announcement_the_next_sign_of_life_reveals_it(lamp: Lamp, eventually: Eventually) -> None:
     with memory_system(beat_s=0.05) as system:
         a, b = system.container("a"), system.container("b")
         end = system.lose(losing("Lamp"))
@@ -366,7 +364,9 @@ def test_who_asks_in_vain_still_takes_signs_of_life(lamp: Lamp, eventually: Even
         ghost.close()
 
 
-def test_nobody_waits_behind_who_has_failed_to_answer(monkeypatch: pytest.MonkeyPatch, eventually: Eventually) -> None:
+def test_no_container_waits_behind_one_that_failed_to_answer(
+    monkeypatch: pytest.MonkeyPatch, eventually: Eventually
+) -> None:
     monkeypatch.setattr("trade._discovery.resync._ANSWER_S", 0.02)
     monkeypatch.setattr("trade._discovery.resync._SLOW_ANSWER_S", 3600.0)
     with memory_system() as system:

@@ -138,7 +138,7 @@ def test_locks_and_e_stops_are_as_they_are_now(here: Container, there: Container
     assert scraped(there)["trade_estops_open",] == 0
 
 
-def test_whoever_drives_something_adds_its_numbers(there: Container) -> None:
+def test_a_driver_adds_its_own_numbers(there: Container) -> None:
     cycles = iter(range(1, 10))
     there.measured_by(
         lambda: [
@@ -173,7 +173,7 @@ def test_the_port_is_free_again_when_the_container_is_closed(there: Container, s
     assert scraped(other)["trade_containers",] >= 1
 
 
-def test_off_nothing_is_counted_and_nothing_stands_around_a_service(here: Container, start_container: Start) -> None:
+def test_when_off_nothing_is_counted_and_no_service_is_wrapped(here: Container, start_container: Start) -> None:
     there = start_container("there")
     there.register(Arm(), "rosie.arm")
     handle = here.find(where(name="reach"), wait_s=20)

@@ -73,7 +73,7 @@ def test_what_was_offered_there_has_moved_though_the_answer_was_lost(scene: Scen
     assert moved.container == "new"
 
 
-def test_contact_that_is_lost_leaves_it_withdrawn_until_somebody_decides(scene: Scene) -> None:
+def test_contact_that_is_lost_leaves_it_withdrawn_until_a_user_decides(scene: Scene) -> None:
     count, _ = scene.counter()
     in_between(scene, lambda: cut_calls(scene, source="old"))
     with pytest.raises(MigrationUnknown) as error:
@@ -86,7 +86,7 @@ def test_contact_that_is_lost_leaves_it_withdrawn_until_somebody_decides(scene: 
     assert scene.asker.call(where(name="count")) == 4
 
 
-def test_who_dies_before_it_offers_it_leaves_it_to_somebody_who_decides(scene: Scene) -> None:
+def test_a_death_before_the_offer_leaves_the_decision_to_a_user(scene: Scene) -> None:
     count, _ = scene.counter()
     in_between(scene, lambda: scene.memory.kill("new"))
     with pytest.raises((MigrationUnknown, CannotMigrate)) as error:

@@ -291,7 +291,7 @@ def test_a_full_container_says_so(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("method", ["save", "restore"])
-def test_what_a_provider_raises_is_told_and_changes_nothing(scene: Scene, method: str) -> None:
+def test_a_providers_exception_is_reported_and_changes_nothing(scene: Scene, method: str) -> None:
     count, _ = scene.counter()
 
     def fail() -> None:
@@ -385,7 +385,7 @@ def prepare(scene: Scene) -> Any:
     return ask(scene, "prepare_arrival")(luggage)
 
 
-def test_what_nobody_fetches_is_closed_by_itself(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_that_are_never_fetched_are_closed_automatically(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(target, "TICKET_S", 0.05)
     ticket = prepare(scene).ticket
     wait_until(lambda: scene.module.events == ["made 1", "close 0"])
@@ -393,7 +393,7 @@ def test_what_nobody_fetches_is_closed_by_itself(scene: Scene, monkeypatch: pyte
         ask(scene, "arrive")(ticket)
 
 
-def test_what_nobody_fetched_is_closed_with_its_container(scene: Scene) -> None:
+def test_results_that_were_never_fetched_are_closed_with_their_container(scene: Scene) -> None:
     prepare(scene)
     scene.new.close()
     assert scene.module.events == ["made 1", "close 0"]

@@ -17,7 +17,7 @@ def _in_greenwich(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "localtime", time.gmtime)
 
 
-def test_a_moment_is_told_by_the_clock() -> None:
+def test_a_moment_is_shown_as_clock_time() -> None:
     assert clock(86_399.9996) == "23:59:59"
     assert clock(86_399.9996, ms=True) == "23:59:59.999"
     assert clock(3.25, ms=True) == "00:00:03.250"
@@ -25,7 +25,7 @@ def test_a_moment_is_told_by_the_clock() -> None:
 
 
 @pytest.mark.parametrize("at", NO_MOMENTS)
-def test_what_is_no_moment_is_told_all_the_same(at: float) -> None:
+def test_a_value_that_is_no_moment_is_shown_nevertheless(at: float) -> None:
     assert clock(at) == clock(at, ms=True) == day_and_clock(at) == "?"
 
 

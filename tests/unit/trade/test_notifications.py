@@ -37,33 +37,33 @@ def listener() -> Listener:
     return Listener()
 
 
-def test_joined_tells_of_services_that_come(here: Container, there: Container, listener: Listener) -> None:
+def test_joined_reports_new_services(here: Container, there: Container, listener: Listener) -> None:
     here.joined(where(name="switch"), listener)
     there.register(Lamp(), "hall")
     assert listener.next().label == "hall.switch"
 
 
-def test_joined_tells_of_own_services_too(here: Container, listener: Listener) -> None:
+def test_joined_reports_own_services_too(here: Container, listener: Listener) -> None:
     here.joined(where(name="switch"), listener)
     here.register(Lamp(), "hall")
     assert listener.next().local
 
 
-def test_joined_tells_only_of_what_matches(here: Container, listener: Listener) -> None:
+def test_joined_reports_only_matching_services(here: Container, listener: Listener) -> None:
     here.joined(where(name="switch", group="attic"), listener)
     here.register(Lamp(), "hall")
     here.register(Lamp(), "attic")
     assert listener.next().label == "attic.switch"
 
 
-def test_joined_tells_nothing_of_what_was_there_before(here: Container, listener: Listener) -> None:
+def test_joined_reports_nothing_that_existed_before(here: Container, listener: Listener) -> None:
     here.register(Lamp(), "before")
     here.joined(where(name="switch"), listener)
     here.register(Lamp(), "after")
     assert listener.next().label == "after.switch"
 
 
-def test_joined_with_existing_tells_of_what_is_there_first_and_each_once(here: Container, listener: Listener) -> None:
+def test_joined_with_existing_first_reports_each_existing_service_once(here: Container, listener: Listener) -> None:
     here.register(Lamp(), "before")
     here.joined(where(name="switch"), listener, existing=True)
     here.register(Lamp(), "after")
@@ -71,7 +71,7 @@ def test_joined_with_existing_tells_of_what_is_there_first_and_each_once(here: C
     assert listener.heard.empty()
 
 
-def test_left_tells_of_services_that_go_with_a_dead_handle(
+def test_left_reports_removed_services_with_a_dead_handle(
     here: Container, there: Container, listener: Listener
 ) -> None:
     lamp = Lamp()
@@ -85,7 +85,7 @@ def test_left_tells_of_services_that_go_with_a_dead_handle(
         gone()
 
 
-def test_left_tells_of_services_whose_container_closes(here: Container, there: Container, listener: Listener) -> None:
+def test_left_reports_services_of_a_closed_container(here: Container, there: Container, listener: Listener) -> None:
     there.register(Lamp(), "hall")
     here.find(where(name="switch"), wait_s=20)
     here.left(where(group="hall"), listener)
@@ -131,7 +131,7 @@ def test_a_failing_callback_kills_nothing(
     assert "the call of <Notification joined name='switch'> failed" in caplog.text
 
 
-def test_a_service_may_be_told(here: Container, there: Container, listener: Listener) -> None:
+def test_a_service_may_get_notifications(here: Container, there: Container, listener: Listener) -> None:
     there.register(listener, "ears")
     here.joined(where(name="switch"), here.find(where(name="tell"), wait_s=20))
     here.register(Lamp(), "hall")

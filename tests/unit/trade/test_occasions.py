@@ -103,7 +103,7 @@ def test_at_knows_time_zones(here: Container) -> None:
     assert noted.active
 
 
-def test_every_goes_on_until_it_is_cancelled(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
+def test_every_repeats_until_it_is_cancelled(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
     noted = here.every(SOON_S, handle("go"))
     for _ in range(3):
         dock.next()
@@ -151,7 +151,9 @@ def test_the_only_service_that_fits_may_be_called(here: Container, dock: Dock, h
     assert dock.next() == 0.1
 
 
-def test_a_service_may_be_told_of_others_with_arguments_of_its_own(here: Container, there: Container) -> None:
+def test_a_service_may_get_notifications_about_others_with_arguments_of_its_own(
+    here: Container, there: Container
+) -> None:
     class Listener:
         heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
 
@@ -257,7 +259,7 @@ def test_what_makes_no_sense_is_refused(here: Container, ask: Callable[[Containe
     assert here.notifications() == []
 
 
-def test_a_condition_that_is_neither_true_nor_false_does_not_hold_and_is_told(
+def test_a_condition_that_is_neither_true_nor_false_does_not_hold_and_is_reported(
     here: Container, dock: Dock, handle: Callable[[str], Handle], caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "trade"):
@@ -279,7 +281,9 @@ def test_what_happens_once_and_fails_is_not_said_to_stay(here: Container, caplog
     assert "it stays attached" not in caplog.text
 
 
-def test_each_kind_of_failure_is_told_once_and_of_what(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+def test_each_kind_of_failure_is_reported_once_with_its_subject(
+    here: Container, caplog: pytest.LogCaptureFixture
+) -> None:
     asked, called = itertools.count(), itertools.count()
 
     def holds() -> bool:
@@ -317,7 +321,9 @@ def test_a_callback_that_fails_kills_nothing(here: Container) -> None:
     assert noted.info().last_error == "OSError: no coffee"
 
 
-def test_a_callback_that_is_gone_is_told_of(here: Container, there: Container, handle: Callable[[str], Handle]) -> None:
+def test_a_garbage_collected_callback_is_reported(
+    here: Container, there: Container, handle: Callable[[str], Handle]
+) -> None:
     go = handle("go")
     there.close()
     noted = here.every(SOON_S, go)

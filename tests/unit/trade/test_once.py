@@ -110,7 +110,7 @@ def test_S02_a_call_that_comes_again_after_its_provider_left_gets_its_answer(
     assert {(one.id, one.status) for one in (line.answer(), line.answer())} == {(7, Status.OK), (8, Status.GONE)}
 
 
-def test_S02_the_same_number_from_somebody_else_is_another_call(
+def test_S02_the_same_number_from_another_client_is_another_call(
     here: Container, open_raw: Any, key: Any, line: Line, motor: Motor
 ) -> None:
     other = Line(open_raw(here), here, key, "other")

@@ -101,7 +101,7 @@ def test_spans_have_the_first_call_as_their_trace_and_each_knows_its_parent(
         assert outer.end_time - outer.start_time >= inner.end_time - inner.start_time
 
 
-def test_errors_and_events_are_told_but_no_arguments_and_no_messages(
+def test_errors_and_events_are_sent_without_arguments_and_messages(
     walk: Callable[[float], list[ReadableSpan]],
 ) -> None:
     step = _named(walk(1.75), "rosie.leg.step", SpanKind.SERVER)
@@ -178,7 +178,7 @@ def test_a_collector_gets_what_is_noted_once_its_url_is_set(
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5])
-def test_samplers_that_go_by_the_trace_take_as_many_as_they_are_told(ratio: float) -> None:
+def test_samplers_that_follow_the_trace_take_the_configured_share(ratio: float) -> None:
     """Ids of calls count up from a moment's chance, and are smaller than half of all that there are."""
     first, sampler, tried = secrets.randbits(38) << 24, TraceIdRatioBased(ratio), 4000
     taken = [sampler.should_sample(None, trace_id(first + number), "walk") for number in range(tried)]
@@ -186,7 +186,7 @@ def test_samplers_that_go_by_the_trace_take_as_many_as_they_are_told(ratio: floa
     assert share == pytest.approx(ratio, abs=0.05)
 
 
-def test_calls_go_on_and_containers_end_when_no_collector_is_there(
+def test_calls_continue_and_containers_end_without_a_collector(
     system: str, collector: Collector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade._telemetry.otlp._TIMEOUT_S", 0.2)
@@ -196,7 +196,7 @@ def test_calls_go_on_and_containers_end_when_no_collector_is_there(
     assert not user.healthy()
 
 
-def test_without_a_url_nothing_is_loaded_and_nothing_is_told(start_container: Start) -> None:
+def test_without_a_url_nothing_is_loaded_and_nothing_is_sent(start_container: Start) -> None:
     container = start_container("quiet")
     container.set_tracing(True, container="quiet")
     assert container._parts.spans._tell is None
@@ -217,7 +217,7 @@ def test_what_is_not_installed_is_named_with_how_to(system: str, monkeypatch: py
         ("http://collector.example:4318", "write https://collector.example:4318"),
     ],
 )
-def test_a_url_that_leads_nowhere_or_tells_everybody_is_refused(url: str, said: str) -> None:
+def test_a_url_that_leads_nowhere_or_has_credentials_is_refused(url: str, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         Settings.read(environment={"TRADE_OTLP": url})
 

@@ -75,7 +75,7 @@ def test_a_decision_names_the_rule(policy: Policy) -> None:
     assert policy.decide("mallory", "read", "x").rule == "mallory is revoked"
 
 
-def test_what_everybody_may_do_is_closed_to_the_revoked(policy: Policy) -> None:
+def test_rights_of_everyone_do_not_include_revoked_identities(policy: Policy) -> None:
     assert policy.authenticated("nobody").allowed
     assert not policy.authenticated("mallory").allowed
 
@@ -138,7 +138,7 @@ def test_a_wrong_file_of_revoked_identities_is_named(tmp_path: Path) -> None:
     assert str(beside) in str(refused.value)
 
 
-def test_half_a_list_of_revoked_identities_takes_nobody_off_it(tmp_path: Path) -> None:
+def test_half_a_list_of_revoked_identities_restores_none(tmp_path: Path) -> None:
     written(tmp_path, "", "r.toml")  # as it is while it is being copied
     with pytest.raises(ConfigurationError, match=r"revoked: missing; write revoked = \[\] if no identity is revoked"):
         read_policy(written(tmp_path, 'revoked_file = "r.toml"\n' + ROLE.format("")))

@@ -92,7 +92,7 @@ def test_any_text_is_either_read_or_refused(text: str) -> None:
         assert repr(text) in str(refused)
 
 
-def test_a_search_that_was_written_to_last_for_ever_ends_without_a_match() -> None:
+def test_an_endless_search_pattern_ends_without_a_match() -> None:
     facts = [f"p({number})" for number in range(10)]
     patterns = parse_predicates(", ".join(f"p(?a{number})" for number in range(60)) + ", q(?z)")
     assert not achieves_all(facts, patterns)

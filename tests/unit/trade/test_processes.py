@@ -28,7 +28,7 @@ def test_closing_is_idempotent(here: Container) -> None:
     here.close()
 
 
-def test_whoever_closes_waits_until_everything_has_ended(here: Container) -> None:
+def test_closing_waits_until_everything_has_ended(here: Container) -> None:
     links: list[int] = []
 
     def close() -> None:
@@ -123,7 +123,7 @@ def test_a_container_that_cannot_start_leaves_nothing(system: str, monkeypatch: 
 # --- the default container
 
 
-def test_the_default_container_starts_itself_and_starts_anew_after_it_was_closed(system: str) -> None:
+def test_the_default_container_starts_itself_and_restarts_after_close(system: str) -> None:
     trade.register(Lamp(), "hall")
     first = trade.container()
     assert trade.find(where(name="brightness"))() == 0.5
@@ -133,7 +133,7 @@ def test_the_default_container_starts_itself_and_starts_anew_after_it_was_closed
     assert trade.container() is not first
 
 
-def test_the_default_container_starts_once_whoever_comes_first(system: str) -> None:
+def test_the_default_container_starts_once_whichever_thread_is_first(system: str) -> None:
     started: list[Container] = []
     threads = [threading.Thread(target=lambda: started.append(trade.container())) for _ in range(8)]
     for thread in threads:

@@ -50,7 +50,7 @@ def memory() -> Iterator[MemorySystem]:
         yield system
 
 
-def test_what_is_there_who_can_do_it_and_where_are_answered_by_calls(memory: MemorySystem) -> None:
+def test_questions_of_what_exists_who_can_do_it_and_where_are_answered_by_calls(memory: MemorySystem) -> None:
     """'Which computers are there, what can they do, how do I ask for it, and who can see a cup?'"""
     asker = memory.container("asker")
     memory.settle()

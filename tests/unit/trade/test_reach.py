@@ -109,7 +109,7 @@ def test_an_endpoint_that_cannot_be_is_refused_in_our_words(what: str, endpoint:
     ("name", "hint"),
     [("TRADE_SYTEM", "did you mean TRADE_SYSTEM?"), ("TRADE_COLOUR", "there is TRADE_SYSTEM, TRADE_IDENTITY")],
 )
-def test_a_variable_nobody_reads_is_warned_of(name: str, hint: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unread_variable_causes_a_warning(name: str, hint: str, caplog: pytest.LogCaptureFixture) -> None:
     Settings.read(environment={name: "x", "TRADE_SYSTEM": "lab", "TRADING": "x"})
     [said] = caplog.messages
     assert name in said

@@ -56,7 +56,7 @@ def test_the_link_outlives_both_switches(apart: tuple[Container, Container]) -> 
 
 
 @pytest.mark.parametrize("switch", ["set_broadcast", "set_discovery"])
-def test_one_switch_alone_links_nobody(apart: tuple[Container, Container], switch: str) -> None:
+def test_one_switch_alone_links_no_container(apart: tuple[Container, Container], switch: str) -> None:
     for container in apart:
         getattr(container.system, switch)(True)
     with pytest.raises(NoSuchService):
@@ -109,7 +109,7 @@ def test_an_endpoint_may_be_a_name(apart: tuple[Container, Container]) -> None:
     assert clock_of(one, "b")() > 0
 
 
-def test_connecting_where_nobody_listens_says_so(here: Container) -> None:
+def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -> None:
     nobody = free_endpoint()
     with pytest.raises(CannotConnect, match=r"nothing accepts connections there\. Is it up") as raised:
         here.system.connect(nobody)

@@ -51,7 +51,7 @@ def answer(registry: Registry, revision: int, **offered: ProviderInfo) -> None:
     registry.settle(state, revision, {name: ("rosie", entry) for name, entry in offered.items()})
 
 
-def test_an_entry_counts_only_while_a_sign_of_life_stands(registry: Registry, told: Told) -> None:
+def test_an_entry_counts_only_while_its_owner_is_alive(registry: Registry, told: Told) -> None:
     registry.put(OTHER, "rosie", "arm", info())
     assert registry.select(where()) == []
     assert registry.appear(OTHER)
@@ -186,7 +186,7 @@ def test_only_so_many_providers_of_one_container_count(registry: Registry, monke
 
 
 @given(st.data())
-def test_whatever_gets_lost_an_answer_that_closes_everything_tells_the_truth(data: st.DataObject) -> None:
+def test_whatever_is_lost_the_answer_that_closes_everything_is_true(data: st.DataObject) -> None:
     """One container announces; each message may be lost, answers come late; nothing is open, so all is known."""
     registry, truth, revision = Registry(OWN), dict[str, ProviderInfo](), 0
     registry.appear(OTHER)
@@ -222,7 +222,7 @@ def test_whatever_gets_lost_an_answer_that_closes_everything_tells_the_truth(dat
 # --- changes
 
 
-def test_a_new_revision_tells_what_came_what_went_and_what_stayed(registry: Registry, told: Told) -> None:
+def test_a_new_revision_lists_what_came_what_went_and_what_stayed(registry: Registry, told: Told) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info(1, "a", "b"))
     registry.put(OTHER, "rosie", "arm", info(2, "b", "c", group="lab"))
@@ -296,7 +296,7 @@ _events = st.lists(
 
 
 @given(_events)
-def test_what_was_told_adds_up_to_what_is_there(events: list[tuple[str, Address, str, int]]) -> None:
+def test_reported_changes_add_up_to_the_present_services(events: list[tuple[str, Address, str, int]]) -> None:
     registry = Registry(OWN)
     told: set[ServiceKey] = set()
 

@@ -43,7 +43,7 @@ def test_who_enters_hears_of_those_that_listen(system: str, folder: Path) -> Non
         assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
-def test_endpoints_nobody_listens_on_are_pruned(system: str, folder: Path) -> None:
+def test_endpoints_without_a_listener_are_pruned(system: str, folder: Path) -> None:
     stale = HostFolder(system)
     stale.enter(free_endpoint())
     old(next(folder.iterdir()))
@@ -58,7 +58,7 @@ def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder:
 
 
 @pytest.mark.parametrize("at_s", [1, 4e9], ids=["forward", "back"])
-def test_a_clock_that_is_set_while_they_start_hides_nobody(system: str, folder: Path, at_s: float) -> None:
+def test_a_clock_that_is_set_while_containers_start_hides_none(system: str, folder: Path, at_s: float) -> None:
     """As on a computer that has none of its own and asks the network when it starts."""
     starting = free_endpoint()
     HostFolder(system).enter(starting)
@@ -118,7 +118,7 @@ def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, fol
         assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
-def test_rubbish_in_the_folder_disturbs_nobody(system: str, folder: Path) -> None:
+def test_foreign_files_in_the_folder_disturb_nothing(system: str, folder: Path) -> None:
     (folder / "tcp_rubbish").write_bytes(b"\xff\x00")
     (folder / "tcp_more").write_text("not an endpoint")
     (folder / "tcp_folder").mkdir()

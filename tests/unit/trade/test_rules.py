@@ -121,7 +121,7 @@ def test_a_condition_compares_a_field_of_an_answer(desk: Desk, engine: Engine) -
     ],
     ids=["actuates", "nobody", "no comparison", "no such field", "no number"],
 )
-def test_a_condition_that_cannot_be_asked_does_not_hold_and_is_told_of_once(
+def test_a_condition_that_cannot_be_evaluated_does_not_hold_and_is_reported_once(
     desk: Desk, engine: Engine, condition: str, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "trade.rules"):

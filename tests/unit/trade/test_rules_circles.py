@@ -45,7 +45,7 @@ def health(container: Container) -> str:
 
 
 @pytest.mark.parametrize("offers", ["left", "missing"])
-def test_rules_that_trigger_each_other_for_ever_are_stopped_and_reported(
+def test_rules_that_trigger_each_other_endlessly_are_stopped_and_reported(
     there: Container,
     engine: Engine,
     offers: str,
@@ -82,9 +82,7 @@ def test_rules_that_trigger_each_other_for_ever_are_stopped_and_reported(
     assert toggle.turns <= causes.TURNS + 2
 
 
-def test_a_stopped_rule_begins_anew_when_the_file_is_read_again(
-    here: Container, there: Container, engine: Engine
-) -> None:
+def test_a_stopped_rule_restarts_when_the_file_is_read_again(here: Container, there: Container, engine: Engine) -> None:
     def come_and_go() -> Firing:
         lamp = Lamp()
         there.register(lamp, "hall")

@@ -92,7 +92,7 @@ def test_a_container_is_reached_at_each_of_its_addresses(start_container: Any) -
         assert client.find(where(name="echo"), wait_s=20)("hello") == "hello"
 
 
-def test_an_address_that_is_not_of_this_host_is_told_by_name(start_container: Any, system: str) -> None:
+def test_an_address_of_another_host_is_reported_by_name(start_container: Any, system: str) -> None:
     lan = {"insecure_lan": True, "system": system, "credentials": ("me", "secret")}
     with pytest.raises(ConfigurationError, match=r"listen tcp/127.0.0.1:\d+, tcp/192\.0\.2\.77:7450: cannot listen"):
         start_container("far", listen=["tcp/127.0.0.1:0", "tcp/192.0.2.77:7450"], **lan)

@@ -103,7 +103,7 @@ def test_a_call_whose_deadline_passes_while_it_waits_never_runs(offer: Any, benc
     assert bench.order == [0, 2]
 
 
-def test_a_local_caller_is_told_that_its_turn_did_not_come(here: Container, bench: Bench) -> None:
+def test_a_local_caller_learns_that_its_turn_did_not_come(here: Container, bench: Bench) -> None:
     here.register(bench, "robot")
     work = here.find(where(name="work"))
     first = work.start(0)

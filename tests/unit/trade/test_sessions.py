@@ -193,7 +193,7 @@ def test_what_cannot_be_stopped_is_not_withdrawn_from_elsewhere(robot: Robot) ->
     assert not robot.me.services(where(group="robot.a"))
 
 
-def test_what_another_provider_can_still_stop_goes_on(robot: Robot) -> None:
+def test_a_motion_that_another_provider_can_still_stop_continues(robot: Robot) -> None:
     joint, home = robot.joints["a"], robot.system.container("a")
     twin = Joint("a")
     twin.resources = joint.resources
@@ -204,7 +204,7 @@ def test_what_another_provider_can_still_stop_goes_on(robot: Robot) -> None:
     assert not joint.stopped.is_set()
 
 
-def test_S14_what_a_dead_session_left_moving_and_nobody_can_stop_is_locked_by_nobody(robot: Robot) -> None:
+def test_S14_a_device_left_moving_by_a_dead_session_that_cannot_be_stopped_cannot_be_locked(robot: Robot) -> None:
     joint = robot.joints["a"]
     joint.stop_fails = True
     with robot.me.open_session("page"):

@@ -24,7 +24,7 @@ OFFERS = """
 """
 
 
-def test_telling_of_many_services_takes_no_pool_and_what_is_large_does(here: Container, start_program: Any) -> None:
+def test_sending_many_small_records_takes_no_pool_and_a_large_one_does(here: Container, start_program: Any) -> None:
     program = start_program(OFFERS)
     handle = here.find(where(name="picture", group="house.room39"), wait_s=30)
     program.tell()

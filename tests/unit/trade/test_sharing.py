@@ -199,7 +199,7 @@ def test_handles_of_what_is_shared_are_translated_and_others_do_not_cross(two: T
         two.find("itself")()
 
 
-def test_what_comes_and_goes_at_home_comes_and_goes_abroad(two: Two) -> None:
+def test_services_that_come_and_go_at_home_come_and_go_in_the_other_system(two: Two) -> None:
     legs = Joint("legs")
     two.robot.register(legs, "rosie.legs")
     move = two.anna.find(where(name="move", group="rosie.legs"), wait_s=20)
@@ -294,7 +294,7 @@ def test_S08_a_clients_own_stop_does_not_latch_and_a_foreign_one_does(two: Two) 
 # --- locks
 
 
-def test_a_lock_abroad_is_a_lock_at_home_under_the_clients_name(two: Two) -> None:
+def test_a_lock_in_another_system_is_a_lock_at_home_under_the_clients_name(two: Two) -> None:
     at_home = two.planner.find(where(name="move", group="rosie.head"), wait_s=20)
     with two.anna.lock(where(group="rosie.head"), purpose="look") as lock:
         assert lock.resources == ("pan",)
@@ -337,7 +337,7 @@ def test_who_has_it_at_home_keeps_it_and_is_asked(two: Two) -> None:
     assert asked[1:] == [("planner/planner", "mine")]
 
 
-def test_who_waits_abroad_gets_it_when_it_is_given_back_at_home(two: Two) -> None:
+def test_a_client_waiting_in_another_system_gets_the_lock_when_it_is_released_at_home(two: Two) -> None:
     with two.planner.lock(where(group="rosie.head")) as held:
         lock = two.anna.lock(where(group="rosie.head"), wait_s=30)
         taking = threading.Thread(target=lock.acquire)

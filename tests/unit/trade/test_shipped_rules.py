@@ -85,7 +85,7 @@ def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) 
     assert told == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
 
 
-def test_bootstrap_lets_itself_be_found_until_somebody_who_can_see_has_joined(
+def test_bootstrap_stays_discoverable_until_a_provider_that_can_see_has_joined(
     start_container: StartContainer, only: Only, here: Container
 ) -> None:
     at = free_endpoint()
@@ -151,7 +151,7 @@ def test_a_lamp_that_is_missing_is_made(
     shine(0.5)
 
 
-def test_who_has_too_much_to_do_goes_on_elsewhere_and_whoever_looks_finds_one(
+def test_an_overloaded_provider_moves_elsewhere_and_clients_find_one(
     start_container: StartContainer, only: Only, here: Container
 ) -> None:
     mind, planner = start_container("mind"), Planner()
@@ -188,7 +188,7 @@ def test_all_of_them_together_do_not_run_in_circles_when_a_camera_is_replaced(
         assert {info.state for info in rules.rules()} == {"standing"}
 
 
-def test_a_planner_that_is_not_well_goes_on_elsewhere_with_what_it_knows(
+def test_an_unhealthy_planner_continues_elsewhere_with_its_state(
     start_container: StartContainer, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     busy = {"worker-1": 70.0, "worker-2": 20.0}

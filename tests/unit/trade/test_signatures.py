@@ -85,7 +85,7 @@ def test_the_signature_reads_like_python(robot: dict[str, Handle], name: str) ->
     assert robot[name].signature == TEXTS[name]
 
 
-def test_the_docstring_is_told(robot: dict[str, Handle]) -> None:
+def test_the_docstring_is_shown(robot: dict[str, Handle]) -> None:
     assert robot["move"].doc == "Move a joint.\n\nBlocks until it is there."
 
 

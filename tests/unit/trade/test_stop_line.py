@@ -127,7 +127,7 @@ def test_what_is_asked_of_many_is_one_estop(driver: Container, start_container: 
         assert [estop.id for estop in container.estops()] == ["1234abcd"]
 
 
-def test_a_stop_that_fails_is_told_with_its_reason(start_container: StartContainer) -> None:
+def test_a_failed_stop_is_reported_with_its_reason(start_container: StartContainer) -> None:
     container = start_container("driver")
     container.register(Lamp("it is stuck"), groups=["rosie.lamp"])
     report = lines(container).stop("rosie.lamp", "", 5).wait()
@@ -244,7 +244,7 @@ def test_the_port_is_a_thousand_above_or_below() -> None:
 # --- reports of several
 
 
-def test_who_confirmed_to_one_is_missing_to_nobody() -> None:
+def test_a_container_that_confirmed_once_is_not_missing() -> None:
     first = EstopReport("1", ("a/a",), missing=("b/b", "c/c"))
     second = EstopReport("1", ("b/b",), failed={"d/d": "it is stuck"})
     assert all_of("1", [first, second]) == EstopReport("1", ("a/a", "b/b"), ("c/c",), {"d/d": "it is stuck"})
@@ -271,7 +271,7 @@ def strangers() -> Iterator[list[socket.socket]]:
         one.close()
 
 
-def test_strangers_that_say_nothing_shut_nobody_out_and_go(
+def test_silent_strangers_shut_no_client_out_and_are_dropped(
     driver: Container, lamp: Lamp, strangers: list[socket.socket]
 ) -> None:
     files = open_files()

@@ -19,7 +19,7 @@ from trade.testing import MemorySystem
 # --- errors and ends
 
 
-def test_an_error_of_the_service_is_raised_and_the_stream_goes_on(two: Two) -> None:
+def test_an_error_of_the_service_is_raised_and_the_stream_continues(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=10_000) as stream:
         stream.next(PATIENCE_S)
         two.battery.error = ValueError("no reading")

@@ -26,7 +26,7 @@ def test_samples_come_in_order_with_the_time_they_were_taken_at(two: Two) -> Non
     assert all(early.at <= late.at for early, late in itertools.pairwise(samples))
 
 
-def test_nobody_asks_a_service_that_nobody_listens_to(two: Two) -> None:
+def test_a_service_without_listeners_is_not_polled(two: Two) -> None:
     assert two.battery.asked == 0
     other = Battery()
     two.there.register(other, "lab")
@@ -47,7 +47,7 @@ def test_many_listeners_cost_one(two: Two) -> None:
         stream.close()
 
 
-def test_samples_are_put_once_for_all_and_never_for_nobody(memory: MemorySystem, apart: Two) -> None:
+def test_samples_are_sent_once_for_all_listeners_and_never_without_one(memory: MemorySystem, apart: Two) -> None:
     put: list[int] = []
     third = memory.container("third")
     handle = third.find(where(name="count", group="rosie"))
@@ -103,7 +103,7 @@ def hear(stream: Stream, number: int, at_ns: int = 0) -> None:
     stream.hear(StreamSample(PROTOCOL, number, 0.0, at_ns, failed=False, body=EMPTY))
 
 
-def test_a_source_that_counts_anew_has_lost_nothing(apart: Two) -> None:
+def test_a_source_that_restarts_its_count_has_lost_nothing(apart: Two) -> None:
     stream = alone(apart.service("count"))
     for number in (9, 1, 2):
         hear(stream, number)
@@ -269,7 +269,7 @@ def test_who_is_slow_has_the_newest_and_knows_how_many_are_missing(two: Two, eve
         assert sum(sample.dropped + 1 for sample in others) == together
 
 
-def test_who_stood_still_is_told_of_all_that_it_missed(apart: Two) -> None:
+def test_a_frozen_listener_learns_how_many_samples_it_missed(apart: Two) -> None:
     """It began out of turn, and the samples before it stood still were a little late, the one after it was not."""
     stream = alone(apart.service("count"))
     for number, at_ms in ((1, 5.2), (2, 10.3), (3, 20.3), (7, 60.0)):
@@ -277,7 +277,7 @@ def test_who_stood_still_is_told_of_all_that_it_missed(apart: Two) -> None:
     assert [sample.dropped for sample in some(stream, 4)] == [0, 0, 0, 3]
 
 
-def test_the_latest_is_there_without_being_taken(two: Two, eventually: Any) -> None:
+def test_the_latest_sample_can_be_read_without_taking_it(two: Two, eventually: Any) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as stream:
         assert eventually(lambda: (latest := stream.latest()) is not None and latest.value >= 3)
         assert stream.next(PATIENCE_S).value == 1

@@ -43,7 +43,7 @@ def test_a_stream_that_passes_on_says_how_to_listen_to_what_comes_again(
         wait_until(lambda: any("trade.joined(" in one for one in caplog.messages))
 
 
-def test_a_failure_that_only_lasts_longer_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_that_only_lasts_longer_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING), memory_system() as system:
         robot, viewer = system.container("robot"), system.container("viewer")
         robot.register(Sick(), "rosie.neck")

@@ -58,7 +58,7 @@ def _left_out() -> list[Any]:
 
 
 @pytest.mark.parametrize(("kind", "name"), _left_out())
-def test_what_the_reference_leaves_out_is_there(kind: str, name: str) -> None:
+def test_names_that_the_reference_omits_exist(kind: str, name: str) -> None:
     """A name that was changed would be on the page again."""
     made = getattr(trade, kind)
     assert hasattr(made, name) or f"self.{name}" in inspect.getsource(made)

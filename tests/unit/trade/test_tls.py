@@ -253,7 +253,7 @@ def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewe
     assert echo(planner)(4) == 4
 
 
-def test_who_cannot_be_dialled_any_more_soon_is_told(
+def test_an_endpoint_that_cannot_be_dialled_any_more_is_reported_soon(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
     for hours, told in ((20, True), (30, False)):
@@ -263,7 +263,7 @@ def test_who_cannot_be_dialled_any_more_soon_is_told(
         assert ("the certificate of arm ends" in caplog.text) == told
 
 
-def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certificate_ends(
+def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it listens with the one it was started with, a renewed one in its folder does not help."""
@@ -277,7 +277,7 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
     assert "start this container again before" in caplog.text
 
 
-def test_the_end_of_a_certificate_is_told_twice(
+def test_the_end_of_a_certificate_is_reported_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(certificates, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
@@ -321,7 +321,7 @@ def test_with_and_without_certificates_are_not_linked_and_it_says_so(
 
 
 @pytest.mark.parametrize(("of", "seen"), [("papers", True), ("strangers", False), ("", False)])
-def test_the_command_line_lists_nobody_without_a_certificate_of_the_authority(
+def test_the_command_line_lists_nothing_without_a_certificate_of_the_authority(
     start_container: Any, request: pytest.FixtureRequest, papers: Papers, of: str, seen: bool
 ) -> None:
     start_container("there", tls=papers.of("arm"))
@@ -463,7 +463,7 @@ def test_endpoints_and_certificates_go_together(papers: Papers) -> None:
                 read(tls=folder, system="lab", **{end: [f"tls/{six}:7450"]})
 
 
-def test_nobody_connects_a_container_past_its_certificate(start_container: Any, papers: Papers) -> None:
+def test_no_container_connects_without_a_valid_certificate(start_container: Any, papers: Papers) -> None:
     """Its switches are services: anybody who may call them names the endpoint."""
     arm = start_container("arm", tls=papers.of("arm"))
     for endpoint in ("tcp/127.0.0.1:1", "tls/127.0.0.1:1#verify_name_on_connect=false", "tls/127.0.0.1:1?rel=1"):

@@ -105,9 +105,7 @@ def _served(container: Container, handle: Handle) -> LocalService:
 # --- what it costs
 
 
-def test_untraced_nothing_stands_around_a_service_and_nothing_is_noted(
-    here: Container, there: Container, arm: Arm
-) -> None:
+def test_untraced_services_are_not_wrapped_and_nothing_is_recorded(here: Container, there: Container, arm: Arm) -> None:
     reach = _served(there, here.find(where(name="reach"), wait_s=20))
     here.call(where(name="reach"), 0.1)
     assert reach.interceptors == ()
@@ -184,7 +182,7 @@ def test_a_call_is_noted_by_who_asks_and_by_who_serves(here: Container, there: C
     assert 0 <= after_s <= served.took_s
 
 
-def test_an_error_is_told_by_its_type_alone(here: Container, there: Container, arm: Arm) -> None:
+def test_an_error_is_reported_by_its_type_alone(here: Container, there: Container, arm: Arm) -> None:
     here.set_tracing(True)
     with pytest.raises(ValueError, match="swordfish"):
         here.call(where(name="reach"), 2.0)
@@ -204,7 +202,7 @@ def test_a_call_that_is_refused_is_noted_by_who_asked(here: Container, there: Co
     assert [span.service for span in here.spans() if span.side == "served"] == []
 
 
-def test_the_time_in_a_serial_queue_is_told(here: Container, there: Container, eventually: Eventually) -> None:
+def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Container, eventually: Eventually) -> None:
     entered, let_go = threading.Event(), threading.Event()
 
     class Queue:
@@ -285,7 +283,7 @@ def test_a_caller_that_is_not_traced_leaves_a_gap_and_no_more(
     assert (trace.service, names) == ("(not traced)", ["trade.acquire", "rosie.arm.reach", "trade.release"])
 
 
-def test_a_call_nobody_noted_is_an_error(here: Container) -> None:
+def test_an_untraced_call_is_an_error(here: Container) -> None:
     here.set_tracing(True)
     with pytest.raises(NoSuchCall, match="no container has traced call 12"):
         here.trace(12)

@@ -58,7 +58,7 @@ def test_patterns_mean_what_they_mean_to_zenoh(one: list[str], other: list[str])
 # --- time
 
 
-def test_time_stands_still_until_it_is_moved() -> None:
+def test_time_does_not_pass_until_it_is_moved() -> None:
     clock = Clock()
     assert clock.monotonic_ns() == 0
     clock.advance(1.5)
@@ -187,7 +187,7 @@ def test_what_is_put_before_the_end_of_a_transport_arrives_before_its_signs_fall
     assert seen[-1] == (Kind.LEAVE, True)
 
 
-def test_somebody_may_drive_the_time_for_what_threads_do(room: Room) -> None:
+def test_a_test_may_drive_the_time_of_other_threads(room: Room) -> None:
     room.network.delay(0.5)
     with room.network.traffic.flowing():
         room.say("word")

@@ -37,7 +37,7 @@ class TestZenoh(TransportConformance):
 
             yield open_transport
 
-    def test_what_nobody_reads_holds_up_nothing_where_only_the_newest_is_wanted(self) -> None:
+    def test_unread_samples_block_nothing_if_only_the_newest_is_wanted(self) -> None:
         with self.network() as open_transport:
             here, there = open_transport(), open_transport()
             unread, read = there.subscribe("flood", newest=_CHANNEL_CAPACITY), there.subscribe("call")

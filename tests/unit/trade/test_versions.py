@@ -265,7 +265,9 @@ def test_what_is_no_order_in_any_version_stops_nothing(
 # --- reports
 
 
-def test_S09_a_report_tells_who_of_another_version_confirmed(memory: MemorySystem, stranger: Strangers) -> None:
+def test_S09_a_report_names_containers_of_another_version_that_confirmed(
+    memory: MemorySystem, stranger: Strangers
+) -> None:
     arm_of(memory)
     other, caller = stranger(), memory.container("caller")
     report = caller.estop("smoke", limit_s=GENEROUS_S)
@@ -284,7 +286,7 @@ def test_S09_who_of_another_version_does_not_confirm_is_missing(memory: MemorySy
     assert not report.complete
 
 
-def test_a_clearing_tells_who_of_another_version_still_has_it_open(
+def test_a_clearing_names_containers_of_another_version_that_still_have_it_open(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:
     arm_of(memory)
@@ -319,7 +321,7 @@ def test_S09_who_joins_takes_over_what_containers_of_another_version_have_open(
         move(one)
 
 
-def test_what_tells_of_an_e_stop_under_a_path_is_dropped(
+def test_an_e_stop_relayed_under_a_path_is_dropped(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:
     """Its id names a file."""

@@ -437,7 +437,7 @@ def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
     assert here.services(where(group="older")) == here.services(where(group="forged")) == []
 
 
-def test_who_answers_for_somebody_else_is_not_listened_to(
+def test_an_answer_on_behalf_of_another_container_is_ignored(
     here: Container, start_container: Any, open_raw: Any, eventually: Any
 ) -> None:
     here.register(Echo(), "robot")
@@ -457,7 +457,7 @@ def test_who_answers_for_somebody_else_is_not_listened_to(
     assert forged.key.address == FORGED  # that one was asked alone, then
 
 
-def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_nobody(
+def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_no_other(
     here: Container,
     there: Container,
     announcer: tuple[Any, Announcer],

@@ -21,7 +21,7 @@ _LINE_M: Final = 0.02
 class ArmContract:
     """Subclass it with a fixture ``arm``: attached, powered, with released brakes, at rest, with space around it."""
 
-    def test_state_tells_what_was_measured_and_when(self, arm: Arm) -> None:
+    def test_state_is_the_truth_what_was_measured_and_when(self, arm: Arm) -> None:
         state, limits = arm.state(), arm.limits()
         assert state.name == arm.resources[0].name == limits.name
         assert len(state.positions_rad) == len(state.velocities_rad_s) == len(state.pose) == len(limits.joints) == 6

@@ -19,7 +19,7 @@ class MotorContract:
     It moves at most 0.12 rad from its initial position, at 0.2 rad/s. The fixture relaxes it after each test.
     """
 
-    def test_state_tells_what_was_measured_and_when(self, motor: Motor) -> None:
+    def test_state_is_the_truth_what_was_measured_and_when(self, motor: Motor) -> None:
         state = motor.state()
         assert state.name == motor.resources[0].name == motor.limits().name
         assert motor.limits().min_rad <= state.position_rad <= motor.limits().max_rad

@@ -66,7 +66,7 @@ def test_nothing_moves_without_a_lock_and_with_one_it_does(robot: Robot, agent: 
     run(moves, agent)
 
 
-def test_a_lock_of_others_stands_in_the_way_and_one_that_is_lost_is_told(
+def test_another_clients_lock_refuses_and_a_lost_lock_is_reported(
     memory: MemorySystem, robot: Robot, agent: Container
 ) -> None:
     person = memory.container("person", identity="ann")

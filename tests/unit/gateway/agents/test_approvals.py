@@ -54,7 +54,7 @@ def test_what_is_marked_waits_for_a_persons_word(
     assert robot.legs.angle == 0.5
 
 
-def test_nobody_approves_for_himself_or_without_the_right(
+def test_no_client_approves_its_own_request_or_without_the_right(
     memory: MemorySystem, robot: Robot, governed: Path, agent: Container
 ) -> None:
     bob, again = memory.container("bob", identity="bob"), memory.container("again", identity="agent")

@@ -67,7 +67,7 @@ def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
         pursue(graph, 1).wait(PATIENCE_S)
 
 
-def test_an_action_that_nobody_serves_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_action_without_a_server_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_action_client, "_THERE_S", 0.2)
     with pytest.raises(RosUnreachable, match="/move: no node serves this action"):
         pursue(graph, 1)
@@ -82,7 +82,7 @@ def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
 
 
-def test_a_goal_whose_server_is_killed_is_told_and_the_next_server_takes_goals(graph: Ros1, stand: Stand) -> None:
+def test_a_goal_whose_server_is_killed_fails_and_the_next_server_takes_goals(graph: Ros1, stand: Stand) -> None:
     heard: list[int] = []
     first = server(stand)
     goal = pursue(graph, HANGS, heard)
@@ -148,7 +148,7 @@ def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
     peer.wait_for("preempted")
 
 
-def test_what_goes_on_is_canceled_as_we_close(graph: Ros1, stand: Stand) -> None:
+def test_calls_in_progress_are_canceled_when_we_close(graph: Ros1, stand: Stand) -> None:
     peer = server(stand)
     heard: list[int] = []
     goal = pursue(graph, FOR_EVER, heard)
@@ -255,7 +255,7 @@ def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover,
     wait_until(lambda: mover.canceled, "it is canceled")
 
 
-def test_a_client_is_told_of_what_fails(mover: Mover, stand: Stand) -> None:
+def test_a_client_receives_reports_of_failures(mover: Mover, stand: Stand) -> None:
     told = client(stand, ABORTS).wait_for("done")
     assert (told["state"], told["text"]) == (ABORTED, "a joint is stuck")
 
@@ -319,7 +319,7 @@ def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -
     assert mover.canceled == [FOR_EVER]
 
 
-def test_the_two_ends_of_ours_understand_each_other(mover: Mover, graph: Ros1) -> None:
+def test_our_two_ends_understand_each_other(mover: Mover, graph: Ros1) -> None:
     heard: list[int] = []
     assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(Ended.SUCCEEDED, {"result": 3}, "done")
     goal = pursue(graph, FOR_EVER)

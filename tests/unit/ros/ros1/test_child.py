@@ -44,7 +44,7 @@ time.sleep(600)
         ("http://localhost:11311", "", {"ROS_IP": "10.0.0.7"}, {"ROS_IP": "10.0.0.7"}),
     ],
 )
-def test_our_node_listens_on_loopback_where_the_master_does_and_nobody_says_otherwise(
+def test_our_node_listens_on_loopback_if_the_master_does_unless_configured(
     master: str, ip: str, set_here: dict[str, str], becomes: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("ROS_IP", "ROS_HOSTNAME"):
@@ -85,7 +85,7 @@ def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> Non
     assert our_node() == node
 
 
-def test_our_node_that_stands_still_is_ended_at_once_and_started_again(graph: Ros1) -> None:
+def test_our_node_is_killed_at_once_when_frozen_and_restarted(graph: Ros1) -> None:
     before = our_node()
     began = time.monotonic()
     before.send_signal(signal.SIGSTOP)
@@ -120,7 +120,7 @@ def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: 
     assert versions <= {sys.implementation.cache_tag}
 
 
-def test_a_port_of_ours_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
+def test_our_port_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
     graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
     listening = [at.laddr.ip for at in our_node().net_connections() if at.status == psutil.CONN_LISTEN]
     assert set(listening) == {"127.0.0.1"}

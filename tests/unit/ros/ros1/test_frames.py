@@ -68,7 +68,7 @@ def test_who_waits_to_read_is_woken_by_the_end_of_its_own_side(pair: Pair) -> No
     other.put({"op": "late"})
 
 
-def test_what_is_too_large_is_left_out_and_all_else_goes_on(
+def test_an_oversized_message_is_left_out_and_the_others_are_sent(
     pair: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(_frames, "_LARGEST", 1000)

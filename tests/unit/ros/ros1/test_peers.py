@@ -57,11 +57,11 @@ os._exit(0)
 """
 
 
-def test_a_node_that_closes_what_is_idle_is_there_until_it_listens_no_more() -> None:
+def test_a_node_that_closes_idle_connections_is_present_until_it_stops_listening() -> None:
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=100, check=True)
     assert ran.stdout.strip() == "[('/arm', True), ('/arm', False)] 4 None"
 
 
-def test_a_death_is_told_however_many_stale_nodes_there_are_and_no_name_is_looked_up_for_it() -> None:
+def test_a_death_is_reported_despite_many_stale_nodes_and_without_name_lookup() -> None:
     ran = subprocess.run([sys.executable, "-c", BESIDE_STALE], capture_output=True, text=True, timeout=100, check=True)
     assert ran.stdout.strip() == "[('/arm', True), ('/arm', False)]"

@@ -35,7 +35,7 @@ def answers(graph: Ros1) -> bool:
 # --- nodes
 
 
-def test_a_node_that_is_killed_is_told_gone_and_come_again(graph: Ros1, stand: Stand) -> None:
+def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Stand) -> None:
     watch = Watch(graph)
     peer = stand.peer("arm")
     watch.until("/arm", there=True)
@@ -47,7 +47,7 @@ def test_a_node_that_is_killed_is_told_gone_and_come_again(graph: Ros1, stand: S
     assert "/trade" not in {name for name, _ in watch.told}
 
 
-def test_a_node_that_ends_is_told_gone(graph: Ros1, stand: Stand) -> None:
+def test_a_node_that_ends_is_reported_gone(graph: Ros1, stand: Stand) -> None:
     watch = Watch(graph)
     peer = stand.peer("arm")
     watch.until("/arm", there=True)
@@ -55,7 +55,7 @@ def test_a_node_that_ends_is_told_gone(graph: Ros1, stand: Stand) -> None:
     watch.until("/arm", there=False)
 
 
-def test_who_begins_to_watch_is_told_of_those_that_are_there_and_who_ends_of_none(graph: Ros1, stand: Stand) -> None:
+def test_a_new_subscriber_gets_the_existing_ones_and_an_ended_one_none(graph: Ros1, stand: Stand) -> None:
     first = Watch(graph)
     stand.peer("arm")
     first.until("/arm", there=True)
@@ -81,7 +81,7 @@ def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros
 # --- the master
 
 
-def test_a_master_that_was_killed_and_started_again_is_told_everything_again(graph: Ros1, stand: Stand) -> None:
+def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
     heard: list[str] = []
@@ -112,7 +112,7 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
     watch.until("/old", there=False)
 
 
-def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again(graph: Ros1, stand: Stand) -> None:
+def test_a_master_that_was_replaced_unnoticed_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
     graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: answers(graph), "its service is found")
     node = our_node()
@@ -181,7 +181,7 @@ def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> Non
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
 
 
-def test_a_result_that_comes_while_our_node_is_dead_is_told(graph: Ros1, stand: Stand) -> None:
+def test_a_result_that_arrives_while_our_node_is_dead_is_delivered(graph: Ros1, stand: Stand) -> None:
     killed: list[bool] = []
 
     def do(goal: Goal) -> Outcome:
@@ -220,7 +220,7 @@ def test_our_node_does_not_take_the_name_of_another(stand: Stand, start_ros1: An
 
 
 @pytest.mark.parametrize(("python", "says"), [("/nowhere/python3", "cannot be started"), ("/bin/false", "has ended")])
-def test_a_python_that_is_none_is_told(python: str, says: str, tmp_path: Path) -> None:
+def test_a_path_that_is_no_python_is_reported(python: str, says: str, tmp_path: Path) -> None:
     graph = Ros1("http://127.0.0.1:1", python=python)
     try:
         wait_until(lambda: says in graph.healthy, "it says so")

@@ -25,7 +25,7 @@ def test_a_service_of_theirs_is_called(graph: Ros1, stand: Stand) -> None:
     assert graph.call("/close", SET_BOOL, {"data": True}, 30) == {"success": True, "message": "/trade asked True"}
 
 
-def test_what_a_service_of_theirs_fails_with_is_told(graph: Ros1, stand: Stand) -> None:
+def test_the_error_of_a_ros_service_is_reported(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/Trigger", "fail")
     peer.wait_for("did")
@@ -41,7 +41,7 @@ def test_a_service_of_another_type_is_refused(graph: Ros1, stand: Stand) -> None
         graph.call("/close", SET_BOOL, {"data": True}, 30)
 
 
-def test_a_service_that_nobody_offers_is_unreachable(graph: Ros1) -> None:
+def test_a_service_without_a_server_is_unreachable(graph: Ros1) -> None:
     with pytest.raises(RosUnreachable, match="/close: no node offers it"):
         graph.call("/close", TRIGGER, {}, 30)
 
@@ -80,14 +80,14 @@ def test_a_service_that_never_answers_is_given_up_and_others_are_not_held_up(gra
     assert graph.call("/close", TRIGGER, {}, 30)["success"]
 
 
-def test_a_node_calls_a_service_of_ours(graph: Ros1, stand: Stand) -> None:
+def test_a_node_calls_our_service(graph: Ros1, stand: Stand) -> None:
     graph.serve("/lights", SET_BOOL, lambda request, who, at: {"success": request["data"], "message": f"for {who}"})
     peer = stand.peer("caller")
     peer.do("call", "/lights", "std_srvs/SetBool", {"data": True})
     assert peer.wait_for("called") == {"success": True, "message": "for /caller"}
 
 
-def test_a_node_is_told_what_a_service_of_ours_fails_with(graph: Ros1, stand: Stand) -> None:
+def test_a_node_receives_the_error_of_our_service(graph: Ros1, stand: Stand) -> None:
     def fail(request: Message, who: str, at: float) -> Message:
         raise RuntimeError("the bulb is gone")
 
@@ -97,9 +97,7 @@ def test_a_node_is_told_what_a_service_of_ours_fails_with(graph: Ros1, stand: St
     assert "the bulb is gone" in peer.wait_for("failed")
 
 
-def test_requests_are_answered_one_after_the_other_and_are_told_when_the_service_is_withdrawn(
-    graph: Ros1, stand: Stand
-) -> None:
+def test_requests_are_answered_in_order_and_fail_when_the_service_is_withdrawn(graph: Ros1, stand: Stand) -> None:
     begun, go_on = threading.Semaphore(0), threading.Event()
 
     def slow(request: Message, who: str, at: float) -> Message:

@@ -87,7 +87,7 @@ def test_S01_what_was_published_before_is_no_command(graph: Ros1, stand: Stand) 
     assert set(heard) == {"new"}
 
 
-def test_a_listener_that_stands_still_holds_up_nobody(graph: Ros1, stand: Stand) -> None:
+def test_a_listener_that_is_frozen_delays_no_other(graph: Ros1, stand: Stand) -> None:
     slow, quick = stand.peer("slow"), stand.peer("quick")
     for peer in (slow, quick):
         peer.do("hear", "/much", "std_msgs/String")
@@ -126,7 +126,7 @@ def _sent(topic: Any, number: int, seen: list[str]) -> bool:
     return str(number) in seen
 
 
-def test_a_closed_subscription_hears_nothing_and_another_goes_on(graph: Ros1) -> None:
+def test_a_closed_subscription_hears_nothing_and_another_continues(graph: Ros1) -> None:
     first: list[str] = []
     second: list[str] = []
     one = graph.subscribe("/both", TEXT, lambda message, who: first.append(message["data"]))

@@ -32,7 +32,7 @@ def test_S07_one_that_hangs_delays_no_other() -> None:
     at_once.close()
 
 
-def test_there_are_only_so_many_threads_and_who_waits_is_told_after_all() -> None:
+def test_threads_are_limited_and_waiting_listeners_are_notified_later() -> None:
     hanging, dropped = Hanging("first", "second"), []
     at_once = AtOnce[str]("test", hanging, most=2, drop=dropped.append)
     for item in ("first", "second", "third", "fourth"):
@@ -60,14 +60,14 @@ def test_what_waits_at_the_end_and_what_comes_after_it_is_dropped(monkeypatch: p
     assert (hanging.told, dropped) == (["first"], ["waits", "too late"])
 
 
-def test_who_is_told_may_end_it() -> None:
+def test_a_listener_may_close_its_own_queue() -> None:
     told: list[str] = []
     at_once = AtOnce[str]("test", lambda item: (at_once.close(), told.append(item)), most=1, drop=lambda _: None)
     at_once.put("end")
     wait_until(lambda: told, "it is told")
 
 
-def test_a_failure_is_logged_and_the_next_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_logged_and_the_next_event_is_delivered(caplog: pytest.LogCaptureFixture) -> None:
     def fail(item: str) -> None:
         raise ValueError(item)
 

@@ -190,7 +190,7 @@ def test_a_result_that_does_not_fit_aborts_the_goal(graph: Ros2, other: Ros2, ca
     assert pursue(other, "misfit", 1).wait(LONG_S).how is Ended.ABORTED
 
 
-def test_an_action_that_is_closed_cancels_its_goals_and_tells_their_end(graph: Ros2, other: Ros2) -> None:
+def test_a_closed_action_cancels_its_goals_and_reports_their_end(graph: Ros2, other: Ros2) -> None:
     doing = Doing()
     action = graph.act("/closing", FIBONACCI, doing)
     pursuit = pursue(other, "closing", 1)
@@ -216,7 +216,7 @@ def test_a_server_that_is_gone_is_noticed(graph: Ros2, other: Ros2, monkeypatch:
     doing.go_on.set()
 
 
-def test_an_action_that_nobody_serves_is_unreachable(graph: Ros2) -> None:
+def test_an_action_without_a_server_is_unreachable(graph: Ros2) -> None:
     with pytest.raises(RosUnreachable, match="no node serves it"):
         graph.pursue("/nobody", FIBONACCI, {"order": 1})
 

@@ -36,7 +36,7 @@ def test_the_oldest_goes_when_there_are_too_many() -> None:
     assert (slow.told, dropped) == (["first", "newer", "newest"], ["old"])
 
 
-def test_S01_what_waited_too_long_is_not_told() -> None:
+def test_S01_a_notification_that_waited_too_long_is_dropped() -> None:
     slow, dropped = Slow(), []
     mailbox = Mailbox[str]("test", slow, longest_s=0.05, drop=dropped.append)
     mailbox.put("first")
@@ -59,7 +59,7 @@ def test_what_comes_after_the_end_is_dropped() -> None:
     assert (told, dropped) == ([], ["too late"])
 
 
-def test_who_is_told_may_end_it() -> None:
+def test_a_listener_may_close_its_own_queue() -> None:
     told = []
     mailbox = Mailbox[str]("test", lambda item: (told.append(item), mailbox.close()))
     mailbox.put("end")
@@ -68,7 +68,7 @@ def test_who_is_told_may_end_it() -> None:
     assert told == ["end"]
 
 
-def test_a_failure_is_logged_and_the_next_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_logged_and_the_next_event_is_delivered(caplog: pytest.LogCaptureFixture) -> None:
     told = []
 
     def tell(item: str) -> None:

@@ -24,7 +24,7 @@ class Told:
         return [there for name, there in self.all if name == node]
 
 
-def test_a_watcher_is_told_first_of_those_that_are_there(graph: Ros2, peer: Process) -> None:
+def test_a_subscriber_first_receives_what_exists(graph: Ros2, peer: Process) -> None:
     peer.ask("listen", topic="/present")  # its node is one with its endpoint
     peer.hear("listening", topic="/present")
     first, second = Told(), Told()
@@ -44,7 +44,9 @@ def test_a_node_in_a_namespace_has_its_whole_name(graph: Ros2, router: Router, o
     wait_until(lambda: told.of("/arm/left/driver") == [True, False], "it is told gone")
 
 
-def test_a_node_that_is_killed_is_told_gone(graph: Ros2, router: Router, start_peer: Callable[..., Process]) -> None:
+def test_a_node_that_is_killed_is_reported_gone(
+    graph: Ros2, router: Router, start_peer: Callable[..., Process]
+) -> None:
     told = Told()
     graph.watch_nodes(told)
     doomed = start_peer(router, "doomed")
@@ -57,7 +59,7 @@ def test_a_node_that_is_killed_is_told_gone(graph: Ros2, router: Router, start_p
     wait_until(lambda: told.of("/doomed") == [True, False, True], "it is told there again")
 
 
-def test_when_one_of_two_with_the_same_name_dies_the_name_is_told_gone_and_there(
+def test_when_one_of_two_of_the_same_name_dies_the_name_is_reported_gone_and_back(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
     told = Told()
@@ -71,7 +73,7 @@ def test_when_one_of_two_with_the_same_name_dies_the_name_is_told_gone_and_there
     wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is told")
 
 
-def test_who_speaks_before_its_token_is_there_is_waited_for(
+def test_a_client_that_speaks_before_its_token_arrived_is_waited_for(
     graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 60.0)
@@ -137,7 +139,7 @@ def test_S07_strangers_are_waited_for_one_after_another_with_pauses(
     assert [presence.node_of(each) for each in (b"one", b"two", b"three")] == ["", "", ""]
 
 
-def test_our_own_node_is_not_told_of(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_our_own_node_is_not_reported(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     told = Told()
     graph.watch_nodes(told)
     open_graph(router, node="/other")
@@ -154,7 +156,7 @@ def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Cal
     assert not told.of("/far")
 
 
-def test_a_closed_watch_is_told_no_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_a_closed_watch_receives_nothing_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     ended, goes_on = Told(), Told()
     watch = graph.watch_nodes(ended)
     graph.watch_nodes(goes_on)

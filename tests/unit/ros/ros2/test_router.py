@@ -16,7 +16,7 @@ ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
 
 
-def test_what_was_asked_for_before_there_is_a_router_works_once_it_is_there(
+def test_requests_from_before_a_router_exists_work_once_it_does(
     own_router: Router, open_graph: Callable[..., Ros2], start_peer: Callable[..., Process]
 ) -> None:
     graph = open_graph(own_router)
