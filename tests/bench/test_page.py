@@ -120,7 +120,7 @@ def test_targets_and_points_have_names_of_their_own_as_reasons_and_comparisons_g
     assert len(set(points)) == len(points)
 
 
-def test_the_command_writes_the_page_and_names_what_is_missed_without_a_reason(
+def test_the_command_writes_the_page_and_names_missed_targets_without_a_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a_run().write(tmp_path / "run.json")

@@ -117,7 +117,7 @@ def hil(file: Path, sim: SimProcess, *words: str, says: str = "") -> "subprocess
 
 def test_the_contracts_run_on_every_joint_and_group_of_a_robot_file(system: str, head_file: Path) -> None:
     with SimProcess(head_file, paced=False) as sim:
-        ended = hil(head_file, sim, "--yes", "-k", "state_is_the_truth or order_of or enable_holds")
+        ended = hil(head_file, sim, "--yes", "-k", "state_has or order_of or enable_holds")
         assert ended.returncode == 0, ended.stdout + ended.stderr
         for device in ("rosie.neck.pan", "rosie.neck.tilt", "rosie.head"):
             assert f"[{device}] PASSED" in ended.stdout
@@ -140,7 +140,7 @@ def test_grippers_are_opened_and_closed_only_after_a_word_of_their_own(system: s
 def test_a_broken_contract_is_reported(system: str, head_file: Path) -> None:
     head_file.write_text(HEAD.replace("min_rad = -1.4", "min_rad = 0.2"))  # it is found outside of its range
     with SimProcess(head_file, paced=False) as sim:
-        ended = hil(head_file, sim, "--yes", "-k", "state_is_the_truth")
+        ended = hil(head_file, sim, "--yes", "-k", "state_has")
         assert ended.returncode == 1
         assert "[rosie.neck.pan] FAILED" in ended.stdout
 

@@ -89,10 +89,10 @@ def defined(path: Path) -> Iterator[tuple[int, str, str]]:
         yield node.lineno, lines[node.lineno - 1], name
 
 
-def in_names(path: Path) -> Iterator[str]:
-    """One line of report for each avoided word in a name that a module defines; names of tests are sentences."""
+def in_names(path: Path, prefix: str = "") -> Iterator[str]:
+    """One line of report for each avoided word in a name with this prefix that a module defines."""
     for number, line, name in defined(path):
-        words = "" if name.startswith("test_") else " ".join(_NAME_PART.findall(name)).lower()
+        words = " ".join(_NAME_PART.findall(name)).lower() if name.startswith(prefix) else ""
         for match in (match for pattern in _NAME_PATTERNS for match in pattern.finditer(words)):
             if f"plain: {match[0]}" not in line:
                 yield f'{path}:{number}: "{match[0]}" in the name {name}: use the term of the field'
@@ -116,6 +116,13 @@ def findings(paths: list[Path]) -> Iterator[str]:
                 yield f'{path}:{number}: "{word}": use {advice}'
         if path.suffix == ".py" and any(path.resolve().is_relative_to(ROOT / package) for package in PRODUCT):
             yield from in_names(path)
+        else:
+            yield from _names_of_tests(path)
+
+
+def _names_of_tests(path: Path) -> Iterator[str]:
+    if path.name.startswith("test_") and path.suffix == ".py":
+        yield from in_names(path, "test_")
 
 
 def files(roots: list[Path]) -> list[Path]:
@@ -130,6 +137,8 @@ def files(roots: list[Path]) -> list[Path]:
 
 def main(arguments: list[str]) -> int:
     found = list(findings(files([Path(name) for name in arguments] or [ROOT / name for name in SEARCHED])))
+    if not arguments:
+        found += [line for path in files([ROOT / "tests"]) for line in _names_of_tests(path)]
     print("\n".join(found))
     return 1 if found else 0
 

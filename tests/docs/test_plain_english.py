@@ -56,4 +56,10 @@ def test_a_finding_says_what_to_write_instead(tmp_path: Path) -> None:
 def test_a_module_is_searched_in_the_names_that_it_defines(tmp_path: Path) -> None:
     path = tmp_path / "module.py"
     path.write_text(NAMES, encoding="utf-8")
-    assert [line.split('"')[1] for line in in_names(path)] == ["told", "theirs", "let go"]
+    assert sorted(line.split('"')[1] for line in in_names(path)) == ["let go", "nobody", "theirs", "told"]
+
+
+def test_of_a_test_module_the_names_of_tests_are_searched(tmp_path: Path) -> None:
+    path = tmp_path / "test_module.py"
+    path.write_text(NAMES, encoding="utf-8")
+    assert [line.split('"')[1] for line in findings([path])] == ["nobody"]

@@ -304,7 +304,7 @@ def test_a_drive_that_does_not_show_its_mode_is_not_enabled_in_it(leg: Leg) -> N
     assert not leg.events("torque_on", HIP, mark)
 
 
-def test_a_drive_that_would_let_go_after_a_quick_stop_is_not_used_in_these_modes(rig: Leg) -> None:
+def test_a_drive_that_would_relax_after_a_quick_stop_is_not_used_in_these_modes(rig: Leg) -> None:
     def stubborn(bus: Cia402Bus) -> None:
         for device in bus.devices:
             write = device.store.set  # type: ignore[attr-defined]

@@ -19,7 +19,7 @@ class TestFakeJointGroup(JointGroupContract):
     # these are of motion that takes time
     test_joints_with_ways_of_different_length_are_on_their_way_together = None  # type: ignore[assignment]
     test_stop_ends_the_motion_of_all_and_the_mover_hears_of_it = None  # type: ignore[assignment]
-    test_its_progress_is_told = None  # type: ignore[assignment]
+    test_its_progress_is_reported = None  # type: ignore[assignment]
     test_stop_ends_a_trajectory = None  # type: ignore[assignment]
     test_a_move_takes_over_from_a_trajectory = None  # type: ignore[assignment]
 

@@ -233,7 +233,7 @@ def test_S18_a_servo_that_browns_out_on_its_way_gets_no_goal_after_it_has_booted
     assert not tail.truth().torque
 
 
-def test_S18_a_servo_that_has_let_go_and_missed_an_exchange_gets_no_goal(tail: TailRig, robot: AttachedRobot) -> None:
+def test_S18_a_servo_that_relaxed_and_missed_an_exchange_gets_no_goal(tail: TailRig, robot: AttachedRobot) -> None:
     moving = Outcome(lambda: robot.motor("tail.root").move_to(1.3, 0.5))
     wait_until(lambda: tail.truth().position_rad > 0.2, "it is under way")
     tail.sim.do(sim.Mute(ids=(1,), count=2))

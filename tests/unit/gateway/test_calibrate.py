@@ -101,7 +101,7 @@ def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[
         Sweep(Hand(beyond), 1, PLACE).until(done_after(1), 60.0)  # type: ignore[arg-type]
 
 
-def test_no_wait_is_without_an_end() -> None:
+def test_a_prompt_without_an_answer_ends_the_measurement() -> None:
     with pytest.raises(ConfigurationError, match="no answer to the prompt"):
         Sweep(Hand([0.0, 0.0, 0.0]), 1, PLACE).until(lambda: False, 0.0)  # type: ignore[arg-type]
 

@@ -278,7 +278,7 @@ def test_a_joint_is_judged_by_when_it_rested_for_good(
     assert (played.problems, [stop.verdict for stop in played.stops]) == ([], [verdict])
 
 
-def test_a_joint_that_rested_before_the_deed_has_shown_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_joint_that_rested_before_the_failure_proves_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05)):
         monkeypatch.setattr(_runner, name, seconds)
     targets, _ = targets_of(load(EXAMPLES / "head.toml"))

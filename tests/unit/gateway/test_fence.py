@@ -59,7 +59,7 @@ def staying() -> Iterator[Staying]:
     made.close()
 
 
-def test_it_is_asked_to_end_and_then_killed(staying: Staying) -> None:
+def test_a_child_that_does_not_end_on_request_is_killed(staying: Staying) -> None:
     staying.until(0.0, 0.5)
     assert staying.says() == "told to leave"
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL

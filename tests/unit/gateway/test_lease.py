@@ -97,7 +97,7 @@ def test_a_stand_in_grants_nothing_until_leases_of_an_earlier_boot_have_ended() 
     assert arbiter.asked(7.0, "", LEASE_S)
 
 
-def test_it_moves_back_by_hand_and_stays_here_if_no_container_takes_it() -> None:
+def test_a_child_handed_back_returns_here_if_no_other_gateway_takes_it() -> None:
     arbiter = free(0.0)
     arbiter.looked(50.0)
     arbiter.ended(51.0, LEASE_S)  # a crash is no reason to give it away

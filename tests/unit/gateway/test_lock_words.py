@@ -34,7 +34,7 @@ def test_the_usage_says_where_the_command_goes() -> None:
     assert "-- COMMAND [ARGUMENT]..." in said.stdout
 
 
-def test_options_of_the_command_are_its_own_and_those_before_the_dashes_are_ours() -> None:
+def test_options_after_the_dashes_belong_to_the_command_and_those_before_to_trade_lock() -> None:
     assert CliRunner().invoke(app, ["lock", "--no-such", "--", "true"]).exit_code == 2
     said = CliRunner().invoke(app, ["lock", "--", "true", "--help", "--no-such"])
     assert isinstance(said.exception, UsageError)  # none of ours: nothing to lock is what is wrong

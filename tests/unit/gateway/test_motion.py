@@ -72,7 +72,7 @@ def test_half_the_speed_takes_twice_as_long() -> None:
     assert slow[12].velocities_rad_s == [velocity / 2 for velocity in once[12].velocities_rad_s]
 
 
-def test_of_stillness_at_both_ends_half_a_second_is_kept() -> None:
+def test_rest_at_both_ends_of_a_motion_is_cut_to_half_a_second() -> None:
     whole = motion_of("rosie.head", states(seconds=60, late_s=40))
     part = moving(whole)
     once = moving(motion_of("rosie.head", states(seconds=4)))

@@ -214,7 +214,7 @@ def test_a_new_authority_has_a_list_of_revoked_names_that_a_policy_can_name(auth
 @pytest.mark.parametrize(
     "text", ["revoked = arm", "revoked = 'arm'", "revoked = [1]", "revoked = ['a b']", "", "names = []"]
 )
-def test_a_damaged_list_forgets_no_one_revoked(authority: Authority, text: str) -> None:
+def test_a_damaged_list_forgets_no_revoked_identity(authority: Authority, text: str) -> None:
     authority.issue("arm")
     (authority.folder / "revoked.toml").write_text(text)
     for act in (lambda: authority.issue("arm"), lambda: authority.revoke("arm"), authority.issued):

@@ -73,7 +73,7 @@ def test_odrive_can_moves_a_simulated_axis(odrive: OdriveBus) -> None:
     assert (truth.position_counts, truth.operating_mode) == (2500, Control.POSITION)
 
 
-def test_odrive_can_sees_an_axis_that_is_not_fed_let_go() -> None:
+def test_odrive_can_sees_an_unfed_axis_relax() -> None:
     with OdriveBus([Axis(NODE, watchdog_s=0.2, t=time.monotonic())], paced=False) as bus:
 
         async def act(drive: Any) -> None:
@@ -157,7 +157,7 @@ def test_damiao_motor_moves_a_simulated_motor_by_springs_and_by_positions(damiao
     wait_until(lambda: abs(damiao.state().devices[0].position_rad + 0.5) < 1e-3, "it has arrived")
 
 
-def test_damiao_motor_sees_a_motor_that_hears_nothing_let_go(damiao: DamiaoBus, motor: Any) -> None:
+def test_damiao_motor_sees_a_motor_that_hears_nothing_relax(damiao: DamiaoBus, motor: Any) -> None:
     motor.set_can_timeout(100)
     motor.enable()
     wait_until(lambda: events(list(damiao.log.entries), "watchdog_expired"), "its time-out has come")

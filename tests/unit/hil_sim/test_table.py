@@ -20,7 +20,7 @@ def vendor_table(name: str) -> dict[str, tuple[int, int]]:
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=lambda model: model.name)
-def test_every_register_of_the_vendors_table_is_ours_at_its_address_and_size(model: Model) -> None:
+def test_the_simulator_has_every_register_of_the_vendors_table_at_its_address_and_size(model: Model) -> None:
     ours = {(register.address, register.size) for register in model.registers}
     vendors = vendor_table(model.name)
     assert set(vendors.values()) <= ours

@@ -291,7 +291,7 @@ def test_only_so_many_reply_keys_are_kept_and_evicted_ones_work_again(
     assert len(there._parts.dispatcher._repliers) <= 2
 
 
-def test_a_reply_key_let_go_while_answering_is_declared_again(here: Container, there: Container) -> None:
+def test_a_reply_key_undeclared_while_answering_is_declared_again(here: Container, there: Container) -> None:
     class Evicting:
         @service
         def answer(self) -> str:

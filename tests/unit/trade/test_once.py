@@ -173,7 +173,9 @@ def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(mo
     assert b"OutcomeUnknown" in bytes(forgotten.answer[1])
 
 
-def test_large_answers_are_let_go_first_but_not_that_they_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_answers_are_dropped_first_but_not_the_record_that_they_were_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(active_calls, "MOST_BYTES", 10_000)
     once = CallDeduplicator()
     for i in range(20):

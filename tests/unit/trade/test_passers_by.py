@@ -40,7 +40,7 @@ NEEDS_GLIBC = pytest.mark.skipif(
 
 
 @NEEDS_GLIBC
-def test_of_who_passes_by_nothing_is_kept(
+def test_nothing_is_kept_of_short_lived_containers(
     start_program: Callable[..., Any], start_container: Callable[..., Container], unwatched: str
 ) -> None:
     staying = start_program(STAYING, prelude=unwatched)

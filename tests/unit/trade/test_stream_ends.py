@@ -317,7 +317,7 @@ def test_a_source_that_is_killed_is_lost(start_container: Any, start_program: An
 # --- the source alone
 
 
-def test_who_does_not_say_again_that_it_listens_is_let_go_of(here: Container) -> None:
+def test_a_listener_that_does_not_renew_is_dropped(here: Container) -> None:
     battery = Battery()
     [count] = [handle for handle in here.register(battery, "rosie") if handle.name == "count"]
     local = here._parts.providers.service(count.key)

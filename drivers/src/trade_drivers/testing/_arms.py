@@ -21,7 +21,7 @@ _LINE_M: Final = 0.02
 class ArmContract:
     """Subclass it with a fixture ``arm``: attached, powered, with released brakes, at rest, with space around it."""
 
-    def test_state_is_the_truth_what_was_measured_and_when(self, arm: Arm) -> None:
+    def test_state_has_the_measurement_and_its_time(self, arm: Arm) -> None:
         state, limits = arm.state(), arm.limits()
         assert state.name == arm.resources[0].name == limits.name
         assert len(state.positions_rad) == len(state.velocities_rad_s) == len(state.pose) == len(limits.joints) == 6
@@ -87,7 +87,7 @@ class ArmContract:
         arm.stop()
         assert not arm.state().freedrive
 
-    def test_a_slower_scaling_is_told_and_kept(self, arm: Arm) -> None:
+    def test_a_slower_scaling_is_reported_and_kept(self, arm: Arm) -> None:
         for fraction in (0.5, 1.0):
             arm.set_speed_scaling(fraction)
             until(lambda fraction=fraction: arm.state().speed_scaling == fraction, "the controller says so")

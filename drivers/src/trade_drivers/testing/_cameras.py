@@ -27,7 +27,7 @@ class CameraContract:
         else:
             assert len(image.data) == _BYTES_PER_PIXEL[image.format] * image.width_px * image.height_px
 
-    def test_an_image_tells_when_it_was_captured(self, camera: Camera) -> None:
+    def test_an_image_has_its_time_of_capture(self, camera: Camera) -> None:
         first = camera.image()
         second = camera.image()
         assert 0 <= first.age_s < 10

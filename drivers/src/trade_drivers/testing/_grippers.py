@@ -19,7 +19,7 @@ class GripperContract:
     The tests open and close it completely, at its limits of speed and force.
     """
 
-    def test_state_is_the_truth_what_was_measured_and_when(self, gripper: Gripper) -> None:
+    def test_state_has_the_measurement_and_its_time(self, gripper: Gripper) -> None:
         state, limits = gripper.state(), gripper.limits()
         assert state.name == gripper.resources[0].name == limits.name
         assert limits.min_width_m - 0.003 <= state.width_m <= limits.max_width_m + 0.003

@@ -113,7 +113,7 @@ class JointGroupContract:
         assert all(state.enabled and not state.moving for state in group.state())
         assert _near(group, goals)
 
-    def test_its_progress_is_told(self, group: JointGroup) -> None:
+    def test_its_progress_is_reported(self, group: JointGroup) -> None:
         with memory_system() as system:
             driver, caller = system.container("driver"), system.container("caller")
             driver.register(group, "contract.group")
@@ -167,7 +167,7 @@ class JointGroupContract:
             group.follow(_trajectory(group, (0.0, elsewhere), (2.0, elsewhere)), Tolerances(start_rad=0.02))
         assert _near(group, before)
 
-    def test_S11_what_somebody_has_locked_moves_for_nobody_else(self, group: JointGroup) -> None:
+    def test_S11_a_locked_device_moves_for_its_owner_only(self, group: JointGroup) -> None:
         with memory_system() as system:
             driver, owner, other = (system.container(name) for name in ("driver", "owner", "other"))
             driver.register(group, "contract.group")

@@ -19,7 +19,7 @@ class MotorContract:
     It moves at most 0.12 rad from its initial position, at 0.2 rad/s. The fixture relaxes it after each test.
     """
 
-    def test_state_is_the_truth_what_was_measured_and_when(self, motor: Motor) -> None:
+    def test_state_has_the_measurement_and_its_time(self, motor: Motor) -> None:
         state = motor.state()
         assert state.name == motor.resources[0].name == motor.limits().name
         assert motor.limits().min_rad <= state.position_rad <= motor.limits().max_rad
@@ -118,7 +118,7 @@ class MotorContract:
         assert 0 < (motor.state().position_rad - start) / _inwards_sign(motor, start) < REACH_RAD
         assert motor.state().enabled
 
-    def test_S04_a_velocity_that_is_renewed_goes_on(self, motor: Motor) -> None:
+    def test_S04_a_renewed_velocity_continues(self, motor: Motor) -> None:
         start, velocity, valid_s = motor.state().position_rad, _inwards(motor) / 2, 0.5
 
         def renewed() -> bool:
@@ -129,7 +129,7 @@ class MotorContract:
         motor.set_velocity(0.0)
         until(lambda: not motor.state().moving, "zero has stopped it")
 
-    def test_S11_what_somebody_has_locked_moves_for_nobody_else(self, motor: Motor) -> None:
+    def test_S11_a_locked_device_moves_for_its_owner_only(self, motor: Motor) -> None:
         with memory_system() as system:
             driver, owner, other = (system.container(name) for name in ("driver", "owner", "other"))
             driver.register(motor, motor.resources[0].name)

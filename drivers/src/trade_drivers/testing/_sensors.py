@@ -23,7 +23,7 @@ class SensorContract:
         assert info.size >= 0
         assert 0 < info.rate_hz < math.inf
 
-    def test_a_reading_tells_when_it_was_measured(self, sensor: Sensor) -> None:
+    def test_a_reading_has_its_time_of_measurement(self, sensor: Sensor) -> None:
         first = sensor.read()
         assert 0 <= first.age_s < 10
         until(lambda: sensor.read().stamp_ns > first.stamp_ns, "something later is measured")

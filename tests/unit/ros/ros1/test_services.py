@@ -18,7 +18,7 @@ TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
 
 
-def test_a_service_of_theirs_is_called(graph: Ros1, stand: Stand) -> None:
+def test_a_ros_service_is_called(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/SetBool")
     peer.wait_for("did")

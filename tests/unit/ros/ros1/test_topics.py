@@ -59,7 +59,7 @@ def test_who_comes_later_is_given_the_last_message_of_a_latched_topic(graph: Ros
     assert peer.wait_for("heard")["data"] == "new"
 
 
-def test_the_last_message_of_a_latched_topic_of_theirs_is_heard(graph: Ros1, stand: Stand) -> None:
+def test_the_last_message_of_a_latched_ros_topic_is_received(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("mapper")
     peer.do("advertise", "/map", "std_msgs/String", True)
     peer.do("send", "/map", {"data": "kept"})

@@ -46,7 +46,7 @@ class LossConformance(ABC):
             reconnect()
             assert [ear.next().payload for ear in far] == [b"", b""]
 
-    def test_once_a_sign_has_risen_again_all_that_stands_is_told_when_asked(self) -> None:
+    def test_once_a_liveliness_token_is_back_all_current_entries_are_sent_on_request(self) -> None:
         with self.severable() as (one, other, sever, reconnect):
             standing = {f"shop/{number}": b"1" for number in range(50)}
             Teller(one, "shop/*", standing)

@@ -52,7 +52,7 @@ class StandingConformance(ABC):
             one.announce("shop/bread", b"2")
             assert late.next().payload == b"2"
 
-    def test_nobody_hears_announcements_of_their_own(self) -> None:
+    def test_no_member_hears_its_own_announcements(self) -> None:
         with self.pair() as (one, other):
             ear = RecordingListener(one.announcements("shop/**"))
             meet(listener=one, speaker=other)
@@ -62,7 +62,7 @@ class StandingConformance(ABC):
 
     # --- queries
 
-    def test_who_asks_is_told_all_that_stands_by_each_who_answers(self) -> None:
+    def test_a_query_gets_all_current_entries_of_each_member_that_answers(self) -> None:
         with self.network() as open_transport:
             one, other = open_transport(), open_transport()
             Teller(one, "shop/one/*", {"shop/one/bread": b"fresh", "shop/one/milk": b"cold"})
@@ -88,7 +88,7 @@ class StandingConformance(ABC):
                 assert answer.messages == [Message(f"shop-{turn}/bread", b"fresh")]
                 sign.close()
 
-    def test_ten_thousand_things_are_told_in_order(self) -> None:
+    def test_ten_thousand_entries_are_sent_in_order(self) -> None:
         with self.pair() as (one, other):
             standing = {f"shop/{number}": str(number).encode() * 100 for number in range(10_000)}
             Teller(one, "shop/*", standing)
@@ -96,7 +96,7 @@ class StandingConformance(ABC):
             [answer] = other.ask("shop/**", 6 * PATIENCE_S)
             assert [(message.key, message.payload) for message in answer.messages] == list(standing.items())
 
-    def test_only_what_was_asked_for_is_told_and_by_those_who_are_asked_for_it(self) -> None:
+    def test_only_the_requested_entries_are_sent_by_the_members_that_were_asked(self) -> None:
         with self.pair() as (one, other):
             Teller(one, "shop/*/one/*", {"shop/food/one/bread": b"fresh", "shop/tools/one/saw": b"sharp"})
             Teller(one, "bank/*", {"shop/food/one/poison": b"", "bank/money": b"1"})
@@ -104,7 +104,7 @@ class StandingConformance(ABC):
             [answer] = other.ask("shop/food/one/*", PATIENCE_S)
             assert answer.messages == [Message("shop/food/one/bread", b"fresh")]
 
-    def test_nobody_asks_themselves(self) -> None:
+    def test_no_member_queries_itself(self) -> None:
         with self.pair() as (one, _):
             Teller(one, "shop/*", {"shop/bread": b"fresh"})
             assert one.ask("shop/**", PATIENCE_S) == []

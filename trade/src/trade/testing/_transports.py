@@ -136,7 +136,7 @@ class TransportConformance(StandingConformance):
                     stop.put(b"stop")
                     assert urgent.next().payload == b"stop"
 
-    def test_droppable_messages_arrive_in_order_where_nobody_stalls(self) -> None:
+    def test_droppable_messages_arrive_in_order_if_no_reader_stalls(self) -> None:
         with self.pair() as (one, other):
             ear = listen(other, "room/a", speaker=one)
             publisher = one.publish("room/a", urgent=True, droppable=True)
@@ -145,7 +145,7 @@ class TransportConformance(StandingConformance):
                 publisher.put(number)
                 assert ear.next().payload == number
 
-    def test_what_may_be_dropped_and_is_not_urgent_arrives_in_order_where_nobody_stalls(self) -> None:
+    def test_droppable_messages_that_are_not_urgent_arrive_in_order_if_no_reader_stalls(self) -> None:
         with self.pair() as (one, other):
             ear = listen(other, "room/a", speaker=one)
             publisher = one.publish("room/a", droppable=True)
@@ -153,7 +153,7 @@ class TransportConformance(StandingConformance):
                 publisher.put(str(number).encode())
                 assert ear.next().payload == str(number).encode()
 
-    def test_who_keeps_the_newest_makes_nobody_wait_and_loses_the_oldest(self) -> None:
+    def test_a_reader_that_keeps_the_newest_delays_no_sender_and_loses_the_oldest(self) -> None:
         with self.pair() as (one, other):
             newest = other.subscribe("room/a", newest=4)
             every = listen(other, "room/*", speaker=one)
@@ -166,7 +166,7 @@ class TransportConformance(StandingConformance):
 
     # --- waking
 
-    def test_waking_reaches_the_readers_of_the_same_transport_and_nobody_else(self) -> None:
+    def test_waking_reaches_the_readers_of_the_same_transport_only(self) -> None:
         with self.pair() as (one, other):
             own, far = RecordingListener(one.subscribe("room/*")), listen(other, "room/*", speaker=one)
             one.wake("room/a", b"wake")
@@ -236,7 +236,7 @@ class TransportConformance(StandingConformance):
             one.close()
             one.wake("room/a", b"")
 
-    def test_what_remains_goes_on_without_the_one_that_closed(self) -> None:
+    def test_the_others_continue_without_the_one_that_closed(self) -> None:
         with self.network() as open_transport:
             one, other, third = open_transport(), open_transport(), open_transport()
             ear = listen(other, "room/a", speaker=third)
