@@ -18,6 +18,8 @@ INSTALL: Final = 'needs prometheus-client; pip install "trade-core[metrics]"'
 _PREFIX: Final = "trade_"
 _MOST_CONNECTIONS: Final = 32
 """The most simultaneous connections; each has a thread until it is answered."""
+_BACKLOG: Final = 128
+"""Connections that wait to be accepted. The default of 5 makes a scraper wait seconds while strangers connect."""
 _ASKED_WITHIN_S: Final = 5.0
 """How long a connection may send nothing."""
 
@@ -95,6 +97,7 @@ def open_metrics(
         raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
 
     server.socket = BoundedListener(server.socket, _MOST_CONNECTIONS)
+    server.socket.listen(_BACKLOG)
     server.RequestHandlerClass.timeout = _ASKED_WITHIN_S  # type: ignore[attr-defined] # as for every stream handler
 
     def close() -> None:
