@@ -53,7 +53,7 @@ def test_a_type_of_ones_own_carries_arguments_and_results_by_name(stand: Stand) 
     assert answer == {"success": True, "message": "", "at": 0.25}
 
 
-def test_a_failure_is_in_the_response_or_raised(stand: Stand) -> None:
+def test_a_failure_is_reported_in_the_response_or_as_a_ros_error(stand: Stand) -> None:
     stand.up(TRIGGERS + '[[to_ros.service]]\nservice = "rosie.legs.state"\ntype = "std_srvs/srv/Empty"\nname="/ask"\n')
     stand.robot.head.silent = stand.robot.legs.silent = True
     answer = stand.trigger(stand.node(), "/rosie/head/state")
@@ -62,7 +62,7 @@ def test_a_failure_is_in_the_response_or_raised(stand: Stand) -> None:
         stand.node("/other").call("/ask", "std_srvs/srv/Empty", {}, PATIENCE_S)
 
 
-def test_a_denial_of_the_policy_is_reported_with_its_rule(stand: Stand, tmp_path: Path) -> None:
+def test_a_call_denied_by_the_policy_is_refused_with_access_denied(stand: Stand, tmp_path: Path) -> None:
     policy = tmp_path / "policy.toml"
     policy.write_text(
         '[roles.robot]\nregister = ["rosie"]\n[roles.bridge]\nregister = ["ros"]\nread = ["rosie"]\n'
@@ -127,7 +127,7 @@ def test_a_lock_is_taken_and_given_back_and_serves_the_calls_of_its_node(stand: 
     assert stand.set_bool(node, "/rosie/head/lock", False)["message"] == "it had none"
 
 
-def test_a_broken_lock_is_reported_and_can_be_taken_again(stand: Stand) -> None:
+def test_a_node_whose_lock_was_broken_is_refused_and_can_lock_again(stand: Stand) -> None:
     stand.up(SWITCHES + LOCKS)
     node = stand.node()
     assert stand.set_bool(node, "/rosie/head/lock", True)["success"]
@@ -138,7 +138,7 @@ def test_a_broken_lock_is_reported_and_can_be_taken_again(stand: Stand) -> None:
     assert stand.set_bool(node, "/rosie/head/power", True) == {"success": True, "message": ""}
 
 
-def test_an_unknown_node_cannot_lock_because_the_lock_would_have_no_owner(stand: Stand) -> None:
+def test_an_unidentified_node_cannot_take_a_lock(stand: Stand) -> None:
     stand.up(LOCKS + TRIGGERS)
     stand.ros.anonymous = True
     answer = stand.set_bool(stand.node(), "/rosie/head/lock", True)
@@ -198,7 +198,7 @@ def test_S07_a_stop_needs_no_lock_and_ends_what_others_move(stand: Stand) -> Non
         run.result(PATIENCE_S)
 
 
-def test_S08_after_a_foreign_stop_no_node_moves_it_until_a_client_resumes(stand: Stand) -> None:
+def test_S08_a_stop_from_another_node_blocks_all_nodes_until_resume(stand: Stand) -> None:
     stand.up(TRIGGERS + SWITCHES)
     spins, _ = apart(lambda: stand.trigger(stand.node("/one"), "/rosie/head/spin"))
     assert stand.robot.head.goes.wait(PATIENCE_S)

@@ -118,7 +118,7 @@ def test_a_call_that_fails_stops_and_gives_the_lock_back(stand: Stand) -> None:
     assert stand.robot.head.commands == [0.1]
 
 
-def test_S08_after_a_foreign_stop_commands_do_nothing_until_a_client_resumes(stand: Stand) -> None:
+def test_S08_a_stop_by_another_client_blocks_ros_commands_until_resume(stand: Stand) -> None:
     stand.up(LONG)
     stick = Stick(stand)
     stick.say(0.1)

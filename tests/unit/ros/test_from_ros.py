@@ -108,7 +108,7 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
     assert stand.container.locks() == []
 
 
-def test_a_service_that_does_not_answer_fails_before_the_deadline_of_the_call(stand: Stand) -> None:
+def test_an_unanswered_ros_service_raises_ros_unreachable_before_the_deadline(stand: Stand) -> None:
     """By default the bridge waits as long as a call lasts."""
     lab = Lab(stand)
     lab.waits = True
@@ -286,7 +286,7 @@ def test_joints_of_ros_move_no_quicker_than_they_may(stand: Stand, arm: RosArm) 
         found(stand, "lab.arm", "move_to")([0.5])
 
 
-def test_our_trajectory_is_followed_in_ros(stand: Stand, arm: RosArm) -> None:
+def test_a_trajectory_is_sent_to_ros_in_the_joint_order_of_the_call(stand: Stand, arm: RosArm) -> None:
     points = [{"time_from_start_s": t, "positions_rad": [t, -t]} for t in (0.0, 1.0)]
     found(stand, "lab.arm", "follow")({"joints": ["lab.arm.b", "lab.arm.a"], "points": points})
     assert [point["positions"] for point in arm.goals[0]["points"]] == [[0.0, 0.0], [-1.0, 1.0]]
@@ -384,7 +384,7 @@ def test_what_came_from_ros_does_not_go_back_there(stand: Stand) -> None:
     assert set(stand.ros.services) == {"/lab/door", "/lab/stop"}
 
 
-def test_the_health_of_a_service_from_ros_shows_that_its_server_is_lost(stand: Stand) -> None:
+def test_a_service_imported_from_ros_is_unhealthy_while_ros_is_lost(stand: Stand) -> None:
     stand.up(TOPIC)
     handle = found(stand, "lab", "level")
     stand.ros.problem = "no master"

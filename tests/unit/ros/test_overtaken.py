@@ -80,7 +80,7 @@ def test_S14_what_stops_is_owed_while_ros_is_lost_and_what_it_moves_counts_as_mo
         assert heard[-1] == 0.0
 
 
-def test_S08_a_stop_that_overtook_a_call_on_its_way_is_sent_again(stand: Stand) -> None:
+def test_S08_a_stop_that_overtook_a_pending_call_is_sent_again(stand: Stand) -> None:
     lab, arrive, asked, stops = stand.node("/lab"), threading.Event(), threading.Event(), list[float]()
 
     def move(_request: Any, _who: str, _came_at: float) -> Any:

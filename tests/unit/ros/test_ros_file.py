@@ -68,7 +68,7 @@ def test_what_is_wrong_is_named_with_what_would_be_right(tmp_path: Path, text: s
         (HEAD + 'types = ["nowhere"]\n', "there is no such folder"),
     ],
 )
-def test_what_cannot_be_mapped_is_reported_before_anything_joins(stand: Stand, text: str, says: str) -> None:
+def test_an_invalid_mapping_is_rejected_before_joining_ros(stand: Stand, text: str, says: str) -> None:
     with pytest.raises(ConfigurationError, match=says):
         planned(stand.read(text, ""), stand.folder / "ros.toml")
 

@@ -106,7 +106,7 @@ def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
         (DeviceFault(device="a", bus="can0", fault="hot"), -1),
     ],
 )
-def test_a_failure_on_the_way_is_reported_with_its_published_code(
+def test_a_failure_during_a_trajectory_ends_with_its_published_error_code(
     stand: Stand, arm: Limb, error: Exception, code: int
 ) -> None:
     arm.error = error

@@ -46,7 +46,7 @@ def test_who_went_without_any_bridge_is_gone_as_soon_as_that_is_sure(told: "queu
     absences.close()
 
 
-def test_no_notification_arrives_after_the_end(told: "queue.SimpleQueue[str]") -> None:
+def test_closed_grace_periods_report_no_absence(told: "queue.SimpleQueue[str]") -> None:
     absences = GracePeriods(told.put, lambda: True, grace_s=3600.0)
     absences.begin("me/arm/1")
     absences.close()
@@ -55,7 +55,7 @@ def test_no_notification_arrives_after_the_end(told: "queue.SimpleQueue[str]") -
     assert not [thread for thread in threading.enumerate() if thread.name == "trade-absence"]
 
 
-def test_a_session_that_returns_while_its_end_is_reported_is_reported_back_after_that() -> None:
+def test_a_return_during_the_absence_report_is_handled_after_the_report() -> None:
     """What is told of him last is that he is there; else he would be forgotten while he lives."""
     telling, told = threading.Event(), threading.Event()
     order: list[str] = []

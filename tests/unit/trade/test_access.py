@@ -57,7 +57,7 @@ def test_a_permitted_identity_calls_reads_and_stops(member: Member, neck: Neck) 
     assert (find(planner, "move")(0.1), find(planner, "angle")(), find(planner, "stop")()) == (0.1, 0.5, None)
 
 
-def test_a_denied_call_names_the_client_the_service_and_the_reason_and_runs_nothing(member: Member, neck: Neck) -> None:
+def test_a_denied_call_reports_caller_service_and_rule_and_runs_nothing(member: Member, neck: Neck) -> None:
     dash = member("dash")
     with pytest.raises(AccessDenied) as denied:
         find(dash, "move")(0.1)
@@ -69,7 +69,7 @@ def test_a_denied_call_names_the_client_the_service_and_the_reason_and_runs_noth
     assert neck.moved == []
 
 
-def test_a_handle_describes_what_it_requires_of_callers(member: Member, neck: Neck) -> None:
+def test_a_handle_shows_the_verb_and_the_roles_that_its_service_requires(member: Member, neck: Neck) -> None:
     dash = member("dash")
     asked = {name: (find(dash, name).verb, find(dash, name).roles) for name in ("move", "angle", "stop")}
     assert asked == {"move": ("call", ("operator",)), "angle": ("read", ("operator", "viewer")), "stop": ("", ())}
@@ -152,7 +152,7 @@ def test_locking_needs_the_right_over_the_group(member: Member, neck: Neck) -> N
         dash.lock(where(group="rosie.neck")).acquire()
 
 
-def test_a_client_that_may_not_read_what_it_looks_for_learns_that(policy: Path) -> None:
+def test_a_lookup_without_read_permission_names_the_missing_permission(policy: Path) -> None:
     access = Authorizer(policy, certified=True)
     hidden = access.hidden("nobody", "rosie.neck")
     assert hidden.startswith("nobody may not read rosie.neck: ")
@@ -277,7 +277,7 @@ def test_an_e_stop_is_not_cleared_by_who_may_not(careless: Container, member: Me
     assert [known.id for known in member("drv").estops()] == [report.id]
 
 
-def test_a_revoked_identity_stops_no_robot(memory: MemorySystem, member: Member, neck: Neck) -> None:
+def test_a_revoked_identity_cannot_stop_a_robot(memory: MemorySystem, member: Member, neck: Neck) -> None:
     thief = memory.container("careless", identity="thief")
     memory.settle()
     thief.estop("now", limit_s=0.3)
@@ -286,7 +286,7 @@ def test_a_revoked_identity_stops_no_robot(memory: MemorySystem, member: Member,
     assert (neck.stops, member("drv").estops()) == (0, [])
 
 
-def test_a_revoked_identity_stops_no_robot_in_another_version_of_the_protocol_either(
+def test_a_revoked_identity_cannot_send_an_estop_in_another_protocol_version(
     memory: MemorySystem, member: Member, neck: Neck
 ) -> None:
     drv, raw = member("drv"), MemoryTransport(memory.network, "raw")
@@ -298,7 +298,7 @@ def test_a_revoked_identity_stops_no_robot_in_another_version_of_the_protocol_ei
     assert [known.id for known in drv.estops()] == ["of-dash"]
 
 
-def test_readers_ignore_services_that_a_container_may_not_offer(
+def test_readers_ignore_services_that_their_container_may_not_offer(
     memory: MemorySystem, member: Member, neck: Neck
 ) -> None:
     planner, careless = member("planner"), memory.container("careless", identity="dash")
@@ -310,7 +310,7 @@ def test_readers_ignore_services_that_a_container_may_not_offer(
     assert planner.services(where(name="clock", container="careless"))
 
 
-def test_each_container_offers_only_its_own_functions_in_the_middlewares_group(member: Member) -> None:
+def test_any_container_may_offer_only_built_in_functions_in_the_middleware_group(member: Member) -> None:
     access = member("planner").access
     assert access.may_offer("dash", "trade", "system", ("trade",))
     assert access.may_offer("dash", "trade", "estops", ("trade",))
@@ -340,7 +340,7 @@ def test_a_reloaded_policy_counts_for_the_next_call_on_both_sides(
     assert unchecked(0.2) == 0.2
 
 
-def test_a_call_in_progress_continues_when_its_right_is_revoked(
+def test_a_running_call_continues_when_its_permission_is_revoked(
     member: Member, memory: MemorySystem, gate: Any, policy: Path
 ) -> None:
     drv, planner = member("drv"), member("planner")

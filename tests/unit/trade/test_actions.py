@@ -181,7 +181,7 @@ def test_a_provider_may_answer_a_cancelled_call(offer: Any, walk: Walk) -> None:
     run.cancel()
 
 
-def test_a_record_that_reports_progress_arrives_as_plain_data(offer: Any, walk: Walk) -> None:
+def test_a_progress_record_arrives_as_plain_data(offer: Any, walk: Walk) -> None:
     run = offer(walk)("tell_record").start()
     wait_until(lambda: run.progress() is not None)
     walk.open.set()
@@ -189,7 +189,7 @@ def test_a_record_that_reports_progress_arrives_as_plain_data(offer: Any, walk: 
     assert run.progress() == {"share": 0.5, "left": [1, 2]}
 
 
-def test_a_provider_that_ignores_cancellation_continues(offer: Any, walk: Walk) -> None:
+def test_a_service_that_ignores_cancellation_runs_to_its_end(offer: Any, walk: Walk) -> None:
     run = offer(walk)("walk").start()
     assert walk.entered.wait(20)
     run.cancel()

@@ -83,7 +83,7 @@ def test_single_groups_come_and_go(there: Container, motor: Motor, move: Handle,
     assert heard.empty()
 
 
-def test_health_is_reported_and_selects_services(
+def test_health_is_shown_on_the_handle_and_usable_as_a_filter(
     here: Container, there: Container, motor: Motor, move: Handle, heard: Heard
 ) -> None:
     there.set_health(motor, "degraded: overheating")
@@ -106,7 +106,7 @@ def test_a_provider_is_read_again(there: Container, motor: Motor, move: Handle, 
     assert move(0.5) == 0.5
 
 
-def test_changed_reports_what_ceases_to_match_and_nothing_else(
+def test_changed_reports_only_services_that_start_or_cease_to_match(
     here: Container, there: Container, motor: Motor, move: Handle, heard: Heard
 ) -> None:
     healthy: queue.SimpleQueue[str] = queue.SimpleQueue()

@@ -118,7 +118,7 @@ def test_a_call_within_the_container_is_written_down_too(there: Container, folde
     assert ("call", "rosie.arm.reach", "ok") in told(there, folder)
 
 
-def test_a_providers_error_is_named_without_its_message(here: Container, there: Container, folder: Path) -> None:
+def test_the_audit_record_names_an_error_without_its_message(here: Container, there: Container, folder: Path) -> None:
     with pytest.raises(ValueError, match="swordfish"):
         call(here, "reach", 2.0)
     [row] = [row for row in rows(there, folder) if row.kind == "call"]
@@ -285,7 +285,7 @@ def test_hooks_and_tracing_leave_a_record_as_it_is(here: Container, there: Conta
 # --- off
 
 
-def test_when_off_no_service_is_wrapped_and_no_file_is_made(
+def test_a_disabled_audit_record_adds_no_interceptor_and_no_file(
     here: Container, start_container: Start, tmp_path: Path
 ) -> None:
     there = start_container("there")

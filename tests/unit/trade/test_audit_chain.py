@@ -125,7 +125,7 @@ def test_a_row_replaced_by_one_that_fits_its_own_hash_is_found_at_the_next(path:
     assert "does not follow" in verdict(path).problem
 
 
-def test_a_wholly_rewritten_record_is_detected_only_by_a_noted_head(tmp_path: Path, path: Path) -> None:
+def test_only_a_separately_kept_head_reveals_a_completely_rewritten_record(tmp_path: Path, path: Path) -> None:
     noted = {20: verdict(path).head.hash}
     assert verdict(path, noted).problem == ""
     other = tmp_path / "other.sqlite"
@@ -174,14 +174,14 @@ def test_a_clock_far_ahead_does_not_clear_the_record(path: Path, store: AuditSto
     assert verdict(path).problem == ""
 
 
-def test_rows_dropped_by_another_writer_are_missed(path: Path, store: AuditStore) -> None:
+def test_rows_deleted_without_a_record_of_it_are_detected(path: Path, store: AuditStore) -> None:
     store.drop(Keep(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
     tamper(path, "DELETE FROM record WHERE seq < 14")
     assert verdict(path).broken_at == 1
     assert "no row says" in verdict(path).problem
 
 
-def test_a_dropped_row_is_proved_by_the_row_that_records_the_drop(path: Path, store: AuditStore) -> None:
+def test_the_row_that_records_a_drop_proves_the_last_dropped_row(path: Path, store: AuditStore) -> None:
     hashes = {link.row.seq: link.hash for link in links(path)}
     keep = Keep(days=1, rows=9, least=0, piece=5)
     assert store.drop(keep, row("", at_ns=2)) == 10
@@ -195,7 +195,7 @@ def test_a_dropped_row_is_proved_by_the_row_that_records_the_drop(path: Path, st
         assert "noted elsewhere" in wrong.problem
 
 
-def test_a_dropped_row_that_no_row_names_is_reported_as_unverifiable(path: Path, store: AuditStore) -> None:
+def test_a_dropped_row_that_no_other_row_names_is_reported_as_unverifiable(path: Path, store: AuditStore) -> None:
     hashes = {link.row.seq: link.hash for link in links(path)}
     store.drop(Keep(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
     dropped = verdict(path, {7: hashes[7]})

@@ -69,7 +69,7 @@ def test_a_record_begins_and_ends_with_its_container(write: Write, path: Path) -
     assert path.parent.stat().st_mode & 0o077 == 0
 
 
-def test_the_next_boot_continues_where_the_last_one_ended(write: Write, path: Path) -> None:
+def test_the_next_boot_continues_the_audit_chain_of_the_last_one(write: Write, path: Path) -> None:
     for _ in range(2):
         write().close()
     assert [row.what for row in rows(path)] == ["began", "ended"] * 2
@@ -93,7 +93,7 @@ def test_texts_that_cannot_be_written_are_written_without_what_cannot(write: Wri
     assert verdict(path).problem == ""
 
 
-def test_a_caller_continues_while_the_queue_is_full_and_the_record_counts_lost_events(
+def test_a_full_audit_queue_blocks_no_caller_and_the_lost_records_are_counted(
     write: Write, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writing, "_MOST", 10)
@@ -284,7 +284,7 @@ def _do(path: Path, *statements: str) -> None:
     file.close()
 
 
-def test_a_folder_that_cannot_be_made_stops_no_container_from_working(
+def test_an_audit_folder_that_cannot_be_created_blocks_no_caller(
     write: Write, path: Path, caplog: pytest.LogCaptureFixture, eventually: Eventually
 ) -> None:
     path.parent.write_text("a file where a folder is to be")

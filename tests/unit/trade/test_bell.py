@@ -8,7 +8,7 @@ import pytest
 from trade._threads.condition import InterruptibleCondition
 
 
-def test_it_wakes_all_waiting_threads() -> None:
+def test_notify_all_wakes_all_waiting_threads() -> None:
     bell, rung, woken = InterruptibleCondition(), threading.Event(), threading.Semaphore(0)
 
     def wait() -> None:
@@ -46,7 +46,7 @@ def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
     assert len(looks) == 2
 
 
-def test_no_waiter_is_kept_once_waiting_is_over() -> None:
+def test_a_condition_keeps_no_waiter_after_its_wait() -> None:
     bell = InterruptibleCondition()
     bell.wait_for(lambda: False, 0)
     assert not bell._gates

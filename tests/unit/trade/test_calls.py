@@ -143,7 +143,7 @@ def test_an_interrupted_call_gives_its_channel_back_and_its_late_answer_is_passe
     assert len(transport.channels) == 1
 
 
-def test_the_end_of_a_wait_never_ends_the_next_one_on_the_same_channel(
+def test_ending_a_wait_does_not_end_the_next_call_on_the_same_channel(
     caller: Caller, transport: PaperTransport
 ) -> None:
     """Between looking at a channel and ending its wait, it may be lent to the next call."""
@@ -280,7 +280,7 @@ def test_an_expiry_is_never_later_than_meant_and_at_most_a_round_trip_early(offs
     assert meant_ns - 2 * round_trip_ns - SECOND_NS <= expiry_ns <= meant_ns
 
 
-def test_a_shorter_round_trip_measures_the_clock_better() -> None:
+def test_a_shorter_round_trip_improves_the_clock_offset_estimate() -> None:
     peer = Peer(OTHER)
     now = time.monotonic_ns()
     peer.heard(now - 50_000_000, now - 100_000_000, now)
@@ -294,7 +294,7 @@ def test_a_shorter_round_trip_measures_the_clock_better() -> None:
     assert abs((peer.expiry_ns(0) or 0) - better) < 10_000_000
 
 
-def test_a_clock_that_jumped_is_synchronised_again() -> None:
+def test_the_clock_offset_of_a_peer_is_replaced_after_a_jump() -> None:
     peer = Peer(OTHER)
     now = time.monotonic_ns()
     peer.heard(now, now - 1000, now)

@@ -113,7 +113,7 @@ def test_cancelling_reaches_what_a_service_waits_for(here: Container, outer: Out
     assert isinstance(refused, Cancelled)
 
 
-def test_a_reading_call_learns_that_its_outer_call_was_cancelled(here: Container, outer: Outer, leaf: Leaf) -> None:
+def test_an_inner_call_sees_the_cancellation_of_its_outer_call(here: Container, outer: Outer, leaf: Leaf) -> None:
     run = found(here, "relay").with_(deadline_s=60).start([found(here, "heed")])
     assert leaf.entered.wait(20)
     run.cancel()

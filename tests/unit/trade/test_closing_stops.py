@@ -75,7 +75,7 @@ def test_the_stop_of_a_cancelled_task_is_waited_for(memory: MemorySystem, caplog
     assert caplog.messages == []
 
 
-def test_a_lock_report_that_closing_interrupts_is_no_failure(
+def test_a_lock_callback_interrupted_by_closing_logs_no_warning(
     memory: MemorySystem, caplog: pytest.LogCaptureFixture
 ) -> None:
     _, me = _rising(memory)

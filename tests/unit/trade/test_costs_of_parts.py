@@ -233,7 +233,7 @@ def test_a_notification_is_one_call_and_nothing_while_it_waits(
 
 
 @pytest.mark.parametrize("listeners", [1, 4])
-def test_a_sample_is_sent_once_to_each_listener_and_read_once_for_all(
+def test_a_sample_is_read_once_and_sent_once_to_each_listener(
     system: MemorySystem, there: Container, heard: Heard, listeners: int
 ) -> None:
     joint = Joint()
@@ -341,7 +341,7 @@ MOST_BYTES_OF_A_LEAVE = 256
 
 
 @pytest.mark.parametrize("containers", [2, 6])
-def test_joining_beating_and_leaving_have_a_fixed_cost_for_each_present_container(
+def test_join_heartbeat_and_shutdown_have_a_bounded_cost_per_container(
     system: MemorySystem, heard: Heard, containers: int
 ) -> None:
     for number in range(containers):

@@ -73,7 +73,7 @@ def test_an_endpoint_that_lets_us_in_is_not_warned_of(start_container: Any, capl
     assert caplog.text == ""
 
 
-def test_discovery_links_no_container_with_other_credentials(start_container: Any) -> None:
+def test_discovery_does_not_link_containers_with_different_credentials(start_container: Any) -> None:
     one = start_container("one", credentials=ALICE)
     other = start_container("other", credentials=("alice", "wrong"))
     one.system.set_broadcast(True)
@@ -82,7 +82,7 @@ def test_discovery_links_no_container_with_other_credentials(start_container: An
         other.find(where(name="clock", container="one"), wait_s=1.5)
 
 
-def test_containers_of_one_user_share_a_secret_that_no_other_user_can_read(here: Container, tmp_path: Path) -> None:
+def test_containers_of_one_user_share_a_secret_readable_only_by_that_user(here: Container, tmp_path: Path) -> None:
     secret = tmp_path / "runtime" / "trade" / "@secret"
     assert secret.stat().st_mode & 0o077 == 0
     assert user_secret() == user_secret()
@@ -115,7 +115,7 @@ def test_no_file_with_a_password_stays_behind(start_container: Any, tmp_path: Pa
 
 
 @pytest.mark.parametrize("credentials", [("a:b", "c"), ("a", "b\nc"), ("a", " b"), ("", "b"), ("a", "")], ids=repr)
-def test_credentials_that_the_transport_cannot_represent_are_refused(credentials: tuple[str, str]) -> None:
+def test_credentials_that_are_not_printable_are_refused(credentials: tuple[str, str]) -> None:
     with pytest.raises(ConfigurationError, match="user and password must be printable"):
         Settings.read(environment={}, credentials=credentials)
 
@@ -138,7 +138,7 @@ def test_S21_a_laboratory_network_is_listened_on_only_on_purpose() -> None:
 
 
 @pytest.mark.parametrize(("credentials", "seen"), [("alice:pass:word", True), ("alice:wrong", False), ("", False)])
-def test_the_command_line_lists_nothing_without_the_credentials(
+def test_the_command_line_lists_containers_only_with_their_credentials(
     start_container: Any, monkeypatch: pytest.MonkeyPatch, credentials: str, seen: bool
 ) -> None:
     start_container("there", credentials=ALICE)

@@ -102,7 +102,7 @@ def drivers(system: MemorySystem, *names: str) -> list[Axis]:
     return axes
 
 
-def test_S09_all_containers_stop_latch_and_confirm(system: MemorySystem) -> None:
+def test_S09_every_driver_stops_latches_and_confirms(system: MemorySystem) -> None:
     one, other = drivers(system, "one", "other")
     caller = system.container("caller")
     report = caller.estop("smoke", limit_s=GENEROUS_S)
@@ -147,7 +147,7 @@ def test_S09_a_motion_under_way_is_stopped_and_what_was_admitted_is_void(system:
     assert not axis.joint.moving
 
 
-def test_S09_a_device_that_does_not_stop_is_reported(system: MemorySystem) -> None:
+def test_S09_a_device_that_fails_to_stop_is_reported(system: MemorySystem) -> None:
     system.container("bad").register(Axis("bad.joint", failing=True), "bad")
     drivers(system, "good")
     report = system.container("caller").estop(limit_s=GENEROUS_S)
@@ -156,7 +156,7 @@ def test_S09_a_device_that_does_not_stop_is_reported(system: MemorySystem) -> No
     assert not report.complete
 
 
-def test_S09_a_device_that_still_moves_after_its_stop_is_reported(system: MemorySystem) -> None:
+def test_S09_a_device_still_moving_after_its_stop_is_reported(system: MemorySystem) -> None:
     axis = Axis("heavy.joint", stops=False)
     system.container("heavy").register(axis, "heavy")
     axis.joint.moving = True
@@ -181,7 +181,7 @@ def test_S09_the_callers_own_container_stops_too() -> None:
         assert axis.stopped == 1
 
 
-def test_S09_an_estop_that_finds_no_container_is_no_success_and_repeats_to_the_end(system: MemorySystem) -> None:
+def test_S09_an_estop_without_a_driver_is_incomplete_and_repeated_until_its_limit(system: MemorySystem) -> None:
     system.container("planner")
     report = system.container("caller").estop(limit_s=0.35)
     assert (report.confirmed, report.missing, report.complete) == ((), (), False)
@@ -285,7 +285,7 @@ def test_S09_a_program_without_a_name_of_its_own_finds_its_notes_under_another_p
     assert [path.parent.name for path in tmp_path.rglob("*.json")] == ["steering"]
 
 
-def test_S09_estop_files_of_the_previous_release_latch_all_containers_and_are_cleared_for_good(tmp_path: Path) -> None:
+def test_S09_estop_files_of_the_previous_release_latch_every_container_until_cleared(tmp_path: Path) -> None:
     """It kept one folder for all containers of a host."""
     folder = tmp_path / "memory" / "estop"
     folder.mkdir(parents=True)
@@ -402,7 +402,7 @@ def test_S09_one_identity_holds_a_bounded_number_and_each_of_its_orders_stops_an
         assert call(caller, "move_to", "one", 0.1) == 0.1
 
 
-def test_S09_an_estop_that_was_evicted_is_not_over_while_another_container_has_it_open(
+def test_S09_an_evicted_estop_stays_open_while_another_container_has_it_open(
     system: MemorySystem, eventually: Eventually
 ) -> None:
     drivers(system, "one", "other")
@@ -433,7 +433,7 @@ def test_S09_a_second_e_stop_while_the_first_one_is_open_calls_the_stops_again(s
     assert axis.stopped == 3
 
 
-def test_S09_clearing_an_unknown_estop_lists_the_open_ones(system: MemorySystem) -> None:
+def test_S09_clearing_an_unknown_estop_fails_and_lists_the_open_ones(system: MemorySystem) -> None:
     drivers(system, "one")
     caller = system.container("caller")
     report = caller.estop(limit_s=GENEROUS_S)
@@ -519,7 +519,7 @@ def entry_with(estop: Estop) -> ProviderInfo:
     )
 
 
-def test_an_e_stop_sent_under_a_path_is_dropped_and_written_nowhere(eventually: Eventually) -> None:
+def test_an_estop_with_a_path_as_its_id_is_dropped_and_not_written(eventually: Eventually) -> None:
     """Its id names a file."""
     with tempfile.TemporaryDirectory() as folder, memory_system(state_dir=Path(folder)) as system:  # ids are short
         drivers(system, "one")
@@ -539,7 +539,7 @@ def test_an_e_stop_sent_under_a_path_is_dropped_and_written_nowhere(eventually: 
         assert one.dropped_messages > before
 
 
-def test_S09_an_estop_relayed_by_another_container_is_recorded_with_the_relay(
+def test_S09_an_estop_reported_by_another_container_is_recorded_with_its_reporter(
     system: MemorySystem, eventually: Eventually
 ) -> None:
     """Its giver never gave it, perhaps."""
@@ -566,7 +566,7 @@ def test_S09_an_estop_relayed_by_another_container_is_recorded_with_the_relay(
     assert (row.who, row.why) == ("boss", "fire (reported by mallory/x)")
 
 
-def test_S09_the_messages_of_an_estop_between_all_containers_are_small(system: MemorySystem) -> None:
+def test_S09_an_estop_causes_only_small_announcements_between_containers(system: MemorySystem) -> None:
     """It is as much as the square of how many there are, in a moment that matters."""
     drivers(system, *(f"d{number}" for number in range(4)))
     caller, told = system.container("caller"), Counter[str]()
@@ -612,7 +612,7 @@ def test_a_clearing_that_was_recorded_clears_no_later_e_stop(system: MemorySyste
         call(one, "move_to", "one", 0.1)
 
 
-def test_S09_a_present_container_that_was_not_read_yet_is_waited_for() -> None:
+def test_S09_a_container_whose_registry_is_unread_is_reported_as_missing() -> None:
     """It may have something to stop: without its word an e-stop is not complete."""
     with memory_system() as system:
         near, far, me = (system.container(name) for name in ("near", "far", "me"))

@@ -123,7 +123,7 @@ def test_S09_a_link_that_is_full_keeps_the_caller_no_longer_than_its_limit(
     assert [name.rpartition("/")[2] for name in report.missing] == ["frozen"]
 
 
-def test_S09_a_killed_driver_is_latched_after_its_restart_though_no_other_container_knew(
+def test_S09_a_killed_driver_stays_latched_after_restart_without_other_containers(
     start_container: Callable[..., Container], driver: Callable[[str], Any]
 ) -> None:
     first = driver("arm")

@@ -153,7 +153,7 @@ def test_an_error_that_cannot_be_sent_whole_still_arrives(
     assert here.find(where(name="clock", container="there"))() > 0  # and whoever ran it goes on
 
 
-def test_exit_and_interrupt_in_a_service_do_not_use_up_the_callee(here: Container, there: Container) -> None:
+def test_a_service_that_raises_system_exit_does_not_use_up_threads(here: Container, there: Container) -> None:
     there.register(Raiser(SystemExit(1)), "robot")
     go = here.find(where(name="go"), wait_s=20)
     for _ in range(100):  # more than there may be threads
@@ -265,7 +265,7 @@ def test_what_a_provider_raises_unmeant_is_logged_once_where_it_runs(
     ("silent_s", "said"),
     [(0.005, "on /dev/x."), (0.0, "on /dev/x."), (0.34, "on /dev/x for 0.3 s."), (20.487, "on /dev/x for 20 s.")],
 )
-def test_silence_is_reported_as_silence_and_not_as_a_wait(silent_s: float, said: str) -> None:
+def test_device_silent_states_how_long_the_device_was_silent(silent_s: float, said: str) -> None:
     told = str(errors.DeviceSilent(device="rosie.pan", bus="/dev/x", waited_s=silent_s))
     assert told.startswith(f"rosie.pan did not answer {said} Is it powered")
 

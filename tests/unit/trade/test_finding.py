@@ -35,7 +35,7 @@ def test_services_lists_what_matches(here: Container) -> None:
     ]
 
 
-def test_services_that_exist_when_a_container_starts_are_known_from_the_start(start_container) -> None:  # type: ignore[no-untyped-def]
+def test_a_new_container_knows_existing_services_immediately(start_container) -> None:  # type: ignore[no-untyped-def]
     start_container("there").register(Arm(), "rosie")
     assert [handle.name for handle in start_container("here").services(where(group="rosie"))] == ["angle", "move_to"]
 
@@ -96,7 +96,7 @@ def test_two_matches_are_an_error_that_names_them(here: Container, there: Contai
     assert "Add a constraint on what distinguishes them (container)" in str(many.value)
 
 
-def test_two_objects_of_one_group_are_distinguished(here: Container) -> None:
+def test_an_ambiguous_lookup_distinguishes_objects_of_the_same_group(here: Container) -> None:
     here.register(Arm(), "rosie")
     here.register(Arm(), "rosie")
     with pytest.raises(TooManyServices, match="Register them in different groups or with different meta") as many:
@@ -104,7 +104,7 @@ def test_two_objects_of_one_group_are_distinguished(here: Container) -> None:
     assert list(many.value.matches) == ["rosie.angle of Arm-1 in here", "rosie.angle of Arm-2 in here"]
 
 
-def test_services_of_two_containers_of_one_name_are_distinguished(here: Container, start_container: Any) -> None:
+def test_an_ambiguous_lookup_distinguishes_containers_of_the_same_name(here: Container, start_container: Any) -> None:
     twins = [start_container("twin"), start_container("twin")]
     for twin in twins:
         twin.register(Arm(), "rosie")

@@ -182,7 +182,7 @@ def test_handles_of_different_services_differ(here: Container) -> None:
     assert add != "add"
 
 
-def test_a_handle_describes_its_service(here: Container, there: Container) -> None:
+def test_a_handle_shows_the_name_groups_and_container_of_its_service(here: Container, there: Container) -> None:
     there.register(Counter(), ["rosie.head", "lab"])
     seen = found(here, "add")
     told = (seen.name, seen.label, seen.groups, seen.container, seen.local, seen.alive, seen.roles)
@@ -295,14 +295,14 @@ def test_a_handle_of_an_earlier_boot_never_reaches_the_next_one(start_container:
     assert (fresh(), fresh_counter.count) == (1, 1)
 
 
-def test_a_dead_handle_still_describes_its_service(here: Container) -> None:
+def test_a_dead_handle_keeps_its_signature_groups_and_effect(here: Container) -> None:
     counter = Counter()
     (add, _) = here.register(counter, "a")
     here.deregister(counter)
     assert (add.signature, add.groups, add.effect) == ("add(step: int = 1) -> int", ("a",), "actuate")
 
 
-def test_the_chain_names_the_services_that_led_here(offer: Any, here: Container) -> None:
+def test_the_call_chain_lists_the_calling_services(offer: Any, here: Container) -> None:
     class Inner:
         @service
         def chain(self) -> list[str]:
@@ -348,7 +348,9 @@ def test_a_copy_of_a_handle_is_the_handle(here: Container) -> None:
     assert copy.deepcopy({"handle": handle})["handle"] is handle
 
 
-def test_a_failing_listener_hides_an_end_from_no_other(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_done_callback_does_not_block_the_other_callbacks(
+    here: Container, caplog: pytest.LogCaptureFixture
+) -> None:
     [add] = [handle for handle in here.register(Counter(), "told") if handle.name == "add"]
     run = add.start(5)
     assert run.result(20) == 5

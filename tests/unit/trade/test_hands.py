@@ -109,7 +109,7 @@ def test_work_that_comes_as_one_gives_up_waiting_is_done(monkeypatch: pytest.Mon
         done_by(hands)
 
 
-def test_once_closed_no_thread_waits(hands: ThreadPool, eventually: Eventually) -> None:
+def test_a_closed_thread_pool_keeps_no_idle_threads(hands: ThreadPool, eventually: Eventually) -> None:
     done_by(hands)
     assert eventually(lambda: idle(hands) == 1)
     hands.close()

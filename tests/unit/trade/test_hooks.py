@@ -86,7 +86,7 @@ def watch(here: Container, observer: Observer) -> Callable[[str], Handle]:
 # --- what a hook is told
 
 
-def test_a_before_hook_sees_the_service_and_its_arguments(
+def test_a_before_hook_receives_the_service_and_its_arguments(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.before_service(plan, watch("see"))
@@ -96,7 +96,7 @@ def test_a_before_hook_sees_the_service_and_its_arguments(
     assert (called.caller, called.session) == (here.address.identity, here.session)
 
 
-def test_an_after_hook_sees_the_result_before_the_caller(
+def test_an_after_hook_receives_the_result_before_the_caller(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(plan, watch("see"))
@@ -106,7 +106,7 @@ def test_an_after_hook_sees_the_result_before_the_caller(
     assert called.took_s > 0
 
 
-def test_an_after_hook_sees_an_error_which_passes_unchanged(
+def test_an_after_hook_receives_an_error_that_still_reaches_the_caller(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(plan, watch("see"))
@@ -116,7 +116,7 @@ def test_an_after_hook_sees_an_error_which_passes_unchanged(
     assert (called.ok, called.error, called.result) == (False, "ValueError: no plan for nothing", None)
 
 
-def test_secrets_appear_in_no_output(
+def test_hooks_receive_secret_arguments_masked(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(where(name="login"), watch("see"))
@@ -395,7 +395,7 @@ def test_only_handles_and_constraints_are_watched(here: Container, watch: Callab
         here.before_service("mind.plan", watch("see"))  # type: ignore[arg-type]
 
 
-def test_the_middlewares_own_services_are_not_observed(
+def test_hooks_do_not_observe_the_built_in_services(
     here: Container, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
     here.after_service(where(), watch("see"))
@@ -436,7 +436,7 @@ administer = ["*"]
     assert hook.infos()[0].services == ()
 
 
-def test_a_call_continues_when_the_last_hook_is_detached_as_it_begins(
+def test_a_call_succeeds_when_the_last_hook_is_detached_as_it_starts(
     here: Container, planner: Planner, observer: Observer, watch: Callable[[str], Handle]
 ) -> None:
     [plan, *_] = here.register(planner, "mind")

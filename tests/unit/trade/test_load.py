@@ -43,7 +43,7 @@ def test_calls_of_others_are_counted_and_ones_own_are_not(here: Container, there
     assert load().calls - before == 21  # and the second question
 
 
-def test_running_and_queued_children_are_reported(here: Container, there: Container, gate: Any) -> None:
+def test_the_load_report_counts_running_and_queued_calls(here: Container, there: Container, gate: Any) -> None:
     there.register(Clerk(gate), "office")
     file, load = here.find(where(name="file"), wait_s=20), load_of(here, "there")
     runs = [file.start() for _ in range(3)]
@@ -55,7 +55,7 @@ def test_running_and_queued_children_are_reported(here: Container, there: Contai
     wait_until(lambda: (load().queued, load().in_flight) == (0, 1))
 
 
-def test_it_prints_what_the_system_answers(here: Container) -> None:
+def test_the_load_report_agrees_with_the_operating_system(here: Container) -> None:
     told, process = here.system.load(), psutil.Process()
     assert (told.container, told.cores) == ("here", psutil.cpu_count())
     assert told.threads == threading.active_count()
@@ -92,7 +92,7 @@ def test_a_process_that_works_has_more_than_one_that_waits() -> None:
     assert load.read().cpu_percent < worked.cpu_percent
 
 
-def test_two_reads_within_a_second_cover_a_longer_time() -> None:
+def test_load_readings_less_than_a_second_apart_cover_a_longer_period() -> None:
     clock = Elapsing()
     load = LoadMeter("c", list[WorkerPool], none_queued, clock)
     told = list[float]()

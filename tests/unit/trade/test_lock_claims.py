@@ -106,7 +106,9 @@ def command(request: pytest.FixtureRequest, robot: Robot) -> Any:
     return ways[request.param]
 
 
-def test_a_lock_reports_what_it_holds_and_what_was_missing(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_partial_lock_reports_what_it_holds_and_what_is_missing(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
     with robot.me.lock(A | C, partial=True, purpose="dance") as lock:
         assert repr(lock) == "<Lock of a, held, without group='robot.c'>"
     assert "the lock for 'dance' holds a; missing: group='robot.c'" in caplog.text

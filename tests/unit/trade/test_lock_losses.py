@@ -153,7 +153,7 @@ def test_what_is_lost_while_it_waits_for_the_rest_is_no_lock(robot: Robot) -> No
     wait_until(lambda: robot.other.locks() == [])
 
 
-def test_S14_a_device_that_could_not_be_stopped_is_granted_to_no_client_until_resumed(robot: Robot) -> None:
+def test_S14_a_device_that_could_not_be_stopped_cannot_be_locked_until_resume(robot: Robot) -> None:
     robot["a"].stop_fails = True
     lock = robot.me.lock(WHOLE, lease_s=4).acquire()
     with lock.use():
@@ -223,7 +223,7 @@ def test_each_refusal_is_an_error_of_its_own(robot: Robot) -> None:
     assert len({len(traceback.extract_tb(one.__traceback__)) for one in refusals[1:]}) == 1
 
 
-def test_a_refusal_names_the_lock_at_once(robot: Robot) -> None:
+def test_a_refused_call_marks_the_lock_as_lost_immediately(robot: Robot) -> None:
     losses, handle = Losses(), robot.find("a")
     lock = robot.me.lock(WHOLE, lease_s=60, on_lost=losses).acquire()
     robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")

@@ -299,7 +299,7 @@ def test_two_who_want_the_same_in_opposite_order_both_get_it(robot: Robot) -> No
     assert sorted(turns) == ["me"] * 20 + ["other"] * 20
 
 
-def test_S13_a_client_that_waits_in_order_keeps_the_locks_that_it_renews(robot: Robot) -> None:
+def test_S13_a_waiting_lock_renews_the_parts_that_it_already_holds(robot: Robot) -> None:
     taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
     lock = robot.me.lock(WHOLE, wait_s=60, lease_s=1.0)
     waiting = threading.Thread(target=lock.acquire)
@@ -372,7 +372,7 @@ def walker(robot: Robot) -> Callable[[str], Handle]:
     return lambda name: robot.me.find(where(name=name, group="walker"), wait_s=20).with_(deadline_s=1.5)
 
 
-def test_S13_a_lock_that_a_service_cannot_get_is_reported_before_its_calls_deadline(
+def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
     """By default a lock waits as long as a call lasts: who has it, and what for, is told all the same."""
@@ -419,14 +419,14 @@ def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
             robot.me.lock(nothing).acquire()
 
 
-def test_S16_a_lock_of_an_unknown_group_lists_the_known_groups(robot: Robot) -> None:
+def test_S16_a_lock_of_an_unknown_group_suggests_a_known_group(robot: Robot) -> None:
     with pytest.raises(NoSuchService, match="Did you mean robot") as refused:
         robot.me.lock(where(group="robt"), wait_s=0).acquire()
     assert robot.me.locks() == []
     assert not isinstance(refused.value, ConfigurationError)
 
 
-def test_S16_a_lock_waits_until_its_whole_group_is_present(robot: Robot) -> None:
+def test_S16_a_lock_waits_until_its_group_is_complete(robot: Robot) -> None:
     head = robot.system.container("head")
     joints = [Joint(name) for name in ("pan", "tilt")]
     for joint in joints:
@@ -446,7 +446,7 @@ def test_S16_a_lock_waits_until_its_whole_group_is_present(robot: Robot) -> None
         lock.release()
 
 
-def test_S16_an_incomplete_group_is_reported_when_the_wait_is_over(robot: Robot) -> None:
+def test_S16_a_lock_of_an_incomplete_group_names_the_missing_member_at_its_timeout(robot: Robot) -> None:
     joint, head = Joint("pan"), robot.system.container("head")
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
     lock = robot.me.lock(where(group="rosie.head"), wait_s=1)

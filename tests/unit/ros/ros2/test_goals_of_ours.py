@@ -64,7 +64,7 @@ class RawServer:
 
 
 @pytest.mark.parametrize(("status", "how"), [(4, Ended.SUCCEEDED), (5, Ended.CANCELED), (6, Ended.ABORTED)], ids=str)
-def test_our_goal_is_sent_in_the_bytes_of_ros(graph: Ros2, raw: zenoh.Session, status: int, how: Ended) -> None:
+def test_the_action_client_uses_the_ros_wire_format(graph: Ros2, raw: zenoh.Session, status: int, how: Ended) -> None:
     server = RawServer(raw, "theirs", accepts=True, result=bytes([status, 0, 0, 0]) + numbers(1, 2, 3))
     feedback: list[Any] = []
     outcome = pursue(graph, "theirs", 3, feedback.append).wait(LONG_S)
@@ -75,7 +75,7 @@ def test_our_goal_is_sent_in_the_bytes_of_ros(graph: Ros2, raw: zenoh.Session, s
     assert [each["sequence"] for each in feedback] in ([], [[sent[4]]])  # never of another goal
 
 
-def test_feedback_of_our_goal_is_delivered(graph: Ros2, raw: zenoh.Session) -> None:
+def test_the_action_client_receives_feedback(graph: Ros2, raw: zenoh.Session) -> None:
     server = RawServer(raw, "telling", accepts=True, result=None)
     feedback: list[Any] = []
     pursuit = pursue(graph, "telling", 3, feedback.append)
@@ -93,7 +93,7 @@ def test_a_rejected_goal_is_refused_when_it_is_waited_for(graph: Ros2, raw: zeno
     assert not server.of("get_result")
 
 
-def test_our_goal_is_canceled_by_its_id(graph: Ros2, raw: zenoh.Session) -> None:
+def test_cancel_sends_the_goal_id_to_the_action_server(graph: Ros2, raw: zenoh.Session) -> None:
     server = RawServer(raw, "canceling", accepts=True, result=None)
     pursue(graph, "canceling", 3).cancel()
     wait_until(lambda: server.of("cancel_goal"), "it is asked to")
@@ -117,7 +117,7 @@ def test_S07_a_goal_that_is_canceled_without_a_router_is_canceled_when_there_is_
         assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
 
 
-def test_S05_our_goals_are_canceled_when_our_graph_ends(graph: Ros2, raw: zenoh.Session) -> None:
+def test_S05_closing_the_graph_cancels_its_pending_goals(graph: Ros2, raw: zenoh.Session) -> None:
     server = RawServer(raw, "orphaned", accepts=True, result=None)
     pursuit = pursue(graph, "orphaned", 3)
     graph.close()

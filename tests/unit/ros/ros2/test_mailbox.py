@@ -36,7 +36,7 @@ def test_the_oldest_goes_when_there_are_too_many() -> None:
     assert (slow.told, dropped) == (["first", "newer", "newest"], ["old"])
 
 
-def test_S01_a_notification_that_waited_too_long_is_dropped() -> None:
+def test_S01_the_mailbox_drops_messages_that_waited_too_long() -> None:
     slow, dropped = Slow(), []
     mailbox = Mailbox[str]("test", slow, longest_s=0.05, drop=dropped.append)
     mailbox.put("first")

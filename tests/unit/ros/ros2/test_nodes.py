@@ -24,7 +24,7 @@ class Told:
         return [there for name, there in self.all if name == node]
 
 
-def test_a_subscriber_first_receives_what_exists(graph: Ros2, peer: Process) -> None:
+def test_a_new_watcher_is_notified_of_the_nodes_already_present(graph: Ros2, peer: Process) -> None:
     peer.ask("listen", topic="/present")  # its node is one with its endpoint
     peer.hear("listening", topic="/present")
     first, second = Told(), Told()
@@ -44,9 +44,7 @@ def test_a_node_in_a_namespace_has_its_whole_name(graph: Ros2, router: Router, o
     wait_until(lambda: told.of("/arm/left/driver") == [True, False], "it is told gone")
 
 
-def test_a_node_that_is_killed_is_reported_gone(
-    graph: Ros2, router: Router, start_peer: Callable[..., Process]
-) -> None:
+def test_a_killed_node_is_reported_as_gone(graph: Ros2, router: Router, start_peer: Callable[..., Process]) -> None:
     told = Told()
     graph.watch_nodes(told)
     doomed = start_peer(router, "doomed")
@@ -59,7 +57,7 @@ def test_a_node_that_is_killed_is_reported_gone(
     wait_until(lambda: told.of("/doomed") == [True, False, True], "it is told there again")
 
 
-def test_when_one_of_two_of_the_same_name_dies_the_name_is_reported_gone_and_back(
+def test_a_name_shared_by_two_nodes_is_reported_gone_and_present_when_one_ends(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
     told = Told()
@@ -73,7 +71,7 @@ def test_when_one_of_two_of_the_same_name_dies_the_name_is_reported_gone_and_bac
     wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is told")
 
 
-def test_a_client_that_speaks_before_its_token_arrived_is_waited_for(
+def test_node_lookup_waits_for_a_liveliness_token_that_arrives_late(
     graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 60.0)
@@ -139,7 +137,9 @@ def test_S07_strangers_are_waited_for_one_after_another_with_pauses(
     assert [presence.node_of(each) for each in (b"one", b"two", b"three")] == ["", "", ""]
 
 
-def test_our_own_node_is_not_reported(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_the_node_watch_does_not_report_its_own_node(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
+) -> None:
     told = Told()
     graph.watch_nodes(told)
     open_graph(router, node="/other")
@@ -156,7 +156,9 @@ def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Cal
     assert not told.of("/far")
 
 
-def test_a_closed_watch_receives_nothing_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_a_closed_watch_receives_no_more_notifications(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
+) -> None:
     ended, goes_on = Told(), Told()
     watch = graph.watch_nodes(ended)
     graph.watch_nodes(goes_on)

@@ -16,7 +16,7 @@ ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
 
 
-def test_requests_from_before_a_router_exists_work_once_it_does(
+def test_endpoints_created_without_a_router_work_once_the_router_starts(
     own_router: Router, open_graph: Callable[..., Ros2], start_peer: Callable[..., Process]
 ) -> None:
     graph = open_graph(own_router)

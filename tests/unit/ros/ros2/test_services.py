@@ -45,7 +45,7 @@ def calling(graph: Ros2, name: str, times: int) -> Iterator[None]:
     assert answered == [{"sum": 0}] * times
 
 
-def test_another_node_calls_our_service(graph: Ros2, peer: Process) -> None:
+def test_a_peer_node_calls_a_service_of_the_graph(graph: Ros2, peer: Process) -> None:
     graph.serve("/add_ours", ADD, add)
     peer.ask("add", service="/add_ours", a=2, b=-3)
     assert peer.hear("added")["sum"] == -1
@@ -58,7 +58,9 @@ def test_we_call_a_service_of_another_node(graph: Ros2, peer: Process) -> None:
     assert peer.has("asked", a=40, b=2)
 
 
-def test_a_service_learns_which_node_calls(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_a_service_receives_the_name_of_the_calling_node(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
+) -> None:
     asked: list[str] = []
     graph.serve("/who", ADD, lambda _, who, _at: asked.append(who) or {})
     assert call(open_graph(router, node="/arm/asks"), "/who", {}) == {"sum": 0}
@@ -72,7 +74,7 @@ def test_what_another_node_fails_with_is_a_refusal(graph: Ros2, peer: Process) -
         call(graph, "/fails", {})
 
 
-def test_the_error_of_our_service_reaches_the_caller(
+def test_an_exception_in_a_service_is_reported_to_the_caller(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(_request: dict[str, Any], _who: str, _came_at: float) -> dict[str, Any]:
@@ -83,7 +85,7 @@ def test_the_error_of_our_service_reaches_the_caller(
         call(open_graph(router, node="/asks"), "/refuses", {})
 
 
-def test_a_service_without_a_server_is_unreachable_at_once(graph: Ros2) -> None:
+def test_a_call_to_a_service_without_a_server_fails_immediately(graph: Ros2) -> None:
     with pytest.raises(RosUnreachable, match="no node serves it"):
         graph.call("/nobody", ADD, {}, LONG_S)
 
@@ -162,7 +164,7 @@ def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer
 
 
 @pytest.mark.parametrize("kept_s", [1000.0, 0.0], ids=["asked_unseen", "asked_seen"])
-def test_S05_a_request_of_a_node_that_died_while_waiting_is_reported_with_its_name(
+def test_S05_a_queued_request_keeps_the_name_of_a_node_that_died_meanwhile(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch, kept_s: float
 ) -> None:
     """It is known by when it came; and if its token came only after it, by what is kept of those that ended."""
@@ -197,7 +199,7 @@ def test_S05_a_request_of_a_node_that_died_while_waiting_is_reported_with_its_na
     assert asked == ["/first", "/doomed"]
 
 
-def test_S01_a_service_sees_when_its_request_arrived_not_when_its_turn_came(
+def test_S01_a_service_receives_the_arrival_time_of_a_queued_request(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
     came: list[float] = []
@@ -221,7 +223,7 @@ def test_S01_a_service_sees_when_its_request_arrived_not_when_its_turn_came(
     assert began_at <= first_at <= second_at <= second_waits_at
 
 
-def test_S07_a_stop_waits_for_no_stop_that_hangs_and_for_no_name_lookup(
+def test_S07_a_stop_waits_neither_for_a_hanging_stop_nor_for_the_name_of_its_caller(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 1000.0)

@@ -61,7 +61,7 @@ def test_who_comes_late_is_given_what_is_latched(graph: Ros2, peer: Process) -> 
     assert not peer.has("heard", topic="/latched", data="first")
 
 
-def test_only_a_listener_that_asks_for_it_gets_earlier_log_lines(graph: Ros2, router: Router, open_graph: Any) -> None:
+def test_only_latched_subscribers_receive_earlier_messages(graph: Ros2, router: Router, open_graph: Any) -> None:
     latched = graph.advertise("/map", STRING, latched=True)
     latched.send({"data": "before"})
     late = open_graph(router, node="/late")
@@ -111,7 +111,7 @@ def test_while_a_subscriber_is_busy_only_the_newest_wait(graph: Ros2, router: Ro
     assert len([text for text in slow if text.startswith("burst")]) <= 10
 
 
-def test_malformed_messages_are_not_delivered(graph: Ros2, router: Router, caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_ros_messages_are_dropped(graph: Ros2, router: Router, caplog: pytest.LogCaptureFixture) -> None:
     heard = Heard()
     graph.subscribe("/broken", STRING, heard)
     key = f"0/broken/std_msgs::msg::dds_::String_/{graph.types.hash(STRING)}"
