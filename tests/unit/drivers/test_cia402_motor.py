@@ -133,7 +133,7 @@ def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
     rig.plug(prepare=only(PROFILE_POSITION, HOMING))
     group = rig.attach().group("leg")
     mark = written_now()
-    with pytest.raises(ConfigurationError, match="rate_hz of 15"):
+    with pytest.raises(ConfigurationError, match="rate_hz to 15"):
         group.follow(through(group, (0.0, [0.0, 0.0]), (2.0, [0.1, 0.2])))
     assert not rig.controlwords(HIP, mark)
 

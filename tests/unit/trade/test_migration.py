@@ -12,7 +12,7 @@ from trade._migration import source as _departing
 from trade.errors import ConfigurationError, LockedByOther, NoSuchService, ServiceGone, TooManyServices
 
 
-def test_it_continues_elsewhere_with_its_state_and_its_clients(scene: Scene) -> None:
+def test_a_migrated_provider_keeps_its_state_its_groups_and_its_meta(scene: Scene) -> None:
     count, _ = scene.counter("hall", "hall.door", meta={"floor": 2})
     moved = {one.name: one for one in scene.asker.migrate(count, to="new")}
     assert scene.module.events == ["save", "made 1", "restore 3", "close 3"]
@@ -103,7 +103,7 @@ def test_other_arguments_are_given_with_the_order(scene: Scene) -> None:
     assert count() == 10
 
 
-def test_without_state_it_starts_afresh(scene: Scene) -> None:
+def test_a_migrated_provider_without_state_starts_afresh(scene: Scene) -> None:
     scene.offer(scene.module.Forgetful())
     [greet] = scene.asker.migrate(where(name="greet"), to="new")
     assert (greet.container, greet()) == ("new", "hello")

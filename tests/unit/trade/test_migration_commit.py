@@ -73,7 +73,7 @@ def test_what_was_offered_there_has_moved_though_the_answer_was_lost(scene: Scen
     assert moved.container == "new"
 
 
-def test_contact_that_is_lost_leaves_it_withdrawn_until_a_user_decides(scene: Scene) -> None:
+def test_a_provider_stays_withdrawn_after_lost_contact_until_a_user_decides(scene: Scene) -> None:
     count, _ = scene.counter()
     in_between(scene, lambda: cut_calls(scene, source="old"))
     with pytest.raises(MigrationUnknown) as error:

@@ -385,7 +385,9 @@ def prepare(scene: Scene) -> Any:
     return ask(scene, "prepare_arrival")(luggage)
 
 
-def test_results_that_are_never_fetched_are_closed_automatically(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfetched_prepared_provider_is_closed_when_it_expires(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(target, "TICKET_S", 0.05)
     ticket = prepare(scene).ticket
     wait_until(lambda: scene.module.events == ["made 1", "close 0"])
@@ -393,7 +395,7 @@ def test_results_that_are_never_fetched_are_closed_automatically(scene: Scene, m
         ask(scene, "arrive")(ticket)
 
 
-def test_results_that_were_never_fetched_are_closed_with_their_container(scene: Scene) -> None:
+def test_an_unfetched_prepared_provider_is_closed_with_its_container(scene: Scene) -> None:
     prepare(scene)
     scene.new.close()
     assert scene.module.events == ["made 1", "close 0"]

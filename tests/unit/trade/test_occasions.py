@@ -321,7 +321,7 @@ def test_a_callback_that_fails_kills_nothing(here: Container) -> None:
     assert noted.info().last_error == "OSError: no coffee"
 
 
-def test_a_garbage_collected_callback_is_reported(
+def test_a_callback_whose_service_is_gone_is_reported(
     here: Container, there: Container, handle: Callable[[str], Handle]
 ) -> None:
     go = handle("go")

@@ -217,7 +217,7 @@ def test_what_is_not_installed_is_named_with_how_to(system: str, monkeypatch: py
         ("http://collector.example:4318", "write https://collector.example:4318"),
     ],
 )
-def test_a_url_that_leads_nowhere_or_has_credentials_is_refused(url: str, said: str) -> None:
+def test_an_invalid_collector_url_or_plain_http_to_another_host_is_refused(url: str, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         Settings.read(environment={"TRADE_OTLP": url})
 

@@ -138,7 +138,7 @@ def test_a_wrong_file_of_revoked_identities_is_named(tmp_path: Path) -> None:
     assert str(beside) in str(refused.value)
 
 
-def test_half_a_list_of_revoked_identities_restores_none(tmp_path: Path) -> None:
+def test_an_incomplete_list_of_revoked_identities_is_refused(tmp_path: Path) -> None:
     written(tmp_path, "", "r.toml")  # as it is while it is being copied
     with pytest.raises(ConfigurationError, match=r"revoked: missing; write revoked = \[\] if no identity is revoked"):
         read_policy(written(tmp_path, 'revoked_file = "r.toml"\n' + ROLE.format("")))

@@ -204,7 +204,7 @@ def test_a_motion_that_another_provider_can_still_stop_continues(robot: Robot) -
     assert not joint.stopped.is_set()
 
 
-def test_S14_a_device_left_moving_by_a_dead_session_that_cannot_be_stopped_cannot_be_locked(robot: Robot) -> None:
+def test_S14_a_device_that_a_dead_session_could_not_stop_is_locked_only_after_resume(robot: Robot) -> None:
     joint = robot.joints["a"]
     joint.stop_fails = True
     with robot.me.open_session("page"):

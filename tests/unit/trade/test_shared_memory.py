@@ -24,7 +24,7 @@ OFFERS = """
 """
 
 
-def test_sending_many_small_records_takes_no_pool_and_a_large_one_does(here: Container, start_program: Any) -> None:
+def test_announcing_many_services_takes_no_pool_and_a_large_result_does(here: Container, start_program: Any) -> None:
     program = start_program(OFFERS)
     handle = here.find(where(name="picture", group="house.room39"), wait_s=30)
     program.tell()

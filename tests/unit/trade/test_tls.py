@@ -253,7 +253,7 @@ def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewe
     assert echo(planner)(4) == 4
 
 
-def test_an_endpoint_that_cannot_be_dialled_any_more_is_reported_soon(
+def test_a_container_warns_at_start_of_a_certificate_that_ends_soon(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
     for hours, told in ((20, True), (30, False)):
@@ -463,7 +463,7 @@ def test_endpoints_and_certificates_go_together(papers: Papers) -> None:
                 read(tls=folder, system="lab", **{end: [f"tls/{six}:7450"]})
 
 
-def test_no_container_connects_without_a_valid_certificate(start_container: Any, papers: Papers) -> None:
+def test_a_tls_container_rejects_endpoints_that_bypass_its_certificate(start_container: Any, papers: Papers) -> None:
     """Its switches are services: anybody who may call them names the endpoint."""
     arm = start_container("arm", tls=papers.of("arm"))
     for endpoint in ("tcp/127.0.0.1:1", "tls/127.0.0.1:1#verify_name_on_connect=false", "tls/127.0.0.1:1?rel=1"):

@@ -283,7 +283,7 @@ def test_a_caller_that_is_not_traced_leaves_a_gap_and_no_more(
     assert (trace.service, names) == ("(not traced)", ["trade.acquire", "rosie.arm.reach", "trade.release"])
 
 
-def test_an_untraced_call_is_an_error(here: Container) -> None:
+def test_a_trace_request_for_an_unrecorded_call_is_an_error(here: Container) -> None:
     here.set_tracing(True)
     with pytest.raises(NoSuchCall, match="no container has traced call 12"):
         here.trace(12)

@@ -321,7 +321,7 @@ def test_S09_who_joins_takes_over_what_containers_of_another_version_have_open(
         move(one)
 
 
-def test_an_e_stop_relayed_under_a_path_is_dropped(
+def test_an_e_stop_whose_id_contains_a_path_is_dropped(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:
     """Its id names a file."""
