@@ -135,7 +135,7 @@ class Device {
     this.number = make("span", { class: "number" });
     const title = make("h4", {}, this.number, this.name);
     const notes = make("div", { class: "notes", tabindex: 0, "aria-label": `Notes on ${this.name}`, role: "group" }, this.trouble, this.message, this.resume);
-    const owner = make("p", { class: "owner" }, "Locked by ", this.locked);
+    const owner = make("p", { class: "owner" }, this.locked);
     const actions = this.actions.size ? make("div", { class: "actions" }, ...this.actions.values()) : null;
     const parts = [title, this.badges, this.picture(), this.figures, owner, this.hands, actions, notes];
     return make("li", { class: "device", id: `at-${this.group}` }, ...parts);
@@ -166,7 +166,7 @@ class Device {
     const words = state ? this.words(state) : [];
     show(this.badges, JSON.stringify(words), () => words.map((text) => make("span", { class: "badge" }, text)));
     const lock = lockOn(this.resources);
-    write(this.locked, lock ? `${lock.owner}, ${lock.purpose}` : "—");
+    write(this.locked, lock ? `Locked by ${lock.owner}, ${lock.purpose}` : "Not locked");
     this.element.classList.toggle("stale", !state || this.stale || !gateway.connected);
     if (!state) return;
     const figures = this.measured(state);
