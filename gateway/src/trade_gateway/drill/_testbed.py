@@ -229,7 +229,7 @@ class Stand:
 
 @contextmanager
 def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], folder: Path) -> Generator[Stand]:
-    """A running testbed; all of it is ended afterwards.
+    """A running testbed, whose processes end with the context.
 
     Raises:
         ConfigurationError: there is no simulator, or it refuses this robot.

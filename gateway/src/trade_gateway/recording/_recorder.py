@@ -107,7 +107,7 @@ class Recorder:
 
         Args:
             sink: the destination; its exceptions are raised.
-            seconds: or for this time.
+            seconds: the longest duration; None for no limit.
             beat: called every second, and once at the end.
         """
         began = looked = beaten = time.monotonic()

@@ -54,7 +54,7 @@ class Unit:
         self.begun = False
         self.was_up = False
         self.leaving = ""
-        """Why it is to end."""
+        """The reason for its requested end; empty if none is requested."""
         self.save_at = math.inf
         self.saved_at = 0.0
         self.lease: Leased | None = None

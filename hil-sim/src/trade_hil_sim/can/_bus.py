@@ -102,7 +102,7 @@ class CanBus(BusThread):
         return tuple(self._devices)
 
     def state(self) -> BusState:
-        """The truth about the bus and its devices, now."""
+        """The actual state of the bus and its devices, now."""
         return self._in_thread(self._state)
 
     def do(self, command: faults.Command) -> None:

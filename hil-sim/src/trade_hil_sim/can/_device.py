@@ -52,7 +52,7 @@ class Device(Protocol):
         ...
 
     def state(self, t: float) -> DeviceState:
-        """The truth about it."""
+        """Its actual state."""
         ...
 
 

@@ -60,11 +60,11 @@ class SimControl(FaultMethods):
     # the truth
 
     def state(self) -> list[BusState]:
-        """The truth about every bus and its devices."""
+        """The actual state of every bus and its devices."""
         return self._ask(State()).buses or []
 
     def device(self, which: str | int) -> DeviceState:
-        """The truth about one device, by its joint's name or its id.
+        """The actual state of one device, by its joint's name or its id.
 
         Raises:
             SimulationError: no such device, or an id that is on two buses; names the devices.
@@ -73,7 +73,7 @@ class SimControl(FaultMethods):
         return _only("devices", which, [(device.joint, device) for device in devices])
 
     def gripper(self, which: str | int) -> GripperTruth:
-        """The truth about one gripper, by its name or its id.
+        """The actual state of one gripper, by its name or its id.
 
         Raises:
             SimulationError: no such gripper, or an id that is on two buses; names the grippers.
@@ -82,7 +82,7 @@ class SimControl(FaultMethods):
         return _only("grippers", which, [(one.gripper, one) for one in grippers])
 
     def arm(self, which: str) -> ArmTruth:
-        """The truth about one arm, by its name.
+        """The actual state of one arm, by its name.
 
         Raises:
             SimulationError: no such arm; names the arms.

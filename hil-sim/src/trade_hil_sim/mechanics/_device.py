@@ -55,7 +55,7 @@ class DeviceModel(ABC):
 
     @abstractmethod
     def state(self, t: float) -> DeviceState | GripperTruth:
-        """The truth about it at time `t`."""
+        """Its actual state at time `t`."""
 
     def do(self, command: faults.Command, t: float) -> None:
         """Carry out a fault or an order; raises `SimulationError` if it does not support it."""
@@ -125,7 +125,7 @@ class DeviceModel(ABC):
 
 
 class Controller(NamedTuple):
-    """The truth about the controller of a joint; see `DeviceState`."""
+    """The actual state of the controller of a joint; see `DeviceState`."""
 
     goal_counts: int
     torque: bool
@@ -164,14 +164,14 @@ class JointModel(DeviceModel):
 
     @abstractmethod
     def _controller(self) -> Controller:
-        """The truth about its controller."""
+        """The actual state of its controller."""
 
     def joint_rad(self, t: float) -> float:
         """The joint's angle where the shaft really is."""
         return self._offset_rad + self._units(t)[0] * self._rad_per_unit
 
     def state(self, t: float) -> DeviceState:
-        """The truth about it at time `t`."""
+        """Its actual state at time `t`."""
         self.advance(t)
         return DeviceState(
             device_id=self.device_id,

@@ -54,7 +54,7 @@ class SimulatedBus(Protocol):
         ...
 
     def state(self) -> BusState:
-        """The truth about its devices."""
+        """The actual state of its devices."""
         ...
 
 

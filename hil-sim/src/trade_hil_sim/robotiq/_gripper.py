@@ -376,7 +376,7 @@ class Gripper(LineDevice):
         self.emit(entry)
 
     def state(self, t: float) -> GripperTruth:
-        """The truth about it, now."""
+        """Its actual state, now."""
         self.advance(t)
         going = self._going and self._activated
         return GripperTruth(

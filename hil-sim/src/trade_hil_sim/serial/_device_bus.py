@@ -90,7 +90,7 @@ class DeviceLine(ABC, Generic[_Device]):
         return tuple(self._devices)
 
     def state(self) -> BusState:
-        """The truth about the bus and its devices, now."""
+        """The actual state of the bus and its devices, now."""
         with self._lock:
             t = self._clock()
             truths = [msgspec.structs.replace(device.state(t), bus=self.name) for device in self._devices]

@@ -42,7 +42,10 @@ class Run:
         """Returns the service's result, or raises its error.
 
         Args:
-            timeout_s: stops waiting after this long, but not the call; raises TimeoutError.
+            timeout_s: how long to wait, in seconds.
+
+        Raises:
+            TimeoutError: the service has not answered in time; the call continues.
         """
         result, error = self._wait(timeout_s)
         if error is not None:
