@@ -19,7 +19,7 @@ parts:
              SCHED_FIFO where the system allows it
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
   supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
-  scale      what joining, leaving, telling and finding cost, by how many containers there are: in memory 100, with
+scale      what joining, leaving, announcing and finding cost, by how many containers there are: in memory 100, with
              --full 1,000; and 50 processes (root, iproute2)
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
@@ -61,7 +61,7 @@ from tests.bench._report import begin_part, forget_since, mark, print_all_target
 
 _SERVICES_EACH = 10
 _JITTER_ROUNDS = 8
-"""One in a thousand cycles is told of, so there have to be some thousands."""
+"""One in a thousand cycles is reported, so some thousands are needed."""
 
 
 def _run_registry(options: argparse.Namespace) -> None:

@@ -114,7 +114,7 @@ def bare_session(
     namespace: str = _NAMESPACE,
     bridge: Sequence[Sequence[str]] = (),
 ):
-    """A session of zenoh's with the settings of ours, and no container around it."""
+    """A zenoh session with TRADE's settings, without a container around it."""
     from trade._security.certificates import Certificate
     from trade._transport.zenoh import configuration
     from trade._transport.zenoh_links import open_session

@@ -1,4 +1,4 @@
-"""A peer in two processes, its server and its caller, told over pipes what to do; both end with the block."""
+"""A peer in two processes, its server and its caller, controlled over pipes; both end with the block."""
 
 import ctypes
 import multiprocessing
@@ -25,7 +25,7 @@ _NETWORK = 0x40000000
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What a caller is told to do in a round."""
+    """What a caller has to do in a round."""
 
     size: int
     n: int
@@ -81,7 +81,7 @@ def _child_of(peer: Peer, inside: str, main, *args: object) -> AbstractContextMa
 
 @contextmanager
 def _elsewhere(python: str, main, *args: object) -> Iterator[Connection]:
-    """The same under another Python, which sees this repository and its own libraries, and none of ours."""
+    """The same under another Python, which sees this repository and only its own libraries."""
     ours, theirs = _SPAWN.Pipe()
     code = f"from tests.bench._children import begin; begin({theirs.fileno()})"
     others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
@@ -193,4 +193,4 @@ def hear(pipe: Connection, patience_s: float = _PATIENCE_S):
     try:
         return pipe.recv()
     except EOFError:
-        raise RuntimeError("a child process ended early; its error stands above") from None
+        raise RuntimeError("a child process ended early; its error is above") from None

@@ -128,7 +128,7 @@ def _until_known(members: Sequence[Connection], count: int) -> float:
 
 @contextmanager
 def _network() -> Iterator[str]:
-    """A network namespace where nobody else is heard."""
+    """A network namespace in which no other program is heard."""
     name = f"trade-{secrets.token_hex(3)}"
     ip("netns", "add", name)
     try:

@@ -57,14 +57,14 @@ class Felt:
     stop_ms: Sequence[float]
     sent_hz: float = 0.0
     ran_hz: float = 0.0
-    """What the flood put, and what of everybody's ran at the robot."""
+    """What the flood sent, and which calls of all clients ran at the robot."""
 
 
 def run(site: Site, n: int, rounds: int) -> None:
     """Measure and print.
 
     Args:
-        site: where the door stands and is up, with certificates.
+        site: where the gateway runs, with certificates.
         n: calls and stops of the honest caller in a round.
         rounds: turns of each flood.
     """

@@ -1,6 +1,6 @@
 """Gateways: calls through one and two in a row, beside the direct call and a bare zenoh pair over the same regions.
 
-Before that one that has nothing to do, and one through which somebody floods.
+Before that, a gateway with nothing to do, and one through which a client floods.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What a gateway costs that has nothing to do: on one side a robot, simulated, on the other somebody who knows it."""
+"""What an idle gateway costs: a simulated robot on one side, a client that knows it on the other."""
 
 import sys
 import time

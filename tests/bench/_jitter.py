@@ -31,7 +31,7 @@ from trade_drivers.plugins._driver import Driver
 from trade_hil_sim import Entry, SimProcess, SimulationError, read_log
 
 EDGES_US: Final = (*(step * 10.0**decade for decade in range(1, 5) for step in (1, 2, 5)), 1e5)
-"""Of the histograms, on either side of zero: whoever compares two runs finds the same ones."""
+"""Of the histograms, on either side of zero: two runs that are compared have the same ones."""
 _QUANTILES: Final = {"p50": 0.5, "p95": 0.95, "p99": 0.99, "p99.9": 0.999}
 _DRIVER_PRIORITY, _SIM_PRIORITY = 50, 60
 _COUNT: Final = 4
@@ -92,7 +92,7 @@ max_accel_m_s2 = 1.2
 
 
 def _joints(device: str) -> str:
-    """So many of a kind; the first one is the one that stands without torque."""
+    """So many of a kind; the first one stays without torque."""
     names = ", ".join(f'"j{n}"' for n in range(2, _COUNT + 1))
     joints = "".join(_JOINT.format(id=n, device=device) for n in range(1, _COUNT + 1))
     return f"{joints}\n[group.{driver.GROUP}]\njoints = [{names}]\n"
@@ -277,7 +277,7 @@ def off_us(began: Sequence[float], rate_hz: float) -> list[float]:
 
 
 def spread_of(off: Sequence[float]) -> Mapping[str, float]:
-    """What stands in the table, in us. A mean that is not zero is a period that is not kept."""
+    """The values of the table, in us. A mean that is not zero is a period that is not kept."""
     ordered = sorted(off)
     quantiles = {name: ordered[min(len(ordered) - 1, int(len(ordered) * share))] for name, share in _QUANTILES.items()}
     return {**quantiles, "most": ordered[-1], "mean": fmean(ordered)}

@@ -19,7 +19,7 @@ _WAY_RAD, _ACCEL_RAD_S2 = 0.2, 2.2
 def drive(pipe: Connection, text: str, ports: Mapping[str, str]) -> None:
     """Attach a robot of one bus, say the number of this process, then keep it busy for the seconds that are asked.
 
-    A first joint is left without torque, what is in the group goes along a trajectory, an arm, too; a gripper stands.
+    A first joint is left without torque; the group and an arm follow a trajectory; a gripper stays at rest.
     Each request is answered with when that began and ended (CLOCK_MONOTONIC), and with what ended the motion before its
     time, or nothing: too busy a machine holds a bus up. The loop turns on, and how late it was is what is measured.
     """
@@ -32,7 +32,7 @@ def drive(pipe: Connection, text: str, ports: Mapping[str, str]) -> None:
 
 
 def idle(pipe: Connection, rate_hz: float) -> None:
-    """The same of a loop with nothing in it, which tells when each of its turns began, too."""
+    """The same of an empty loop, which also reports when each of its cycles began."""
     pipe.send(os.getpid())
     for seconds in _requests(pipe):
         began = [time.monotonic()]

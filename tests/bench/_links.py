@@ -85,7 +85,7 @@ class Threads(Link):
             try:
                 while left() <= n:
                     check(payload, call(payload))
-            except Exception as bad:  # noqa: BLE001 - told by the thread that waits for all
+            except Exception as bad:  # noqa: BLE001 - raised by the thread that waits for all
                 wrong.append(bad)
 
         threads = [threading.Thread(target=work, args=(call,)) for call in self.several(in_flight)]

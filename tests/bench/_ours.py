@@ -8,7 +8,7 @@ from tests.bench._links import Call, Link, Peer, Pipeline, Threads
 
 
 class Trade(Peer):
-    """A remote call of ours: typed, with deadline, identity and checks; of the kind that may move something."""
+    """A remote call of TRADE: typed, with deadline, identity and checks; of the kind that may move something."""
 
     name = "TRADE"
     system = "two"

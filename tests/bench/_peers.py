@@ -15,7 +15,7 @@ _SIZE_BYTES = 4
 _PATIENCE_S = 20.0
 _CALLS, _REPLIES = "call/bench", "reply/bench"
 _MOST_UNREAD = 256 * 1024
-"""Bytes that raw TCP may have under way: with more, both ends could wait to send and nobody would read."""
+"""Bytes that raw TCP may have under way: with more, both ends could wait to send and neither would read."""
 
 
 class Tcp(Peer):
@@ -65,9 +65,9 @@ def _framed(link: socket.socket) -> bytes:
 
 
 class BarePair(Peer):
-    """What our calls stand on, with nothing of ours around it.
+    """What our calls are based on, without TRADE around it.
 
-    A channel and a declared publisher on each side, the lease every session of ours has, an id before the payload.
+    A channel and a declared publisher on each side, the lease of every TRADE session, an id before the payload.
     """
 
     name = "bare zenoh pair"
@@ -156,7 +156,7 @@ def serve_bare(session, calls: str, replies: str) -> None:
 
 
 def bare_link(session, calls: str, replies: str) -> Link:
-    """The caller's end; raises RuntimeError if nobody comes to hear its calls."""
+    """The caller's end; raises RuntimeError if no server receives its calls."""
     heard, asked = session.declare_subscriber(replies, _fifo()), _declare(session, calls)
     _wait_until_heard(asked)
     return _BareLink(asked.put, heard.recv)
@@ -166,7 +166,7 @@ def _wait_until_heard(asked) -> None:
     until = time.monotonic() + _PATIENCE_S
     while not asked.matching_status.matching:
         if time.monotonic() > until:
-            raise RuntimeError(f"nobody hears {asked.key_expr}")
+            raise RuntimeError(f"no server receives {asked.key_expr}")
         threading.Event().wait(0.01)
 
 

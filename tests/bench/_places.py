@@ -1,4 +1,4 @@
-"""Where containers of a run find each other, and nobody else does."""
+"""Where containers of a run find each other and no other containers."""
 
 import os
 import tempfile

@@ -117,7 +117,7 @@ class Machine(Struct, frozen=True):
 
 
 class Again(Struct, frozen=True):
-    """When some parts of a run were measured anew."""
+    """When some parts of a run were measured again."""
 
     parts: tuple[str, ...]
     commit: str

@@ -1,6 +1,6 @@
 """Many services as a container sees them that comes late: how soon it knows them, what they weigh, finding one.
 
-A server registers them and stands; each round is a fresh process that joins. Everything goes through the public API.
+A server registers them and waits; each round is a fresh process that joins. Everything goes through the public API.
 """
 
 import gc
@@ -121,7 +121,7 @@ def _serve(pipe: Connection, providers: int, services: int) -> None:
 def _join(providers: int, services: int, traced: bool) -> Seen:
     from trade import Container, Settings
 
-    with Container(Settings.read(container="warm-up", system="bench-nobody")) as other:
+    with Container(Settings.read(container="warm-up", system="bench-empty")) as other:
         other.services()
     count = providers * services
     if traced:

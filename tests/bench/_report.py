@@ -16,7 +16,7 @@ def this_run() -> Run:
 
 
 def begin_part(name: str) -> None:
-    """What is told from now on belongs to it."""
+    """What is reported from now on belongs to it."""
     global _part  # noqa: PLW0603 - a process runs one part at a time
     _part = name
 
@@ -28,7 +28,7 @@ def mark() -> tuple[int, int, int]:
 
 
 def forget_since(marked: tuple[int, int, int]) -> None:
-    """What was told since then is told once more, or not at all."""
+    """What was reported since then is reported once more, or not at all."""
     run = this_run()
     for told, count in zip((run.points, run.targets, run.skipped), marked, strict=True):
         del told[count:]

@@ -1,6 +1,6 @@
 """ROS 1: a service of rospy, called over a connection that stays. Under the Python that ROS is installed for.
 
-Nothing of ours is imported here beyond the bench's own modules, as that Python has none of our libraries.
+Only the bench's own modules are imported here, as that Python has none of our libraries.
 """
 
 import os

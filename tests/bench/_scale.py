@@ -1,4 +1,4 @@
-"""Many containers: what joining, leaving, telling and finding cost, by how many there are; messages are counted.
+"""Many containers: what joining, leaving, announcing and finding cost, by how many there are; messages are counted.
 
 In memory first: up to a thousand containers with a hundred services each, on the network of the tests, where every
 message between two of them is seen. Of the larger systems a few are whole containers and the others stand-ins, which
@@ -53,7 +53,7 @@ class Seen:
     """Given and cleared, where all are whole."""
     lock: Cost
     own_kib: float
-    """What a container tells of itself that offers nothing: how large."""
+    """The size of what a container that offers nothing announces about itself."""
     kib_a_service: float
     """What Python keeps of a service of another container."""
     threads: float
@@ -100,7 +100,7 @@ def _print(seen: Sequence[Seen]) -> None:
     }
     for name, tell in rows.items():
         print(f"{name:26}" + "".join(f"{tell(one):>18}" for one in seen))
-    print(f"a container that offers nothing tells {seen[0].own_kib:.1f} KiB of itself")
+    print(f"a container that offers nothing announces {seen[0].own_kib:.1f} KiB about itself")
 
 
 def _told(cost: Cost | None) -> str:
@@ -291,7 +291,7 @@ def _wait(holds: Callable[[], bool]) -> None:
 
 
 def _settle(system: Any) -> None:
-    """Wait until everybody has taken note of everything; of a thousand that takes its time."""
+    """Wait until all containers know everything, which takes some time with a thousand."""
     until = time.monotonic() + _PATIENCE_S
     while time.monotonic() < until:
         try:
@@ -299,7 +299,7 @@ def _settle(system: Any) -> None:
         except TimeoutError:
             continue
         return
-    raise TimeoutError("not everybody has taken note of everything")
+    raise TimeoutError("not all containers know everything")
 
 
 def _median_us(action: Callable[[int], object], times: int) -> float:

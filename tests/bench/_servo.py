@@ -120,7 +120,7 @@ def _load(cycle: Cycle, seconds: float) -> float:
 
 
 class Answers:
-    """How many cycles lacked an answer; a machine that stands still for a moment loses one, a bus that is sick many."""
+    """How many cycles lacked an answer; a machine that is suspended for a moment loses one, a faulty bus many."""
 
     def __init__(self) -> None:
         self._cycles = self._missed = 0

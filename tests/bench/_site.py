@@ -2,7 +2,7 @@
 
     robot, aside -- near -- door -- far -- office, lobby, gate -- beyond -- home
 
-Loopback addresses are no replacement: all of them are on one interface, and networks are told apart by interfaces.
+Loopback addresses are no replacement: all of them are on one interface, and networks are distinguished by interfaces.
 """
 
 import json

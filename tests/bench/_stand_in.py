@@ -1,4 +1,4 @@
-"""What stands in for a container on a network in memory: it says and asks all that one does, and forgets what it hears.
+"""A stand-in for a container on a network in memory: it sends what a container sends and forgets what it hears.
 
 A thousand whole containers in one process would each keep a registry of all others, which no memory holds. What they
 send to each other does not depend on that.
@@ -23,7 +23,7 @@ _ANSWER_S = 20.0
 
 
 def offer_of(container: Container) -> Offer:
-    """What a container tells those who ask it."""
+    """What a container answers to queries."""
     standing = dict(container._parts.announcer._current)
     return {(key.split("/")[1], key.split("/")[-1]): decode_provider(payload) for key, payload in standing.items()}
 
@@ -34,9 +34,9 @@ class StandIn:
     Args:
         network: where it joins.
         name: of the container it stands for.
-        offer: what it tells of itself.
+        offer: what it announces about itself.
         asks: whether it asks those there and those to come what they offer; else, so that very many begin quickly,
-            nobody before `ask_from_now_on`.
+            none before `ask_from_now_on`.
     """
 
     def __init__(self, network: Network, name: str, offer: Offer, *, asks: bool = True) -> None:
@@ -57,7 +57,7 @@ class StandIn:
         self._thread.start()
 
     def ask_from_now_on(self) -> None:
-        """Whoever comes is asked."""
+        """Ask each container that joins."""
         self._asks = True
 
     def beat(self) -> None:
