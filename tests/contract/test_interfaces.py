@@ -51,7 +51,7 @@ GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body"),
 def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttachedRobot]:
     """The robot of a file, on simulated buses in this process: a starved one of its own looks like silence."""
     name = request.param
-    # a computer that stands still for a moment is no silence
+    # a computer that is suspended for a moment is no silence
     file = parse(re.sub("(?m)^driver = .*", r"\g<0>\nstale_after_s = 1", FILES[name]), f"{name}.toml")
     with ExitStack() as undo:
         buses = buses_of(file, tmp_path_factory.mktemp(name), log=ByteLog(keep=False), paced=False)

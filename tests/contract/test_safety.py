@@ -193,7 +193,7 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(rig: SafetyRig,
     waiting = [Outcome(rig.move) for _ in range(3)]
     wait_until(lambda: len(rig.exchange._inbox) == 3, "they wait")
     stop = Outcome(rig.device.stop)
-    wait_until(lambda: rig.exchange._stops, "the stop is there")
+    wait_until(lambda: rig.exchange._stops, "the stop is queued")
     gate.let_go()
     assert stop.wait().error is None
     assert all(one.wait().error is not None for one in (moving, *waiting))

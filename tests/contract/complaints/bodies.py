@@ -30,7 +30,7 @@ def outcome(act: Callable[[], object]) -> str:
     """What an act ends with: nothing, or its error in words."""
     try:
         act()
-    except Exception as error:  # noqa: BLE001 - told
+    except Exception as error:  # noqa: BLE001 - returned
         return f"{type(error).__name__}: {error}"
     return ""
 
@@ -108,7 +108,7 @@ class Body:
         waiting.wait_until(lambda: abs(self.truth.position_rad - to_rad) < 0.01, "it was turned")
 
     def shift_its_zero(self, counts: int) -> None:
-        """Write its homing offset as if somebody else had."""
+        """Write its homing offset as if another program had."""
         address, size = self.ways.homing
         self.rig.sim.devices[0].write(address, counts.to_bytes(size, "little"), time.monotonic())
 
@@ -121,7 +121,7 @@ class Body:
         return float(self.rig.robot.joints[0].max_rad)
 
     def moves(self) -> list[Entry]:
-        """What it was told that could move it."""
+        """The commands it got that could move it."""
         return list(self.rig.moves()) if hasattr(self.rig, "moves") else list(self.rig.controlwords(self.device_id))
 
     def events(self, name: str, since: float = 0.0) -> list[Entry]:
@@ -133,7 +133,7 @@ class Body:
     def wait_until_it_rests(self, since: float, before_rad: float) -> None:
         """Wait until it has come to rest; fails as soon as it is beyond an angle where it should have."""
         waiting.wait_until(lambda: self.events("at_rest", since) or self.truth.position_rad > before_rad, "it rests")
-        assert self.truth.position_rad < before_rad, f"it went on to {self.truth.position_rad:.2f} rad"
+        assert self.truth.position_rad < before_rad, f"it continued to {self.truth.position_rad:.2f} rad"
 
     def wait_for_cycles(self, motor: Motor, since: float) -> None:
         """Let it be measured for a while: something that has to begin to move would have begun."""

@@ -73,7 +73,7 @@ class Wifi:
         self._planner.ask("start", endpoint)
 
     def link_by_multicast(self, endpoint: str) -> None:
-        """The same, as most middleware does it: both call out for whoever is there."""
+        """The same, as most middleware does it: both send a broadcast to find others."""
         self._planner.ask("start")
         for each in (self._robot, self._planner):
             each.ask("find_each_other")

@@ -35,7 +35,7 @@ def test_overload_latched_until_a_power_cycle(body: Body) -> None:
     motor = body.motor()
     motor.move_to(0.2)
     body.strike(body.ways.overload)
-    wait_until(lambda: motor.state().fault, "state() tells of it")
+    wait_until(lambda: motor.state().fault, "state() reports it")
     assert outcome(lambda: motor.move_to(0.1)).startswith("DeviceFault")
     body.strike(Heal())
     told = outcome(motor.enable)
@@ -44,8 +44,8 @@ def test_overload_latched_until_a_power_cycle(body: Body) -> None:
 
 
 @complaint(
-    ("feetech", mutants.the_last_speed_holds_for_ever, "it went on"),
-    ("cia402", mutants.the_last_speed_holds_for_ever, "it went on"),
+    ("feetech", mutants.the_last_speed_holds_for_ever, "it continued"),
+    ("cia402", mutants.the_last_speed_holds_for_ever, "it continued"),
     also=("dynamixel", "damiao"),
 )
 def test_client_dies_and_the_robot_moves_on_at_its_last_speed(body: Body) -> None:
@@ -57,8 +57,8 @@ def test_client_dies_and_the_robot_moves_on_at_its_last_speed(body: Body) -> Non
 
 
 @complaint(
-    ("dynamixel", mutants.the_end_of_a_session_stops_nothing, "it went on"),
-    ("damiao", mutants.the_end_of_a_session_stops_nothing, "it went on"),
+    ("dynamixel", mutants.the_end_of_a_session_stops_nothing, "it continued"),
+    ("damiao", mutants.the_end_of_a_session_stops_nothing, "it continued"),
     also=("feetech", "cia402"),
 )
 def test_client_dies_and_the_robot_moves_on(body: Body) -> None:
@@ -99,7 +99,7 @@ def test_a_fault_needs_a_restart(body: Body) -> None:
     motor = body.motor()
     motor.enable()
     body.strike(Unplug())
-    wait_until(lambda: outcome(motor.state), "state() tells of it")
+    wait_until(lambda: outcome(motor.state), "state() reports it")
     body.strike(Replug())
     wait_until(lambda: outcome(motor.state) == "", "it answers again")
     assert outcome(motor.enable) == ""
@@ -107,8 +107,8 @@ def test_a_fault_needs_a_restart(body: Body) -> None:
 
 
 @complaint(
-    ("dynamixel", mutants.two_motions_have_one_joint, "was told nothing"),
-    ("damiao", mutants.two_motions_have_one_joint, "was told nothing"),
+    ("dynamixel", mutants.two_motions_have_one_joint, "got no error"),
+    ("damiao", mutants.two_motions_have_one_joint, "got no error"),
     also=("feetech", "cia402"),
 )
 def test_two_modes_claim_one_joint(body: Body) -> None:
@@ -120,7 +120,7 @@ def test_two_modes_claim_one_joint(body: Body) -> None:
     turned = written_now()
     body.wait_until_it_rests(turned, before_rad=0.5 * body.farthest_rad)
     by_position.join(1.0)
-    assert by_position.ended, "who moved it by position was told nothing"
+    assert by_position.ended, "the client that moved it by position got no error"
     assert "took over" in by_position.ended
 
 

@@ -16,8 +16,8 @@ from trade_gateway.cli import app
 
 
 @complaint(
-    ("dynamixel", mutants.the_devices_zero_is_taken_as_it_is, "its zero has moved, and nobody says so"),
-    ("feetech", mutants.the_devices_zero_is_taken_as_it_is, "its zero has moved, and nobody says so"),
+    ("dynamixel", mutants.the_devices_zero_is_taken_as_it_is, "its zero has moved, and no error says so"),
+    ("feetech", mutants.the_devices_zero_is_taken_as_it_is, "its zero has moved, and no error says so"),
 )
 def test_lost_calibration(body: Body) -> None:
     robot = body.attach()
@@ -26,10 +26,10 @@ def test_lost_calibration(body: Body) -> None:
     motor.relax()
     body.shift_its_zero(200)
     refusal = outcome(motor.enable)
-    assert refusal.startswith("DeviceFault"), "its zero has moved, and nobody says so"
+    assert refusal.startswith("DeviceFault"), "its zero has moved, and no error says so"
     assert f"register {body.ways.homing[0]}" in refusal
     robot.close()
-    assert outcome(body.attach).startswith("WrongDevice"), "its zero has moved, and nobody says so"
+    assert outcome(body.attach).startswith("WrongDevice"), "its zero has moved, and no error says so"
     body.shift_its_zero(0)
     assert outcome(lambda: body.motor().enable()) == ""
 
@@ -106,7 +106,7 @@ def test_access_rule_surprises(folder: Path) -> None:
 
 
 class Spare:
-    """What somebody may use, or may not."""
+    """A service that a client may or may not use."""
 
     @service
     def grant(self) -> bool:

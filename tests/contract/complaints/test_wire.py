@@ -38,9 +38,9 @@ def test_wrong_or_duplicate_ids(body: Body) -> None:
 
 
 @complaint(
-    ("dynamixel", mutants.a_dynamixel_that_is_silent_reads_zero, "-3.14 rad, where nobody was"),
-    ("dynamixel", mutants.the_bare_dynamixel_sdk, "-3.14 rad, where nobody was"),
-    ("feetech", mutants.a_feetech_that_is_silent_reads_zero, "-3.14 rad, where nobody was"),
+    ("dynamixel", mutants.a_dynamixel_that_is_silent_reads_zero, "-3.14 rad, where the joint never was"),
+    ("dynamixel", mutants.the_bare_dynamixel_sdk, "-3.14 rad, where the joint never was"),
+    ("feetech", mutants.a_feetech_that_is_silent_reads_zero, "-3.14 rad, where the joint never was"),
     ("cia402", mutants.a_write_is_done_when_it_is_sent, "went unanswered and ended with success"),
 )
 def test_an_empty_reply_taken_for_success(body: Body) -> None:
@@ -52,7 +52,7 @@ def test_an_empty_reply_taken_for_success(body: Body) -> None:
     def ended() -> bool:
         told: list[float] = []
         outcome(lambda: told.append(motor.state().position_rad))
-        assert all(abs(angle - 0.5) < 0.01 for angle in told), f"{told[0]:.2f} rad, where nobody was"
+        assert all(abs(angle - 0.5) < 0.01 for angle in told), f"{told[0]:.2f} rad, where the joint never was"
         return enabling.ended is not None
 
     wait_until(ended, "enable() has ended")
@@ -61,8 +61,8 @@ def test_an_empty_reply_taken_for_success(body: Body) -> None:
 
 
 @complaint(
-    ("dynamixel", mutants.the_last_value_is_told_for_ever, "what it was is told as if it were"),
-    ("cia402", mutants.the_last_value_is_told_for_ever, "what it was is told as if it were"),
+    ("dynamixel", mutants.the_last_value_is_told_for_ever, "an old state is reported as the current one"),
+    ("cia402", mutants.the_last_value_is_told_for_ever, "an old state is reported as the current one"),
     also=("feetech", "damiao"),
 )
 def test_stale_state_after_link_loss(body: Body) -> None:
@@ -71,4 +71,4 @@ def test_stale_state_after_link_loss(body: Body) -> None:
     body.strike(Unplug())
     wait_until(lambda: "BusGone" in outcome(motor.relax), "its driver has noticed")
     sleep_past(time.monotonic_ns() + int(body.rig.robot.buses[0].stale_after_s * 1e9))
-    assert outcome(motor.state).startswith("BusGone"), "what it was is told as if it were"
+    assert outcome(motor.state).startswith("BusGone"), "an old state is reported as the current one"

@@ -98,7 +98,7 @@ class Cia402Rig(CanJointRig):
         wait_until(lambda: self.bench.controlwords(FIRST)[-1] & HALT, "it was halted")
         wait_until(lambda: "quick_stop_active" in self.states(0.0), "the drive's own watchdog has its say")
         expired = self.bench.wait_for("watchdog_expired", FIRST)
-        wait_until(lambda: len(self.bench.frames("heartbeat", FIRST, expired.t)) > 3, "the drive goes on")
+        wait_until(lambda: len(self.bench.frames("heartbeat", FIRST, expired.t)) > 3, "the drive continues")
         return self._halted()
 
     def _halted(self) -> float:
@@ -124,7 +124,7 @@ class Cia402Rig(CanJointRig):
             assert bytes.fromhex("23161001") + (127 << 16 | 300).to_bytes(4, "little") in writes
             assert bytes.fromhex("2b076000 03000000") in writes
         count = len(self._heartbeats())
-        wait_until(lambda: len(self._heartbeats()) >= count + 3, "the heartbeat goes on")
+        wait_until(lambda: len(self._heartbeats()) >= count + 3, "the heartbeat continues")
         return True
 
     def leaves(self, leave: str) -> None:

@@ -60,7 +60,7 @@ class UrRig(SafetyRig):
         return ArmRig(self.undo)
 
     def plug(self) -> None:
-        """The controller is there."""
+        """The controller answers."""
 
     def swap(self) -> None:
         self.bench = ArmRig(self.undo, Arm("UR10e", name="right"))
@@ -138,7 +138,7 @@ class UrRig(SafetyRig):
         return made
 
     def last_resort(self, lost: float) -> None:
-        """The controller's RTDE watchdog ends the program, and the arm stands."""
+        """The controller's RTDE watchdog ends the program, and the arm stops."""
         self.bench.stands()
         wait_until(lambda: self.events("program_stopped", lost), "its program has ended")
         assert not self.bench.moves(self.events("program_stopped", lost)[0].t)
