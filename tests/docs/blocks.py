@@ -1,4 +1,4 @@
-"""Blocks of code on the pages, each with the heading that it stands under."""
+"""Blocks of code on the pages, each with its heading."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -33,12 +33,12 @@ class Section(NamedTuple):
     heading: str
 
     def blocks(self, *languages: str) -> list[Block]:
-        """What stands there in these languages."""
+        """The blocks in these languages."""
         return [one for one in blocks(DOCS / self.page, *languages) if one.heading == self.heading]
 
 
 def blocks(page: Path, *languages: str) -> Iterator[Block]:
-    """What stands in the blocks of code of these languages, also in lists."""
+    """The text of the blocks of code in these languages, also in lists."""
     text = page.read_text(encoding="utf-8")
     heading = ""
     for found in _PART.finditer(text):

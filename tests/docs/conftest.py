@@ -18,9 +18,9 @@ from trade import Container
 
 
 class Play:
-    """The programs of one section, in one module, as somebody has it who has read the page up to there.
+    """The programs of one section, in one module, as a reader of the page has it there.
 
-    What the page has imported before is there. The default container is the reader's; what the page takes for granted,
+    Earlier imports of the page are available. The default container is the reader's; what the page takes for granted,
     ``offer`` has in other containers of the system.
     """
 

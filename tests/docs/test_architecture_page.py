@@ -1,4 +1,4 @@
-"""docs/architecture.md: each room is there, and each step of its walks is in the file that it links to.
+"""docs/architecture.md: each room exists, and each step of its walks is in the file that it links to.
 
 A link to a source file is followed by a colon and names in backticks: these are defined in that file.
 """

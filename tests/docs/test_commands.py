@@ -1,7 +1,7 @@
 """The command lines of the guide, and of the pages on drivers and deployment, typed as they stand there.
 
 Those that need no system are typed here, section by section, in a folder with what the page takes for granted. What the
-others do is done, on simulated robots, by the tests that `TYPED_ELSEWHERE` names; some are typed by nobody, and
+others do is done, on simulated robots, by the tests that `TYPED_ELSEWHERE` names; some are not typed, and
 `NOT_TYPED` says why. Of all of them tests/docs/test_docs.py looks whether the commands and their options are there.
 """
 

@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md: its map has every room, and what it names is there."""
+"""CONTRIBUTING.md: its map has every room, and what it names exists."""
 
 import ast
 import os
@@ -17,7 +17,7 @@ HOUSES: Final = {"trade": "trade", "drivers": "trade_drivers", "gateway": "trade
 
 
 def test_the_map_has_every_room() -> None:
-    """With WRITE_TABLES=1 in the environment the map is drawn anew."""
+    """With WRITE_TABLES=1 in the environment the map is drawn again."""
     drawn = "\n| room | what it is for |\n|---|---|\n" + "".join(_rows()) + "\n"
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     shown, end, after = rest.partition(MARKS[1])
@@ -64,7 +64,7 @@ def _modules() -> dict[str, Path]:
 
 
 def _loaded_with(module: str, path: Path) -> Iterator[str]:
-    """The modules of ours that a module imports at its top level; packages that name them are left out."""
+    """The modules of this project that a module imports at its top level; packages that name them are left out."""
     known = _modules()
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.parse(path.read_text(encoding="utf-8")).body:

@@ -1,4 +1,4 @@
-"""What the pages say is there, is there; what they show, runs."""
+"""What the pages name exists, and what they show runs."""
 
 import ast
 import json
@@ -119,7 +119,7 @@ def json_text(value: object) -> str:
 
 
 def commands(page: Path) -> Iterator[list[str]]:
-    """The words of each ``trade`` in the blocks of a page, without what stands before and behind it in its line."""
+    """The words of each ``trade`` in the blocks of a page, without what precedes and follows it in its line."""
     typed = [line for block in blocks(page, "sh") for line in block.text.splitlines()]
     typed += [line[2:] for block in blocks(page, "console") for line in block.text.splitlines() if line[:2] == "$ "]
     for line in typed:

@@ -65,7 +65,7 @@ def test_offer_services(play: Play) -> None:
 
 
 class Head:
-    """Its first call is told of; a faulty one refuses them all."""
+    """Its first call is reported; a faulty one refuses them all."""
 
     def __init__(self, fault: str = "") -> None:
         self.called = threading.Event()
@@ -139,7 +139,7 @@ def test_long_calls(play: Play) -> None:
 
 
 class Listener:
-    """What it is told."""
+    """What it receives."""
 
     def __init__(self) -> None:
         self.told: list[Any] = []
@@ -221,13 +221,13 @@ def test_listen(play: Play, printed: Said) -> None:
     play.offer("mind", listener, "mind")
     play.run(battery=trade.find(where(name="battery")), dock=trade.find(where(name="dock")))
     assert "moving=False" in printed.lines[-1]
-    wait_until(lambda: listener.told == [15, 15])  # of the stream, and of the one that is there already
+    wait_until(lambda: listener.told == [15, 15])  # of the stream, and of the existing one
     play.offer("mind-2", Listener(), "mind")
     wait_until(lambda: listener.told == [15, 15, 15])
 
 
 class MovingHead(Head, Joints):
-    """Moves, and tells of its joints."""
+    """Moves, and reports its joints."""
 
     def __init__(self) -> None:
         Head.__init__(self)

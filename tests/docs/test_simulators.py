@@ -1,4 +1,4 @@
-"""The program of docs/simulators.md, run as it stands there."""
+"""The program of docs/simulators.md, run unchanged."""
 
 import shutil
 import time
