@@ -32,7 +32,7 @@ def licence(package: Distribution) -> str:
 
 
 def not_permissive(said: Iterable[tuple[str, str]]) -> list[str]:
-    """Of names and licences those that somebody has to look at."""
+    """The names and licences that a person has to check."""
     wrong = ((name, text) for name, text in said if _STRICTER.search(text) or not PERMISSIVE.search(text))
     return [f"{name}: {text}" for name, text in wrong if name not in AS_THEY_ARE]
 

@@ -41,7 +41,7 @@ def _candidates(uv: str) -> Iterator[Path]:
 
 
 def _asked(python: Path) -> tuple[tuple[int, ...], Path] | None:
-    """Version and path of a CPython; None of anything else. A shim (pyenv) tells the one behind it, or fails."""
+    """Version and path of a CPython; None of anything else. A shim (pyenv) names the one behind it, or fails."""
     try:
         told = subprocess.run([python, "-c", _TELL], capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError):

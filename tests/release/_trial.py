@@ -64,7 +64,7 @@ class Trial:
         self._stand.mkdir()
 
     def core_alone(self) -> None:
-        """Install the core without anything else of ours; a program finds its own service."""
+        """Install the core without the other packages; a program finds its own service."""
         self._install(self._wheel("trade_core"))
         program = "import trade; trade.close(); print(trade.__file__)"
         where = self._run(self._python, "-c", program).strip()

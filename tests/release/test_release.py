@@ -1,4 +1,4 @@
-"""Wheels are the same bytes whoever builds them and wherever, and say what may be done with them."""
+"""Wheels are the same bytes on every computer, and say what may be done with them."""
 
 import email
 import os

@@ -1,4 +1,4 @@
-"""All that our packages need is there for the computers of robots."""
+"""All that our packages need exists for the computers of robots."""
 
 import re
 

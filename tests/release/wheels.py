@@ -24,7 +24,7 @@ LOCK: Final = Path(__file__).parents[2] / "uv.lock"
 OURS: Final = ("trade-core", "trade-drivers", "trade-gateway", "trade-hil-sim")
 PYTHONS: Final = ((3, 10), (3, 11), (3, 12), (3, 13))
 ALLOWED: Final = {"ur-rtde"}
-"""Arms of Universal Robots need a computer with x86_64, or somebody who builds it; the rest of a robot does without."""
+"""Arms of Universal Robots need a computer with x86_64, or a build from source; the rest of a robot does without."""
 _PLATFORMS: Final = [f"manylinux_2_{minor}_aarch64" for minor in range(28, 16, -1)] + ["manylinux2014_aarch64"]
 
 Package = Mapping[str, Any]

@@ -174,7 +174,7 @@ class Run:
         slot.tell("cut", 0.2 + 2.3 * self._random.random())
 
     def end(self) -> None:
-        """Have everybody end by himself, clients first; who does not is killed, and will be missed."""
+        """Let all processes end by themselves, clients first; one that does not is killed, and will be missed."""
         for slot in (*self._drivers, *self._clients):
             slot.thaw()
         for slots in (self._clients, self._drivers):
@@ -223,7 +223,7 @@ def main() -> None:
     multiprocessing.set_forkserver_preload(["tests.endurance.chaos._client", "tests.endurance.chaos._driver"])
     with tempfile.TemporaryDirectory(prefix="trade-chaos-") as folder:
         verdict = run(plan, Path(folder))
-        if verdict.violations:  # what everybody noted is what there is to look at
+        if verdict.violations:  # the notes of all processes are the evidence
             kept = Path("build", f"chaos-{plan.seed}")
             shutil.rmtree(kept, ignore_errors=True)
             shutil.copytree(Path(folder, "logs"), kept)

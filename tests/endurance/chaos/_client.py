@@ -148,7 +148,7 @@ class Client:
             self._log.note(Done(t=now(), hold=hold, how=type(refused).__name__))
             return
         had_t = now()
-        if lock.held:  # else it was frozen since it was told so, and may not have it at that moment any more
+        if lock.held:  # else it was frozen since the grant, and may not have it at that moment any more
             self._log.note(Held(t=had_t, hold=hold))
         try:
             with lock.use():

@@ -15,7 +15,7 @@ from trade.errors import LockLost
 
 
 def _no_fence() -> None:
-    """Nobody looks again before bytes go out."""
+    """No fence is checked before bytes go out."""
     Permit.gate = lambda self: None  # type: ignore[method-assign]
 
 

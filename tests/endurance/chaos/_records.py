@@ -34,7 +34,7 @@ class Grant(Record):
 
 
 class Renewed(Record):
-    """Leases began anew."""
+    """Leases began again."""
 
     epoch: str
     numbers: tuple[int, ...]

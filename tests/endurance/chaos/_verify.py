@@ -114,5 +114,5 @@ def _grants_that_outlive_their_lease(known: dict[type, list]) -> list[str]:
 def _not_had(signs: list[float], since: float, until: float) -> float:
     """For how long, in that time, the driver's process did not run."""
     around = signs[max(0, bisect_right(signs, since) - 1) : bisect_right(signs, until) + 1]
-    gaps = itertools.pairwise([*around, until])  # who is told to end as he is thawed gives no more signs
+    gaps = itertools.pairwise([*around, until])  # a process that has to end as it is thawed gives no more signs
     return sum(max(0.0, min(later, until) - max(earlier, since) - _BEAT_S) for earlier, later in gaps)

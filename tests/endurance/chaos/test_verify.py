@@ -101,7 +101,7 @@ def test_a_grant_that_outlives_its_lease() -> None:
 
 def test_time_that_a_frozen_driver_did_not_have_does_not_count() -> None:
     assert wrong(grant(1, 1.0, 4.5), beats((0, 1.5), (4.0, 5))) == []
-    assert wrong(grant(1, 1.0, 4.5), beats((0, 1.5))) == []  # it was told to end as it was thawed
+    assert wrong(grant(1, 1.0, 4.5), beats((0, 1.5))) == []  # it had to end as it was thawed
     assert wrong(grant(1, 1.0, 4.5), beats((0, 2.0), (2.2, 5))) != []
 
 

@@ -102,7 +102,7 @@ def _sdo_answers(data: bytes) -> bytes:
                 return b""  # a drive that says nothing else is given up for its silence
     except StopIteration as ended:
         return bytes(ended.value)
-    raise AssertionError("a drive that goes on answering is asked for ever")
+    raise AssertionError("a drive that keeps answering is asked without end")
 
 
 def _pieces(data: bytes) -> Iterator[bytes]:

@@ -1,7 +1,7 @@
-"""A robot, a gateway, a dashboard and planners for hours: nothing may grow, nothing fail, nothing stand still.
+"""A robot, a gateway, a dashboard and planners for hours: nothing may grow, fail or stop.
 
 Rosie is simulated with all her devices on a network of her own; on another one six planners lock and move a part each,
-a page follows her joints, and all the time somebody comes, looks around and goes, every other one killed. Leaves the
+a page follows her joints, and all the time a container joins, looks around and leaves, every other one killed. Writes
 samples and plots; prints what grew and what was wrong, and exits with 1 if something was.
 """
 
@@ -57,7 +57,7 @@ class Soak:
         self._ended = threading.Event()
         self._told = 0.0
         self._known = set[str]()
-        """What went wrong, and was told."""
+        """What went wrong, and was reported."""
 
     def now(self) -> float:
         return time.monotonic() - self._began
@@ -88,7 +88,7 @@ class Soak:
         def run() -> None:
             try:
                 what(*words)
-            except Exception as error:  # noqa: BLE001 - whatever it is, the run tells of it
+            except Exception as error:  # noqa: BLE001 - whatever it is, the run reports it
                 self.run.complaints.append(f"{what.__name__}: {type(error).__name__}: {error}")
 
         thread = threading.Thread(target=run, name=what.__name__)
@@ -122,7 +122,7 @@ class Soak:
                     self.run.complaints.append(f"the page was cut off at {self.now():.0f} s: {closed}")
                     return
                 if "problem" in told:
-                    self.run.complaints.append(f"the page was told {told} at {self.now():.0f} s")
+                    self.run.complaints.append(f"the page was sent {told} at {self.now():.0f} s")
                     return
             if silent > 0.1 * self.now():
                 self.run.complaints.append(f"the page heard nothing for {silent} s")

@@ -13,9 +13,9 @@ from tests.support.lock_log import Verdict
 MOST_MIB: Final = 8.0
 """How much the memory of a process may grow between the second quarter of a run and the last one."""
 MOST_FILES, MOST_THREADS = 4, 4
-"""The same of open files and of threads; who passes by just then has some."""
+"""The same of open files and of threads; a short-lived container has some at that moment."""
 _SILENT_S: Final = 120.0
-"""A planner that got no round done in so long stands still."""
+"""A planner that completed no round in so long is stuck."""
 _QUARTERS: Final = 4
 _SILENT: Final = ("DeviceSilent: ", "MotionStopped: ")
 _LET_GO: Final = ("watchdog", "for too long", "it was away", "lost its activation", "is not activated")

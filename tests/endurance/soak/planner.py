@@ -1,7 +1,7 @@
 """One part of the robot is locked, moved, asked and given back, again and again: what programs of a laboratory do.
 
 ``planner.py PART``; its settings are the ordinary TRADE_ variables. Every few seconds it says as JSON what it has done,
-and how long the calls since took; SIGTERM ends it. ``passer`` is somebody who comes, asks around, and goes.
+and how long the calls since took; SIGTERM ends it. ``passer`` is a container that joins, asks around and leaves.
 """
 
 import contextlib
