@@ -49,7 +49,7 @@ def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _short_collections(_warm_up: None) -> None:
-    """What stands by now is left out of garbage collections: one of all tests and reports stops threads for 0.3 s."""
+    """Leave existing objects out of garbage collections: one of all tests and reports stops threads for 0.3 s."""
     gc.collect()
     gc.freeze()
 
@@ -112,7 +112,7 @@ def _children() -> set[str]:
 
 @pytest.fixture
 def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A system id nobody else has, also for child processes and for the default container."""
+    """A unique system id, also for child processes and for the default container."""
     name = f"test-{secrets.token_hex(4)}"
     monkeypatch.setenv("TRADE_SYSTEM", name)
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "runtime"))

@@ -68,7 +68,7 @@ class Answer:
 
 @dataclass
 class Client:
-    """Somebody outside; each request has a connection of its own."""
+    """A client outside; each request has a connection of its own."""
 
     url: str
     token: str = ""
@@ -139,9 +139,9 @@ class Opened:
 
 @contextmanager
 def opened(container: Container, folder: Path, **options: Any) -> Iterator[tuple[HttpGateway, Path]]:
-    """An HTTP gateway of a container, to which `nobody` has a token."""
+    """An HTTP gateway of a container, to which `stranger` has a token."""
     tokens = folder / "tokens.toml"
-    add_token(tokens, "nobody")
+    add_token(tokens, "stranger")
     with HttpGateway(container, listen="127.0.0.1:0", tokens=Tokens(tokens), **options) as gateway:
         yield gateway, tokens
 

@@ -81,7 +81,7 @@ class Verdict:
 
 
 class Owned(NamedTuple):
-    """From when to when somebody surely had a resource, as far as he himself knew."""
+    """From when to when an owner certainly had a resource, as far as it knew."""
 
     hold: str
     since: float

@@ -57,7 +57,7 @@ def _stop_loses(patch: Patch) -> None:
 
 
 def _watchdog_off(patch: Patch) -> None:
-    """Servos are not told to look after themselves."""
+    """The watchdogs of servos are not armed."""
     from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
 
     begin = DynamixelExchange.__init__
@@ -70,7 +70,7 @@ def _watchdog_off(patch: Patch) -> None:
 
 
 def _discovery_stays_on(patch: Patch) -> None:
-    """Who looks for containers once looks for ever."""
+    """A search for containers never ends."""
     from trade._discovery.dialer import Dialer
 
     switch = Dialer.set_discovery
@@ -92,7 +92,7 @@ def _uses_uncounted(patch: Patch) -> None:
 
 
 def _no_priority(patch: Patch) -> None:
-    """Whoever locks waits like everybody else, whatever priority it was given."""
+    """Clients wait in order of arrival, whatever priority they have."""
     from trade._locks import api
 
     request = api.LockRequest
@@ -115,7 +115,7 @@ def _twin_unplaced(patch: Patch) -> None:
 
 
 def _no_stop_line(patch: Patch) -> None:
-    """Nobody listens on the stop line."""
+    """No container listens on the stop line."""
     from trade._stop_line import service
 
     patch(service, "host_socket", lambda _: None)

@@ -6,7 +6,7 @@ still: a process of its own looks at the clock, and the product's own words for 
 twice has failed. More than `_MOST` such tests fail the run: that is no accident any more.
 
 Two failures of each process may be without such a reason and still run once more: of thousands of tests one that waits
-for too little should not refuse a whole day. The summary shows them with what failed, for somebody to mend them.
+for too little should not refuse a whole day. The summary shows them with what failed, so that they get fixed.
 """
 
 import os
@@ -38,7 +38,7 @@ while os.getppid() == {{parent}}:
     last = now
 """
 _KEY: Final = "ran again"
-_UNSTEADY: Final = "for no reason that is known, mend it: "
+_UNSTEADY: Final = "for no known reason, fix it: "
 _UNSTEADY_ONES: Final = 2
 _FAILURES: Final = "TEST_FAILURES"
 """The variable that names a file for a line of each failure: `make test` shows those of all its parts at its end."""
@@ -120,7 +120,7 @@ class Again:
 
 
 def _afresh(item: pytest.Item) -> bool:
-    """Have it made all that it needs anew, also what whole modules share; False if what was there cannot be ended."""
+    """Have it make all that it needs again, also what whole modules share; False if the old ones cannot be ended."""
     try:
         item.session._setupstate.teardown_exact(None)
     except Exception:  # noqa: BLE001 - the failure that there is says more

@@ -1,4 +1,4 @@
-"""A ROS 1 system of a test's own: the master of the distribution, and rospy nodes that do what they are told."""
+"""A ROS 1 system of a test's own: the master of the distribution, and rospy nodes that follow commands."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def need_ros1() -> None:
 
 
 class Peer:
-    """A rospy node, told what to do in lines; what it tells is in `told`."""
+    """A rospy node that takes commands as lines; what it reports is in `told`."""
 
     def __init__(self, stand: "Stand", name: str) -> None:
         self.name = f"/{name}"
@@ -57,7 +57,7 @@ class Peer:
         return self._process.pid
 
     def do(self, what: str, *args: object) -> None:
-        """Tell it; `wait_for` waits for what it tells of it."""
+        """Send it a command; `wait_for` waits for what it reports."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps([what, *args]) + "\n")
         self._process.stdin.flush()
@@ -67,7 +67,7 @@ class Peer:
 
     def wait_for(self, event: str, true: Callable[[Any], object] = lambda _: True) -> Any:
         wait_until(
-            lambda: any(true(what) for what in self.all(event)), f"{self.name} told of {event}: {self.told[-5:]}"
+            lambda: any(true(what) for what in self.all(event)), f"{self.name} reported {event}: {self.told[-5:]}"
         )
         return next(what for what in self.all(event) if true(what))
 

@@ -2,7 +2,7 @@
 
     python -m tests.support.ros2_graph_node PORT NODE_NAME
 
-Told and telling as `ros2_sdk_node`.
+Its commands and reports are those of `ros2_sdk_node`.
 """
 
 import json

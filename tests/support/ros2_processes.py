@@ -49,8 +49,8 @@ class Process:
         self._process.stdin.flush()
 
     def hear(self, what: str, **told: object) -> dict[str, Any]:
-        """Wait until it tells something; what it told."""
-        wait_until(lambda: self.has(what, **told), f"it tells of {what} {told}; it told {self.told}")
+        """Wait until it reports something; returns the report."""
+        wait_until(lambda: self.has(what, **told), f"it reports {what} {told}; it reported {self.told}")
         return self.has(what, **told)[0]
 
     def has(self, what: str, **told: object) -> list[dict[str, Any]]:
@@ -106,7 +106,7 @@ def until_heard(say: Callable[[], object], heard: Callable[[], object]) -> None:
 
 
 def raw_session(router: Router) -> zenoh.Session:
-    """Somebody at the router who knows nothing but keys and bytes."""
+    """A client at the router that knows nothing but keys and bytes."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{router.endpoint}"]')
@@ -115,7 +115,7 @@ def raw_session(router: Router) -> zenoh.Session:
 
 
 def until_served(session: zenoh.Session | None, key: str) -> None:
-    """A service is there for somebody when the router knows of it."""
+    """A service is present for a client when the router knows of it."""
     assert session is not None
     querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL_COMPLETE)
     wait_until(lambda: querier.matching_status.matching, f"{key} is served")

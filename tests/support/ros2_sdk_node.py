@@ -2,7 +2,7 @@
 
     python -m tests.support.ros2_sdk_node PORT NODE_NAME
 
-It is told what to do by lines of JSON on its standard input, and tells what it hears by lines of JSON. It ends when its
+It takes commands as lines of JSON on its standard input, and reports what it hears as lines of JSON. It ends when its
 input does.
 """
 
@@ -41,7 +41,7 @@ def until_served(client: ROS2ServiceClient) -> None:
     """As ``wait_for_service`` of ROS does, which the package lacks."""
     deadline = time.monotonic() + 60
     while not client.querier.matching_status.matching:
-        assert time.monotonic() < deadline, "nobody serves it"
+        assert time.monotonic() < deadline, "no node serves it"
         threading.Event().wait(0.02)
 
 

@@ -38,7 +38,7 @@ def test_what_is_broken_is_found_by_the_test_of_its_rule(mutant: str) -> None:
         check=False,
     )
     assert done.returncode == pytest.ExitCode.TESTS_FAILED, done.stdout + done.stderr
-    assert re.search(r"^FAILED ", done.stdout, re.MULTILINE), "it may not fail for the sake of what it stands on"
+    assert re.search(r"^FAILED ", done.stdout, re.MULTILINE), "it may not fail because of what it is based on"
 
 
 def test_a_mutant_there_is_not_is_no_proof_of_anything() -> None:

@@ -73,7 +73,7 @@ def test_a_test_that_is_late_once_reruns_and_is_reported(tmp_path: Path, said: s
 def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert not first")
     assert code == 0, said
-    assert "test_late0.py::test_it: for no reason that is known, mend it: " in said
+    assert "test_late0.py::test_it: for no known reason, fix it: " in said
     assert ">       assert not first" in said or ">   assert not first" in said
 
 
@@ -135,4 +135,4 @@ def test_each_of_the_two_runs_has_the_time_limit_and_only_that_test_fails(tmp_pa
     code, said = _run(tmp_path, "time.sleep(60)", options=("--timeout", "1", "--timeout-method", "signal"))
     assert code == 1, said
     assert "1 failed, 1 passed" in said
-    assert said.count("Failed: Timeout") > 2, said  # the first is told of in the summary
+    assert said.count("Failed: Timeout") > 2, said  # the first is shown in the summary
