@@ -51,7 +51,7 @@ numbers: Final = itertools.count(1)
 
 
 class Attack:
-    """The site, who is there, and what bare sessions say."""
+    """The site, its containers, and what bare sessions say."""
 
     def __init__(self, site: Site) -> None:
         self.site = site
@@ -132,10 +132,12 @@ class Attack:
         return sorted({key for key in heard if key in keys})
 
     def settle(self, name: str, who: str) -> None:
-        """All calls that it has put before have been dealt with: one more, which everybody may make, is answered."""
+        """All calls that it has put before have been dealt with: one more, which every client may make, is answered."""
         answer = f"reply/{self.place[0]}/{who}/{name}/clock"
         self.say(name, self.key(who, system=True), self.call(name, who, "clock", channel=f"{name}/clock"))
-        assert any(key == answer for key, _ in self.intruder.ask("heard", name, answer)), "its clock is told to anybody"
+        assert any(key == answer for key, _ in self.intruder.ask("heard", name, answer)), (
+            "its clock is sent to any client"
+        )
 
     def slipped(self, name: str, *keys: str) -> list[str]:
         """Which of these keys the arm hears of a session that may say nothing at all, not even that it has spoken."""

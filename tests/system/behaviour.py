@@ -1,4 +1,4 @@
-"""A behaviour that locks robots, moves their joints and gives them back, without end; it notes all it did and was told.
+"""A behaviour that locks robots, moves their joints and gives them back, without end; it notes all actions and replies.
 
 ``behaviour.py NAMESPACE NAME ADDRESS``; its first line of input says the rest as JSON: ``slot``, ``folder``,
 ``connect``, ``robots``, ``speed_rad_s``. Further lines are a word each and are answered: ``sees``, ``moved``,

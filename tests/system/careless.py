@@ -1,7 +1,7 @@
 """What every client of the siege does, whichever way it speaks: locks joints of robots, moves them, gives them back.
 
-It is careless: it goes on to move what it has lost, and now and then moves what it never asked for. It notes all that
-it did and was told. ``quiet`` on its input ends the locking, ``works`` has it move every joint once more and answer.
+It is careless: it keeps moving what it has lost, and now and then moves what it never asked for. It notes all that
+it did and all replies. ``quiet`` on its input ends the locking, ``works`` has it move every joint once more and answer.
 """
 
 import json
@@ -42,7 +42,7 @@ def rad(counts: int) -> float:
 
 
 class Refused(Exception):
-    """Somebody said no, or nobody said anything.
+    """A refusal, or no answer at all.
 
     Args:
         error: the name of why.
@@ -59,7 +59,7 @@ class Careless(ABC):
 
     Args:
         name: of its process, in its notes.
-        told: ``slot`` of those there are, ``seed``, and the ``folder`` of its notes.
+        told: ``slot`` of those that exist, ``seed``, and the ``folder`` of its notes.
     """
 
     later_s = 0.0
@@ -109,7 +109,7 @@ class Careless(ABC):
 
     @abstractmethod
     def resume(self, joint: str) -> None:
-        """Let it move again after somebody else's stop."""
+        """Let it move again after another client's stop."""
 
     # --- what all do
 
@@ -145,7 +145,7 @@ class Careless(ABC):
             self._log.note(Done(t=now(), hold=hold, how=no.error))
             return
         had_t = now()
-        if self.feels_its_locks and self.has(taken):  # it may have been frozen since it was told so
+        if self.feels_its_locks and self.has(taken):  # it may have been frozen since the grant
             self._log.note(Held(t=had_t, hold=hold))
         how = "lost"
         try:

@@ -95,7 +95,7 @@ class Program:
                 self.process.wait(10)
             except subprocess.TimeoutExpired:
                 self.process.kill()
-        with suppress(ProcessLookupError):  # whoever it started and left keeps its pipes open
+        with suppress(ProcessLookupError):  # a process that it started and left keeps its pipes open
             os.killpg(self.process.pid, signal.SIGKILL)
         self.wait()
         for stream in (self.process.stdout, self.process.stderr):
@@ -185,7 +185,7 @@ class Bench:
         self.restart()
 
     def restart(self) -> None:
-        """Start the driver; whoever ran before must have ended."""
+        """Start the driver; an earlier one must have ended."""
         self.driver = self._up()
         self.driver.json()
 
@@ -195,7 +195,7 @@ class Bench:
         return [entry.position_rad or 0.0 for entry in entries if entry.joint == joint]
 
     def stopped_short(self, since: float, most_rad: float) -> None:
-        """The pan joint comes to rest before that, told to by the driver and not by its own watchdog."""
+        """The pan joint comes to rest before that, stopped by the driver and not by its own watchdog."""
         wait_until(lambda: bool(self.rests("neck.pan", since)))
         assert self.rests("neck.pan", since)[0] < most_rad
         assert writes(self.sim.entries(), device_id=1, register="goal_position", since=since)

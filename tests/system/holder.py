@@ -1,4 +1,4 @@
-"""Holds a lock and moves a joint on and on, is told things and listens meanwhile; says how it goes, a line a round."""
+"""Holds a lock, moves a joint repeatedly and receives notifications and samples; prints a line a round."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""Bare sessions that say what no container would: told on standard input like ``member.py``, in its place."""
+"""Bare sessions that say what no container would: controlled on standard input like ``member.py``, in its place."""
 
 import json
 import os
@@ -77,7 +77,7 @@ class Intruder:
         self._declared.append(self._sessions[name].liveliness().declare_token(key))
 
     def answer(self, name: str, pattern: str, *said: str) -> None:
-        """To whoever asks what stands there: keys and what to say, by turns."""
+        """Answers to queries: keys and replies, in turn."""
 
         def reply(query: zenoh.Query) -> None:
             for key, payload in zip(said[::2], said[1::2], strict=True):
@@ -126,7 +126,7 @@ def main(host: str) -> None:
         action: Callable[..., Any] = getattr(intruder, verb)
         try:
             answer: Any = {"answer": action(*words)}
-        except Exception as error:  # noqa: BLE001 - whatever it was is told the test
+        except Exception as error:  # noqa: BLE001 - whatever it was is reported to the test
             answer = {"error": f"{type(error).__name__}: {error}"}
         os.write(1, (json.dumps(answer) + "\n").encode())
     intruder.leave()

@@ -1,4 +1,4 @@
-"""A container on a network of its own: does what it is told on standard input, answers with a line each."""
+"""A container on a network of its own: takes commands on standard input, answers with a line each."""
 
 import contextlib
 import json
@@ -67,7 +67,7 @@ class Ticker:
 
 
 class Watch:
-    """Notes what the calls that it is told of were made with."""
+    """Records the arguments of the calls that it is notified of."""
 
     def __init__(self) -> None:
         self.noted: list[Any] = []
@@ -78,7 +78,7 @@ class Watch:
 
 
 class Relay:
-    """Moves something of others for whoever calls."""
+    """Moves something of others for any caller."""
 
     def __init__(self, container: Container, of: str) -> None:
         self._container = container
@@ -161,7 +161,7 @@ class Member:
         self._lock = self.up.lock(where(group=group)).acquire()
 
     def hold_when_there(self, group: str) -> None:
-        """The same once something that moves is there."""
+        """The same once something that moves exists."""
         self.up.find(where(name="move_to", group=group), wait_s=30)
         self.hold(group)
 
@@ -203,7 +203,7 @@ class Member:
         self._run.result()
 
     def linked(self, count: str) -> list[str]:
-        """Ids of whom it is linked to once they are so many; whoever it is after half a minute."""
+        """Ids of whom it is linked to once they are so many; whichever they are after half a minute."""
         until = time.monotonic() + 30
         while len(found := _others(self._session)) != int(count) and time.monotonic() < until:
             threading.Event().wait(0.02)
@@ -256,7 +256,7 @@ class Member:
         self.up.joined(where(name="echo", group=group), self.up.find(where(name="greet", group=of)))
 
     def watch_moves(self, group: str, mine: str) -> None:
-        """From now on note, in a service of that group of ours, what moves there."""
+        """From now on note, in a service of this container's group, what moves there."""
         self._watch = Watch()
         [see] = self.up.register(self._watch, mine)
         self._hook = self.up.after_service(self.up.find(where(name="move", group=group)), see)
@@ -394,7 +394,7 @@ class Member:
         return [[sample.value, sample.number, sample.dropped] for sample in samples]
 
     def overhear(self, group: str, hz: str) -> None:
-        """Hear samples at a rate that nobody here asked for."""
+        """Receive samples at a rate that no client here asked for."""
         key = self.up.find(where(name="asked", group=group)).key
         self._tapped = [self._session.declare_subscriber(stream_key(key, float(hz)), zenoh.handlers.FifoChannel(8192))]
 
@@ -410,7 +410,7 @@ def main(host: str, name: str, address: str) -> None:
         action: Callable[..., Any] = getattr(member, verb)
         try:
             answer: Any = {"answer": action(*words)}
-        except Exception as error:  # noqa: BLE001 - whatever it was is told the test
+        except Exception as error:  # noqa: BLE001 - whatever it was is reported to the test
             answer = {"error": f"{type(error).__name__}: {error}"}
         os.write(1, (json.dumps(answer) + "\n").encode())
 

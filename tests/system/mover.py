@@ -14,7 +14,7 @@ def handle(name: str) -> trade.Handle:
 
 
 class Relay:
-    """Moves the joint on behalf of whoever calls."""
+    """Moves the joint on behalf of its caller."""
 
     @service(effect="actuate")
     def go(self) -> float:

@@ -1,4 +1,4 @@
-"""Hosts as network namespaces, the networks between them, and containers that do there what a test tells them."""
+"""Hosts as network namespaces, the networks between them, and containers there that a test controls."""
 
 import contextlib
 import json
@@ -37,7 +37,7 @@ def why_not() -> str:
 
 
 class Member:
-    """``member.py``, or another script that is told by lines, in one of the namespaces.
+    """``member.py``, or another script that is controlled by lines, in one of the namespaces.
 
     With certificates if ``tls`` is its folder, else with a password; ``system`` if it is not the test's own;
     ``through`` another script, with its words, that runs this one.

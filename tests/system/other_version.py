@@ -1,6 +1,6 @@
 """A program as if it were of another version of the protocol: ``other_version.py VERSION -m MODULE WORDS...``.
 
-Or ``VERSION SCRIPT WORDS...``. The number is changed in the text of the one module that has it, before anything of ours
+Or ``VERSION SCRIPT WORDS...``. The number is changed in the text of the one module that has it, before TRADE
 is imported; all else is as it is.
 """
 

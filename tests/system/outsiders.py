@@ -1,4 +1,4 @@
-"""Clients of the siege that speak nothing of ours: ``outsiders.py NAMESPACE NAME ADDRESS``; see `careless`.
+"""Clients of the siege that use no TRADE library: ``outsiders.py NAMESPACE NAME ADDRESS``; see `careless`.
 
 The first line of input says the rest as JSON. ``by`` is ``page``: a dashboard, over the WebSocket at ``url`` with a
 ``token``, which moves by holding a button, too; or ``agent``: tools of MCP, from a ``trade mcp`` that is its child.
@@ -26,7 +26,7 @@ from tests.system.siege_records import CAN_BUS
 _LATER_S = 0.5
 """What a busy computer may take to pass an order on."""
 _ANSWERS_S = 2.0
-"""So long after its deadline an answer may come; then nobody waits any more."""
+"""So long after its deadline an answer may come; then no client waits any more."""
 _LOOKS_S = 5.0
 _JOG_RAD_S, _JOG_VALID_S, _JOG_EVERY_S, _JOG_DEADLINE_S = 0.1, 0.2, 0.08, 1.0
 _END_COUNTS = 913
@@ -105,7 +105,7 @@ class Page(Outsider):
     def _hold(self, hold: str, joint: str, taken: Any) -> None:
         """Hold to move: set-points that end by themselves, one after the other; at the end a stop, or nothing more.
 
-        A drive is told speeds as such, and its log has no goal that would say whose motion it was.
+        A drive gets speeds as such, and its log has no goal that would say whose motion it was.
         """
         if f".{CAN_BUS}." in joint:
             self._go(hold, joint, taken)

@@ -20,7 +20,7 @@ def main(group: str, limit_s: str, *connect: str) -> None:
     print(
         json.dumps({"through": bool(report.stopped or report.failed), "said": f"{report} {call.problems}"}), flush=True
     )
-    os._exit(0)  # who has its answer waits for nobody else
+    os._exit(0)  # after its answer it waits for no other thread
 
 
 if __name__ == "__main__":

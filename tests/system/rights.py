@@ -1,6 +1,6 @@
 """What each identity may do, found out by trying it at each place where that is decided; as a table for the docs.
 
-Its own container and the provider are asked in one process, where nothing else stands in between; the gateway by bare
+Its own container and the provider are asked in one process, with nothing else in between; the gateway by bare
 sessions on a real network.
 """
 
@@ -25,7 +25,7 @@ WHO: Final = {
     "not named": "mallory",
     "revoked": "thief",
 }
-"""By what stands above a column, an identity of that kind."""
+"""By the heading of a column, an identity of that kind."""
 _WITHOUT_RULES: Final = ("mallory", "thief")
 _MARKS: Final = ("<!-- rights: made by test_the_table_of_rights_is_what_happens -->\n", "<!-- end of rights -->\n")
 
@@ -46,7 +46,7 @@ class Joint:
 
 
 class Stage:
-    """A provider, whoever tries, and those who put right again what came of it."""
+    """A provider, the client that tries, and those that undo the consequences."""
 
     def __init__(self, memory: MemorySystem, policy: Path) -> None:
         self.memory = memory
@@ -231,7 +231,7 @@ def _crossed(attack: Attack, who: str) -> set[str]:
 
 
 def in_the_page(page: str) -> str:
-    """The table as it stands in a page."""
+    """The table of a page."""
     return page.partition(_MARKS[0])[2].partition(_MARKS[1])[0]
 
 

@@ -46,7 +46,7 @@ _JUMPS_S: Final = (-36_000.0, -5.0, 5.0, 36_000.0)
 _STRANGERS: Final = 200
 """So many come in a second, and so many stay."""
 _LEFT_S: Final = 20.0
-"""When they have left, the transport ends ten of what they left a second; nobody is linked anew before."""
+"""When they have left, the transport ends ten of what they left a second; no new link is made before."""
 _RESCUE_S: Final = 10.0
 _ESTOPS: Final = 200
 """Of one flood."""
@@ -102,7 +102,7 @@ _ROBOTS: Final = {
 
 
 def _robot_file(robot: str, patience: str, ports: Mapping[str, str] = {}) -> str:
-    """Of a robot; before its devices are there, nobody knows where its buses are."""
+    """Of a robot; before its devices exist, the places of its buses are unknown."""
     text = f'[robot]\nname = "{robot}"\n'
     for bus, ((driver, model), joints) in _ROBOTS[robot].items():
         port = ports.get(bus, "can0" if bus == CAN_BUS else "/dev/ttyNOWHERE").removeprefix("socketcand:")
@@ -414,7 +414,7 @@ class Stand:
         return self._noted("one way", host, heal)
 
     def delay(self) -> Callable[[], None]:
-        """What clients say is held back, what they are told, or both."""
+        """What clients send is held back, what they receive, or both."""
         most_s = self._dice.choice((0.5, 1.0, 1.5))
         up, down = self._dice.choice([(most_s, 0.0), (0.0, most_s), (most_s, most_s)])
         before = self._slow(up, down)
@@ -432,7 +432,7 @@ class Stand:
         return self._wire.ask(json.dumps({"up": up, "down": down}))
 
     def policy(self) -> Callable[[], None]:
-        """The gateway lets nobody lock dora, for a while. Others read their policy once, and keep it."""
+        """The gateway lets no client lock dora, for a while. Others read their policy once, and keep it."""
         self._write_policy(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
         return self._noted("policy", "door", lambda: self._write_policy(_POLICY))
 
@@ -454,7 +454,7 @@ class Stand:
         return self._noted("disk", "all", self._disk.free)
 
     def strangers(self) -> Callable[[], None]:
-        """They fill the gateway's ports, or a driver's; somebody without a link has to stop something."""
+        """They fill the gateway's ports, or a driver's; a client without a link has to stop something."""
         robot = self._dice.choice([*self.drivers])
         whom = self._dice.choice(["door", robot])
         host, per_s = ("right2" if whom == "door" else "left"), str(_STRANGERS)
@@ -502,7 +502,7 @@ class Stand:
         if whom == "door":
             host, port = GATEWAY["public"].removeprefix("tls/").split(":")
             return f"{host}:{port},{host}:{int(port) + 1000}"
-        there = (self.site.folder / "runtime" / whom / SYSTEM).glob("tls_*")  # nobody, if it has just been killed
+        there = (self.site.folder / "runtime" / whom / SYSTEM).glob("tls_*")  # none, if it has just been killed
         return ",".join(":".join(path.name.split("_")[1:]) for path in there) or "127.0.0.1:1"
 
     def _rescue(self, whom: str, robot: str) -> Rescue:
@@ -530,7 +530,7 @@ class Stand:
     # --- after it
 
     def quiet(self) -> None:
-        """Everybody locks nothing any more, and no e-stop is open."""
+        """No client holds a lock any more, and no e-stop is open."""
         for _, member in self.clients.values():
             member.tell("quiet")
         for _, member in self.clients.values():
@@ -547,7 +547,7 @@ class Stand:
         return self._slow(0.0, 0.0)
 
     def held(self) -> dict[str, tuple[int, int]]:
-        """By process of ours that serves: its open files and its threads."""
+        """By serving process of this project: its open files and its threads."""
         pids = {"gateway": self.site.gateway.pid, "door": self._hall.pid}
         pids |= {name: driver.pid for name, driver in self.drivers.items()}
         processes = {name: psutil.Process(pid) for name, pid in pids.items()}

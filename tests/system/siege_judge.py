@@ -15,7 +15,7 @@ STOPS_S = 6.0
 WATCHED_S = 2.0
 """A joint whose driver is gone for longer than that rests: its servo's watchdog waits for 0.5 s."""
 FULL_SPEED = 100
-"""What is written with so much and more (of 0.229 rpm) is a stop: nobody orders more than 84."""
+"""What is written with so much and more (of 0.229 rpm) is a stop: no client orders more than 84."""
 _ANSWERED_S = 3.0
 """So long after its deadline a call may end, beside the time that its process did not have."""
 _IN_THE_WAY = frozenset(
@@ -46,7 +46,7 @@ class Motion(NamedTuple):
     rests: float = inf
     """When it came to rest or was given another goal; never: infinity."""
     stopped: bool = False
-    """Whether it was told to stop on its way."""
+    """Whether it got a stop on its way."""
     turned: bool = False
     """Whether it was given its goal on the way to another one."""
 
@@ -57,7 +57,7 @@ class Motion(NamedTuple):
 
 
 def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> Verdict:
-    """Look for two owners, and for motions that nobody ordered or that came twice, late, without a lock or had no end.
+    """Look for two owners, and for motions that no client ordered that came twice, late, without a lock or without end.
 
     Args:
         records: of clients, and the faults.
@@ -88,7 +88,7 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
 
 
 def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
-    """By joint, what it did: it tells of setting off and of rest; on its way, what it was told counts.
+    """By joint, what it did: it reports starts and rest; on its way, its commands count.
 
     Who comes to rest after a goal has come and before it reads it sets off for it later: that is the same motion.
     """
@@ -127,7 +127,7 @@ def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
 
 
 class Drive:
-    """What a drive was told last: it tells that it sets off, but not where to."""
+    """The last command of a drive: it reports that it starts, but not where to."""
 
     def __init__(self) -> None:
         self._word = self._goal = 0
@@ -195,7 +195,7 @@ def _not_rescued(known: dict[type, list[Any]]) -> list[str]:
 
 
 def _not_latched(known: dict[type, list[Any]], motions: Mapping[str, Sequence[Motion]]) -> list[str]:
-    """Motions that began although their robot had confirmed an e-stop that nobody had begun to clear.
+    """Motions that began although their robot had confirmed an e-stop whose clearing had not begun.
 
     A driver that starts while its disk is full finds no notes of what is open.
     """
@@ -217,7 +217,7 @@ def _overlaps(rescue: Rescue, fault: Fault) -> bool:
 
 
 def _frozen_s(faults: Sequence[Fault], order: Order) -> float:
-    """For how long, since then, whoever ordered it did not run."""
+    """For how long, since then, the client that ordered it did not run."""
     return sum(
         fault.until - max(fault.t, order.t)
         for fault in faults
@@ -259,7 +259,7 @@ def _motions(
         if motion.far <= _FAR_COUNTS:  # it may be a stop that happens to end there
             continue
         if order is None:
-            found.append(f"{at}, {motion.far} counts away: nobody ordered that")
+            found.append(f"{at}, {motion.far} counts away: no client ordered that")
             continue
         if last is not None and last[1] is not None and motion.turned and _broken_into(motion, order, *last):
             found.append(f"{at} for {order.hold}, while it moves for {last[1].hold}")
@@ -276,14 +276,14 @@ def _motions(
 
 
 def _broken_into(motion: Motion, order: Order, last: Motion, its: Order) -> bool:
-    """Whether it took the joint from somebody else, under a lock of either, whose motion nobody had stopped."""
+    """Whether it took the joint from another client, under a lock of either, without a stop in between."""
     free = its.hold.endswith(_FREE) and order.hold.endswith(_FREE)
     under_way = abs(motion.at - last.counts) > _FAR_COUNTS and not last.stopped
     return under_way and not free and _who(its.number) != _who(order.number)
 
 
 def _goes_on(at: str, motion: Motion, order: Order, resource: str, faults: Sequence[Fault]) -> list[str]:
-    """Whether it went on although who ordered it, or who carried it out, was gone for long enough."""
+    """Whether it continued although the client that ordered it, or the driver, was gone for long enough."""
     found: list[str] = []
     if order.valid_s and motion.rests - motion.t > order.valid_s + WATCHED_S:
         found.append(f"{at} and on for {motion.rests - motion.t:.1f} s, which was to hold for {order.valid_s:g} s")

@@ -17,11 +17,11 @@ class Order(Record):
     counts: int
     deadline_s: float
     valid_s: float = 0.0
-    """How long it holds unless it is given again; 0: until it is there."""
+    """How long it holds unless it is given again; 0: until it arrives."""
 
 
 class Answer(Record):
-    """What it was told of that."""
+    """The reply to that."""
 
     number: str
     how: str
@@ -36,7 +36,7 @@ class Fault(Record):
 
 
 class Rescue(Record):
-    """Somebody without a link stopped a group while strangers were at the ports, or could not."""
+    """A client without a link stopped a group while strangers were at the ports, or could not."""
 
     whom: str
     """Who was asked: ``door``, or a robot."""
@@ -46,7 +46,7 @@ class Rescue(Record):
 
 
 class Alarm(Record):
-    """A robot confirmed an e-stop before ``t``, and nobody began to clear it before ``until``."""
+    """A robot confirmed an e-stop before ``t``, and its clearing did not begin before ``until``."""
 
     robot: str
     since: float

@@ -22,9 +22,9 @@ class Site:
     """Hosts ``left`` on the private network, ``between`` with the gateway, ``right`` and ``right2`` on the public one.
 
     Args:
-        networks: not laid yet; whoever made them closes them.
+        networks: not laid yet; their creator closes them.
         folder: for certificates and files; paths in a policy are beside it.
-        policy: what everybody goes by, as text.
+        policy: the policy of all, as text.
         public: the groups that the public network lets into the private one, which lets out ``rosie.arm`` in turn, or
             what ``private`` says.
         private: see there.
@@ -92,7 +92,7 @@ class Site:
         reachable: bool = False,
         through: Sequence[str] = (),
     ) -> Member:
-        """A member process, not told anything yet.
+        """A member process, without any command yet.
 
         Args:
             host: where.

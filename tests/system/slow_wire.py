@@ -1,7 +1,7 @@
 """A TCP connection in our own hands: ``slow_wire.py NAMESPACE NAME ADDRESS``, which listens there.
 
 The first line of its input says as JSON where to ``connect``. Each further one says for how many seconds at most what
-goes ``up`` to there and ``down`` from there is held back, anew for whatever has come; it answers how often it has held
+goes ``up`` to there and ``down`` from there is held back, again for whatever has come; it answers how often it has held
 something back so far. Nothing overtakes anything, as on every TCP connection.
 """
 
@@ -41,7 +41,7 @@ class Wire:
     def _link(self, here: socket.socket) -> None:
         try:
             there = socket.create_connection(self._connect, timeout=5)
-        except OSError:  # nobody listens there now
+        except OSError:  # no server listens there now
             here.close()
             return
         there.settimeout(None)

@@ -16,7 +16,7 @@ from tests.support.waiting import PATIENCE_S, wait_until
 
 
 class Shell:
-    """A shell in a folder of its own that finds ``trade``; what goes on in the background ends with the test."""
+    """A shell in a folder of its own that finds ``trade``; what runs in the background ends with the test."""
 
     def __init__(self, folder: Path, undo: ExitStack, **environment: str) -> None:
         self.folder = folder
@@ -40,7 +40,7 @@ class Shell:
         return ended.returncode, ended.stdout
 
     def start(self, command: str) -> "subprocess.Popen[str]":
-        """A command that goes on beside the others; it can be answered, and Ctrl-C ends it with the test."""
+        """A command that runs beside the others; it can be answered, and Ctrl-C ends it with the test."""
         process = subprocess.Popen(
             ["bash", "-c", f"exec env {command}"],  # variables may stand before it
             cwd=self.folder,
@@ -74,7 +74,7 @@ class Shell:
 
 
 def normalised(text: str, *, numbers: bool = True) -> str:
-    """What differs from run to run, put in words; the columns of a table are drawn anew around them."""
+    """What differs from run to run, put in words; the columns of a table are drawn again around them."""
     head, *rows = lines = text.splitlines()
     if not re.match(r"[A-Z]+(  |$)", head):
         return "".join(f"{in_words(line)}\n" for line in lines)

@@ -65,7 +65,7 @@ def as_planner(attack: Attack) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def as_arm(attack: Attack) -> Iterator[str]:
-    """Whoever has the driver's key is the driver, wherever."""
+    """A client that has the driver's key is the driver, wherever it is."""
     yield from own_session(attack, "arm")
 
 
@@ -96,7 +96,7 @@ def test_who_may_only_read_takes_no_lock_away_and_resumes_nothing(attack: Attack
     planner.ask("started", "move", ARM, "6")
     planner.ask("ended")
     attack.chief.ask("break_lock", ARM)
-    wait_until(lambda: not planner.ask("still_held"), "its owner is told")
+    wait_until(lambda: not planner.ask("still_held"), "its owner is notified")
     planner.ask("let_go")
     attack.chief.ask("call", "halt", ARM, "arm")
     assert attack.dash.refused("resume", ARM).startswith("AccessDenied")
@@ -121,7 +121,7 @@ def test_any_client_can_estop_and_an_unauthorized_one_cannot_clear_it(attack: At
     attack.dash.ask("estop_clear", stopped)
     assert attack.arm.ask("estops") == [stopped]
     assert attack.planner.refused("move", ARM, "1").startswith("Stopped")
-    wait_until(lambda: attack.chief.ask("estops") == [stopped], "it is told everybody")
+    wait_until(lambda: attack.chief.ask("estops") == [stopped], "all containers know of it")
     assert attack.chief.ask("estop_clear", stopped)
     attack.chief.ask("resume", ARM)
     attack.planner.ask("move", ARM, "1")
@@ -311,7 +311,7 @@ def test_a_sign_of_life_is_of_oneself(attack: Attack, as_dash: str) -> None:
 
 
 def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it(attack: Attack) -> None:
-    """Containers of one name are told apart by identity and boot; answers go by those."""
+    """Containers of one name are distinguished by identity and boot; answers go by those."""
     twin = attack.site.launched("left", "planner", identity="porter")
     twin.ask("start", GATEWAY["private"])
     assert twin.ask("group", ARM, "arm") and twin.ask("call_group", ARM) == [7]
@@ -335,7 +335,7 @@ def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it
 
 @pytest.fixture(scope="module")
 def bad_papers(attack: Attack) -> dict[str, tuple[Path, str]]:
-    """Folders that no container would start with, and what whoever is shown them says."""
+    """Folders that no container would start with, and the error for each."""
     folder = attack.site.folder
     strangers = Papers(folder / "elsewhere")
     expired = shutil.copytree(attack.site.papers.expired("planner"), folder / "expired")
@@ -405,7 +405,7 @@ def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others
 
 
 def test_the_table_of_rights_is_what_happens(attack: Attack) -> None:
-    """With WRITE_TABLES=1 in the environment it is written anew."""
+    """With WRITE_TABLES=1 in the environment it is written again."""
     attack.revoke("thief")
     page = ROOT / "docs" / "access-control.md"
     table = rights.found_out(attack)

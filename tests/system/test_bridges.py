@@ -19,7 +19,7 @@ LEFT, RIGHT = "tcp/10.231.1.1:7450", "tcp/10.231.2.1:7450"
 
 @pytest.fixture
 def member(networks: Networks, system: str, tmp_path: Path) -> Iterator[StartMember]:
-    """Starts ``member.py`` on a host; it is told to do things, and asked, from there on."""
+    """Starts ``member.py`` on a host; it takes commands and questions from there on."""
     started: list[Member] = []
 
     def start(host: str, name: str, address: str = "", *, bridge: str = "", tls: Path | None = None) -> Member:
@@ -45,7 +45,7 @@ def up(member: Member, *connect: str) -> Member:
 
 
 def all_work_together(members: list[Member]) -> None:
-    """Everybody sees and calls the services of everybody."""
+    """All containers see and call the services of all."""
     count = PROVIDERS * len(members)
     seen = [each.ask("sees", str(count)) for each in members]
     assert [len(labels) for labels in seen] == [count] * len(members), [each.ask("state") for each in members]
@@ -137,7 +137,7 @@ def test_private_networks_dial_out_and_messages_cross_two_bridges_in_a_row(
     networks.lay("inner", office="10.231.3.1", desk="10.231.3.2")
     office = member("office", "office", "10.231.2.2:7450,10.231.3.1:7450", bridge="public,inner")
     office.ask("start")
-    # The robot listens on its private side only: nobody can dial it from outside. So does the laptop, for its own host.
+    # The robot listens on its private side only: no container can dial it from outside. So does the laptop.
     robot = up(member("robot", "robot", "10.231.1.1:7450", bridge="private"), "tcp/10.231.2.2:7450")
     arm = up(member("arm", "arm", "10.231.1.2:0"), "tcp/10.231.1.1:7450")
     desk = up(member("desk", "desk", "10.231.3.2:0"), "tcp/10.231.3.1:7450")

@@ -28,7 +28,7 @@ class Step(NamedTuple):
     why: str
     command: str
     kind: str = "run"
-    """``run``, ``up`` (goes on in the background), or ``calibrate`` (a joint is moved by hand)."""
+    """``run``, ``up`` (runs in the background), or ``calibrate`` (a joint is moved by hand)."""
     counts: tuple[int, int, int] = (0, 0, 0)
     """Where a joint is moved to: its zero, and both ends."""
     code: int = 0
@@ -198,7 +198,7 @@ def bench(system: str, tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.mark.timeout(300)  # it asks every id at every rate
 def test_new_devices_become_a_robot(bench: Bench) -> None:
-    """With WRITE_TABLES=1 in the environment the page's transcript is written anew."""
+    """With WRITE_TABLES=1 in the environment the page's transcript is written again."""
     told = "\n" + "".join(bench.type(step) for step in STEPS)
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     shown, end, after = rest.partition(MARKS[1])

@@ -1,4 +1,4 @@
-"""``make demo``: the story is told to its end on both kinds of networks, and nothing is left of it."""
+"""``make demo``: the story runs to its end on both kinds of networks, and nothing is left of it."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Where certificates tell who is who, nobody takes another one's turn."""
+"""Where certificates identify clients, none takes another one's turn."""
 
 import threading
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ class Room:
 
     @service(effect="read")
     def knock(self) -> str:
-        return "who is there?"
+        return "who knocks?"
 
 
 class Lab:
@@ -79,7 +79,7 @@ def test_who_has_all_threads_of_its_own_busy_leaves_those_of_others_alone(
     runs = [enter.start() for _ in range(20)]
     assert room.inside.acquire(timeout=20)
     assert any(isinstance(run.exception(20), Busy) for run in runs[1:])
-    assert knock() == "who is there?"
+    assert knock() == "who knocks?"
     room.open.set()
 
 

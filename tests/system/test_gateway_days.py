@@ -35,7 +35,7 @@ arm = ["driver"]
 planner = ["operator"]
 """
 PAN, FAR_RAD, SPEED_RAD_S = "rosie.neck.pan", 1.3, 0.1
-"""A motion of 13 s: what is not stopped is still under way when everybody has noticed."""
+"""A motion of 13 s: what is not stopped is still under way when all have noticed."""
 LEASE_S = 2.5
 """More than the transport's and a lock's."""
 
@@ -94,11 +94,11 @@ def comes_to_rest_far_from_its_goal(bench: Bench) -> None:
 def everything_is_lost_at_once(bench: Bench, planner: Member) -> None:
     comes_to_rest_far_from_its_goal(bench)
     assert planner.refused("ended").partition(":")[0] in ("ContainerLost", "LockLost")
-    wait_until(lambda: not planner.ask("still_held"), "its owner is told")
+    wait_until(lambda: not planner.ask("still_held"), "its owner is notified")
 
 
 def it_works_again(bench: Bench, planner: Member) -> None:
-    """With a lock of its own, and nothing of what was before goes on or comes late."""
+    """With a lock of its own, and nothing of before continues or comes late."""
     goals = len(events(bench.sim.entries(), "motion_started", device_id=1))
     planner.ask("let_go")
     planner.ask("hold_when_there", PAN)
@@ -126,7 +126,7 @@ def test_S12_a_network_that_is_cut_ends_lock_and_motion_and_heals(
     for state in ("down", "up"):
         cut(site.networks, network, host, state)
     far_rad = position_rad(bench) + LEASE_S * SPEED_RAD_S
-    wait_until(lambda: position_rad(bench) > far_rad, "it goes on")
+    wait_until(lambda: position_rad(bench) > far_rad, "it continues")
     assert planner.ask("still_held")
     cut(site.networks, network, host, "down")
     everything_is_lost_at_once(bench, planner)
@@ -135,5 +135,5 @@ def test_S12_a_network_that_is_cut_ends_lock_and_motion_and_heals(
 
 
 def cut(networks: Networks, network: str, host: str, state: str) -> None:
-    """At the switch: neither end is told."""
+    """At the switch: neither end is notified."""
     ip("-n", networks.host(f"{network}-switch"), "link", "set", host, state)

@@ -17,7 +17,7 @@ LEASED = '[container.a]\nlease_from = "base"\nsave_every_s = 1\nrestarts = 1\n'
 
 
 class Pair:
-    """``base`` stands in for ``rover``; between them is what base offers, which can be withdrawn."""
+    """``base`` is the standby for ``rover``; between them is what base offers, which can be withdrawn."""
 
     def __init__(self, folder: Path, start: Callable[..., Container]) -> None:
         self.base, self.rover = (Keeping(folder, start(name), 20.0) for name in ("base", "rover"))

@@ -37,7 +37,7 @@ sys.exit(7)
 WAITS = """
 import os, signal, sys, time
 def end(number, frame):
-    os.write(1, f"told {signal.Signals(number).name}\\n".encode())  # print may be in the middle of a line
+    os.write(1, f"got {signal.Signals(number).name}\\n".encode())  # print may be in the middle of a line
     sys.exit(9)
 signal.signal(signal.SIGTERM, end)
 signal.signal(signal.SIGINT, end)
@@ -99,7 +99,7 @@ def locked(rosie_up):
 
 @pytest.fixture
 def nobody_there() -> str:
-    """An endpoint where nobody listens."""
+    """An endpoint without a listener."""
     return free_endpoint()
 
 
@@ -135,7 +135,7 @@ def test_a_signal_is_passed_on_and_the_exit_code_comes_back(locked, trade_comman
     program = locked(WAITS, "rosie.head")
     assert program.line() == "waiting"
     program.process.send_signal(number)
-    assert program.line() == f"told {signal.Signals(number).name}"
+    assert program.line() == f"got {signal.Signals(number).name}"
     program.end()
     assert program.process.returncode == 9
     assert json.loads(trade_command("locks", "--json").stdout) == []
@@ -146,7 +146,7 @@ def test_breaking_a_lock_ends_the_program_and_says_why(locked, trade_command: Co
     assert program.line() == "waiting"
     broken = trade_command("unlock", "rosie.neck", "--break", "my turn")
     assert "rosie.neck.pan" in broken.stdout
-    assert program.line() == "told SIGTERM"
+    assert program.line() == "got SIGTERM"
     _, complaints = program.end()
     assert complaints.startswith("the lock of rosie.neck.pan is lost: broken by ")
     assert "my turn" in complaints

@@ -170,7 +170,7 @@ def attempt() -> None:
 
 
 def assert_alive_once(folder: Path, pids: list[int]) -> None:
-    """Those counted one after the other, and who came later went on from where the one before was."""
+    """Those counted one after the other, and each later one continued from where the one before was."""
     found = served(folder)
     who = [pid for pid, _ in found]
     assert who == list(dict.fromkeys(pids))[: len(who)]

@@ -72,7 +72,7 @@ def recorded(rosie_up: Callable[[], Rosie], run: Callable[..., Program], tmp_pat
     look = trade.find(where(name="move_to", group="rosie.head"), wait_s=PATIENCE_S)
     for place in WAY:
         look(place, 1.5)
-        threading.Event().wait(0.5)  # it stands there for a moment
+        threading.Event().wait(0.5)  # it rests there for a moment
     recording.signal(signal.SIGINT)
     assert recording.wait() == 0
     rosie.program.close()

@@ -319,7 +319,7 @@ def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: 
 
         return now
 
-    wait_until(says(24.5), "the voltage is told")
+    wait_until(says(24.5), "the voltage is published")
     node.kill()
 
     def stale() -> bool:
@@ -331,7 +331,7 @@ def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: 
 
     wait_until(stale, "it is stale")
     bridged.ros.node("base").repeat("/battery", 23.0, 20)
-    wait_until(says(23.0), "the next one is told")
+    wait_until(says(23.0), "the next one is published")
 
 
 MIXED_1 = """

@@ -76,7 +76,7 @@ class Service:
         return {name: value for name, _, value in (line.partition("=") for line in lines)}
 
     def next_but_alive(self) -> dict[str, str]:
-        """What it tells next, besides that it is alive."""
+        """Its next notification, besides that it is alive."""
         while (told := self.tells()) == {"WATCHDOG": "1"}:
             pass
         return told
@@ -116,7 +116,7 @@ def test_what_a_gateway_looks_after_does_not_speak_for_it(manager: socket.socket
     service = Service(manager, "gateway", str(file))
     try:
         assert service.tells()["READY"] == "1"
-        wait_until(service.children, "its container is there")
+        wait_until(service.children, "its container is up")
         [mind] = service.children()
         asked = {"NOTIFY_SOCKET", "WATCHDOG_USEC"}
         assert asked < psutil.Process(service.process.pid).environ().keys()  # as it was started
@@ -160,4 +160,4 @@ def test_S19_a_service_that_is_stopped_leaves_its_robot_as_the_robot_file_says(
     truth = next(device for device in bus.devices if device.device_id == 1)
     assert (truth.torque, truth.moving) == (leave == "hold", False)
     assert truth.position_rad < 1.0
-    assert not events(sim.entries(), "watchdog_expired")  # it was told to, before anything ran out
+    assert not events(sim.entries(), "watchdog_expired")  # it was ordered to, before anything ran out

@@ -48,7 +48,7 @@ def test_nothing_moves_that_must_not_whatever_befalls_them(besieged: Stand) -> N
     count = verdict.counts
     count["held back"] = besieged.held_back()
     print(f"seed {SEED}:", *(f"  {name:36} {many:6}" for name, many in sorted(count.items())), sep="\n")
-    if verdict.violations:  # what everybody noted is what there is to look at
+    if verdict.violations:  # the notes of all processes are the evidence
         shutil.rmtree(KEPT, ignore_errors=True)
         shutil.copytree(besieged.records, KEPT)
         for name, entries in logs.items():
@@ -145,10 +145,10 @@ STOP = 104
         (GOOD, [*MOVED, begun(6, 2490, 2500), rest(6.1)], ""),  # it settles
         (GOOD, [begun(3, 2500), told(4, 2310, 2300, STOP), rest(5)], ""),  # stopped on the way
         (GOOD, [begun(3, 2500), told(4, 2150, 2300, STOP), rest(5)], ""),  # by who knew only where it had been
-        (GOOD, [begun(3, 2500), told(4, 2150, 2300), rest(5)], "nobody ordered that"),
+        (GOOD, [begun(3, 2500), told(4, 2150, 2300), rest(5)], "no client ordered that"),
         (GOOD, [begun(3, 2500), told(4, 2500, 2300), rest(5)], "is done again"),
         (GOOD, [begun(3, 2500), told(7.5, 2500, 2300), rest(8)], "after its deadline"),
-        (GOOD, [*MOVED, begun(6, 3000, 2500), rest(7)], "nobody ordered that"),
+        (GOOD, [*MOVED, begun(6, 3000, 2500), rest(7)], "no client ordered that"),
         (GOOD, [*MOVED, begun(5.5, 2100, 2500), begun(6, 2500, 2100), rest(7)], "is done again"),
         (GOOD, [begun(7.5, 2500), rest(7.9)], "after its deadline"),
         ((*GOOD, *LATER), [begun(11, 2500), rest(12)], "while b:1 had it"),
@@ -230,7 +230,7 @@ def test_who_comes_to_rest_before_it_has_read_its_next_goal_sets_off_once_for_th
     assert [motion.t for motion in again] == [2, 3.1, 6]  # once is enough
     there = structs.replace(rest(5), position_counts=2690)
     again = motions_of([*before[:3], there, begun(6, 2700, 2690)])["pan"]
-    assert [motion.t for motion in again] == [2, 3.1, 6]  # it had done what it was told
+    assert [motion.t for motion in again] == [2, 3.1, 6]  # it had carried out its command
 
 
 def test_motions_of_a_drive_are_derived_from_its_commands_and_events() -> None:
@@ -274,7 +274,7 @@ def test_motions_of_a_drive_are_derived_from_its_commands_and_events() -> None:
 def test_a_stop_that_does_not_get_through_is_found_unless_something_is_in_its_way(
     faults: list[Fault], found: int
 ) -> None:
-    missed = Rescue(t=10, whom="dora", until=12, through=False, said="nobody answers")
+    missed = Rescue(t=10, whom="dora", until=12, through=False, said="no answer")
     assert len(judge([missed, *faults], {}).violations) == found
     assert judge([structs.replace(missed, through=True), *faults], {}).violations == []
 

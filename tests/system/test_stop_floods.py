@@ -1,4 +1,4 @@
-"""Strangers that fill the ports of a driver or a gateway shut nobody out of stop and e-stop (S07)."""
+"""Strangers that fill the ports of a driver or a gateway shut no client out of stop and e-stop (S07)."""
 
 import json
 import os

@@ -215,7 +215,7 @@ def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_agai
     ("wanted", "why"),
     [
         ('providers = [{ class = "tiny:Dies" }]', "ended (exit code 3)"),
-        ('providers = [{ class = "tiny:Nobody" }]', "it came up, but: "),
+        ('providers = [{ class = "tiny:Missing" }]', "it came up, but: "),
         (f'robot = "{ROSIES_HEAD}"', "ended (exit code 1: ConfigurationError: "),
     ],
 )
@@ -359,7 +359,7 @@ def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
     wait_until(lambda: events(sim.entries(), "at_rest", device_id=1, since=killed_at))
     wait_until(lambda: not psutil.pid_exists(info.pid), "it has left")
     assert writes(sim.entries(), device_id=1, register="goal_position", since=killed_at)
-    assert not events(sim.entries(), "watchdog_expired")  # it was told to, before anything ran out
+    assert not events(sim.entries(), "watchdog_expired")  # it was ordered to, before anything ran out
 
 
 def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(

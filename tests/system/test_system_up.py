@@ -49,7 +49,7 @@ class Deployment:
         self.file.write_text(text.replace(before, after))
 
     def processes(self) -> list[psutil.Process]:
-        """What runs of this system: its id is nobody else's."""
+        """What runs of this system: its id is unique."""
         return [one for one in psutil.process_iter() if _runs_in(one, self.system)]
 
     def gone(self) -> bool:
@@ -154,7 +154,7 @@ def test_what_is_in_use_is_not_ended_unless_by_force(home: Deployment) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ('host = "robot"', 'host = "nobody.invalid"', "unknown host"),
+        ('host = "robot"', 'host = "missing.invalid"', "unknown host"),
         (str(TRADE), "/nowhere/trade", "no trade there"),
         (
             'providers = [{ class = "sight:Eye", groups = ["rosie.eyes"] }]',

@@ -37,7 +37,7 @@ class Seen(NamedTuple):
 
 
 def said(entries: Iterable[Entry], device_id: int, since: float = 0.0) -> list[Seen]:
-    """All that a joint of the follower told of itself, which is the truth in a simulator: registers 56 to 61."""
+    """All that a joint of the follower reported, which is the truth in a simulator: registers 56 to 61."""
     return [
         Seen(entry.t, (int.from_bytes(entry.data[5:7], "little") - CENTRE) * RAD, signed(entry.data[7:9]) * RAD)
         for entry in entries
@@ -182,7 +182,7 @@ def test_ctrl_c_ends_it_and_the_follower_holds(pair: Pair) -> None:
 def test_a_follower_whose_lock_is_broken_halts_and_obeys_other_clients(pair: Pair) -> None:
     program = following(pair)
     trade.find(where(name="move_to", group="pair.follower", kind="JointGroup"), wait_s=PATIENCE_S)
-    trade.break_lock(where(group="pair.follower"), reason="somebody is in the way")
+    trade.break_lock(where(group="pair.follower"), reason="a person is in the way")
     code, _, errors = ended(program)
     assert code == 1
     assert "LockLost" in errors or "MotionStopped" in errors  # whichever comes first

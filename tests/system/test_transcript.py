@@ -54,7 +54,7 @@ STEPS: Final = (
 
 
 class Terminal:
-    """Runs commands as a user would, and what goes on in the background."""
+    """Runs commands as a user would, and what runs in the background."""
 
     def __init__(self, trade_command: Command, run: Callable[..., Program]) -> None:
         self._command = trade_command
@@ -91,7 +91,7 @@ def terminal(
 
 
 def test_the_transcript_is_what_happens(terminal: Terminal) -> None:
-    """With WRITE_TABLES=1 in the environment it is written anew."""
+    """With WRITE_TABLES=1 in the environment it is written again."""
     told = "\n" + "".join(terminal.type(step) for step in STEPS)
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     shown, end, after = rest.partition(MARKS[1])

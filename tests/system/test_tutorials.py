@@ -1,7 +1,7 @@
 """The tutorials, done as they are read: each file saved, each command typed, each answer compared.
 
 A page's ``console`` blocks are typed in order, in a folder of its own with a copy of examples/. Blocks with a title are
-files to save. A command that ends in ``&`` goes on beside the others; of what it says as many lines as the page shows
+files to save. A command that ends in ``&`` runs beside the others; of what it says as many lines as the page shows
 are compared. `kill %1` ends the first of those.
 """
 
@@ -68,7 +68,7 @@ def terminal(system: str, tmp_path: Path) -> Iterator[Terminal]:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_is_what_happens(terminal: Terminal, page: Path) -> None:
-    """With WRITE_TABLES=1 in the environment the answers on the page are written anew."""
+    """With WRITE_TABLES=1 in the environment the answers on the page are written again."""
     before = page.read_text(encoding="utf-8")
 
     def done(block: re.Match[str]) -> str:

@@ -51,7 +51,7 @@ _FAST_RAD_S, _SLOW_RAD_S = 2.0, 0.05
 _PATIENCE: Final = "stale_after_s = 1\nwatchdog_s = 1"
 """On a busy host a driver or a simulation gets no time for half a second, whatever the version."""
 _FEW: Final = 4
-"""Moves that show that somebody goes on."""
+"""Moves that show that a client continues."""
 pytestmark = pytest.mark.timeout(600)
 
 
@@ -127,7 +127,7 @@ class Stand:
         )
 
     def versions(self, host: str, version: int) -> dict[str, int]:
-        """By identity, the version of each container that ``trade containers`` of a version tells of there.
+        """By identity, the version of each container that ``trade containers`` of a version lists there.
 
         On a busy host one may not have answered yet; then that is said, and it is asked again.
         """
@@ -146,7 +146,7 @@ class Stand:
         return self.behaviours[name].ask("sees")
 
     def goes_on(self, *names: str) -> None:
-        """Each of these goes on to move."""
+        """Each of these continues to move."""
         for name in names:
             self._moves_on(name)
 
@@ -186,7 +186,7 @@ def stand(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
 
 
 def unwell(stand: Stand, name: str, since: float, until: float) -> list[str]:
-    """What a behaviour was told in that time that is not as it is meant.
+    """The unexpected replies that a behaviour got in that time.
 
     A servo that was silent is left out: on a busy host its simulation gets no time, whatever the version.
     """

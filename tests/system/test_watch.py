@@ -1,4 +1,4 @@
-"""``trade watch`` tells what happens, and ``trade top`` how busy it is, from outside of everything that happens."""
+"""``trade watch`` reports events, and ``trade top`` the load, from outside of the containers concerned."""
 
 import signal
 import subprocess

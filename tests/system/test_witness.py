@@ -49,7 +49,7 @@ def test_a_joint_of_one_robot_fails_and_the_camera_of_another_takes_a_picture(
     asked = pictures_asked(log, struck)
     assert len(asked) == 1, said
     [picture] = folder.iterdir()
-    assert picture.read_bytes() == image().data, "it shows rosie as she stands after the fault"
+    assert picture.read_bytes() == image().data, "it shows rosie as she is after the fault"
     assert picture.read_bytes() != before
     assert said.startswith(f"{SHOULDER}: hardware error: overload; seen by rosie.eye at 2")
 

@@ -160,7 +160,7 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
         self._gateways[host].send_signal(signal.SIGCONT)
 
     def freeze_all(self, host: str) -> None:
-        """All its processes; the gateway first, so that it has told nobody anything when others freeze."""
+        """All its processes; the gateway first, so that it has notified no other when others freeze."""
         self.freeze(host)
         for pid in ip("netns", "pids", self._networks.host(host)).split():
             with contextlib.suppress(ProcessLookupError):
@@ -172,7 +172,7 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
                 os.kill(int(pid), signal.SIGCONT)
 
     def kill_mind(self, host: str) -> None:
-        """The container, if it is there."""
+        """The container, if it exists."""
         for child in self._children(host):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
@@ -183,7 +183,7 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
         return [pid for pid in pids if pid != gateway]
 
     def pull(self) -> None:
-        """At the switch: neither end is told."""
+        """At the switch: neither end is notified."""
         ip("-n", self._networks.host("cable-switch"), "link", "set", "rover", "down")
 
     def plug(self) -> None:

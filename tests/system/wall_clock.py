@@ -1,6 +1,6 @@
 """A program whose wall clock is off by as many seconds as a file says: ``wall_clock.py FILE PROGRAM...``.
 
-The file is a double of eight bytes, looked at anew each time; ``PROGRAM`` is a script or ``-m`` and a module, with its
+The file is a double of eight bytes, read again each time; ``PROGRAM`` is a script or ``-m`` and a module, with its
 words. The clock that waits go by, `time.monotonic`, is right.
 """
 
@@ -15,7 +15,7 @@ _FORMAT = struct.Struct("d")
 
 
 def shift(file: Path, by_s: float) -> None:
-    """Set the clock of whoever goes by this file."""
+    """Set the clock of each program that uses this file."""
     with file.open("r+b" if file.exists() else "w+b") as opened:
         opened.write(_FORMAT.pack(by_s))
 

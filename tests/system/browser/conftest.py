@@ -62,7 +62,7 @@ class HttpProcess:
 
     def __init__(self, run: Callable[..., Program], folder: Path) -> None:
         self._run, self._tokens = run, folder / "tokens.toml"
-        self.token("nobody")
+        self.token("stranger")
         self.url = ""
         self.start("127.0.0.1:0")
 
@@ -92,7 +92,7 @@ def http(
 
 
 class View:
-    """Somebody's page: what can be seen and done there."""
+    """A user's page: what can be seen and done there."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -133,7 +133,7 @@ class Browsers:
         self._first: Browser | None = None
 
     def view(self, who: str, *, alone: bool = False, **options: Any) -> View:
-        """A page of somebody who has signed in; ``alone``: in a browser of its own."""
+        """A page of a signed-in user; ``alone``: in a browser of its own."""
         if alone or self._first is None:
             browser = self._start()
             self._first = self._first or browser

@@ -25,11 +25,11 @@ def test_a_certificate_of_the_systems_authority_takes_the_place_of_a_token(tmp_p
         playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"]) as browser,
     ):
         shown = {"origin": gateway.url, "certPath": folder / "cert.pem", "keyPath": folder / "key.pem"}
-        # the browser knows no authority of ours; whom the HTTP gateway lets in is what is tried
+        # the browser does not know the test's authority; the test is whom the HTTP gateway lets in
         anna = browser.new_context(ignore_https_errors=True, client_certificates=[shown]).new_page()  # type: ignore[list-item]
         anna.goto(gateway.url, timeout=PATIENCE_MS)
         expect(anna.locator("#connection")).to_have_text("● Connected as anna", timeout=PATIENCE_MS)
         expect(anna.get_by_role("button", name="Sign out")).to_be_hidden()
-        nobody = browser.new_context(ignore_https_errors=True).new_page()
-        nobody.goto(gateway.url, timeout=PATIENCE_MS)
-        expect(nobody.get_by_label("Token")).to_be_visible(timeout=PATIENCE_MS)
+        stranger = browser.new_context(ignore_https_errors=True).new_page()
+        stranger.goto(gateway.url, timeout=PATIENCE_MS)
+        expect(stranger.get_by_label("Token")).to_be_visible(timeout=PATIENCE_MS)

@@ -17,7 +17,7 @@ from trade_hil_sim import events
 LEAST_RAD = 0.02
 """What is more than noise."""
 MOST_RAD = 1.0
-"""Where a joint does not get to that stands soon after its page does not want it to move: its range ends at 1.4."""
+"""An angle that a joint does not reach if it stops soon after its page releases the button: its range ends at 1.4."""
 LOOKS = 200
 """Lines of the simulator's log; there are several in each of the driver's cycles."""
 
@@ -28,7 +28,7 @@ def pan_rad(bench: Bench) -> float:
 
 
 def jog(bench: Bench, view: View, button: Any) -> None:
-    """Hold a button until the joint has moved its way; whoever was refused, as on a busy computer, presses again."""
+    """Hold a button until the joint has moved its way; a refused page, as on a busy computer, presses again."""
     began, sign = pan_rad(bench), 1 if button is view.plus else -1
 
     def moved() -> bool:
@@ -42,14 +42,14 @@ def jog(bench: Bench, view: View, button: Any) -> None:
 
 
 def stands(bench: Bench) -> None:
-    """It comes to rest and stays, short of the end of its range, where a jog that went on would get."""
+    """It comes to rest and stays, short of the end of its range, where a jog that continued would get."""
 
     def stayed() -> bool:
         at, looked = pan_rad(bench), len(bench.sim.entries())
         wait_until(lambda: len(bench.sim.entries()) > looked + LOOKS)
         return pan_rad(bench) == pytest.approx(at, abs=1e-3)
 
-    wait_until(stayed, "the joint stands")
+    wait_until(stayed, "the joint is at rest")
     assert abs(pan_rad(bench)) < MOST_RAD
     assert not events(bench.sim.entries(), "watchdog_expired")
 
@@ -116,7 +116,7 @@ def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, 
     expect(bert.message).to_contain_text("LockedByOther")
     bert.page.mouse.up()
     was = pan_rad(bench)
-    wait_until(lambda: pan_rad(bench) > was + LEAST_RAD, "anna's goes on")
+    wait_until(lambda: pan_rad(bench) > was + LEAST_RAD, "anna's continues")
     anna.page.mouse.up()
     stands(bench)
     expect(bert.pan.locator(".locked")).not_to_contain_text("for anna")
@@ -144,7 +144,7 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     chief.page.get_by_role("button", name="Clear the e-stop").click()
     expect(anna.stopped).to_be_empty()
     anna.hold(anna.plus)
-    expect(anna.message).to_contain_text("Stopped")  # it was moving: somebody has to let it
+    expect(anna.message).to_contain_text("Stopped")  # it was moving: a client has to resume it
     anna.page.mouse.up()
     anna.pan.get_by_role("button", name="Let it move again").click()
     expect(anna.message).to_have_text("It may move again.")

@@ -65,12 +65,12 @@ def test_S04_a_joint_of_an_arm_turns_while_its_button_is_held_and_by_no_frozen_p
 
         jog()
         chief.page.mouse.up()
-        wait_until(lambda: not control.arm("right").moving, "it stands")
+        wait_until(lambda: not control.arm("right").moving, "it is at rest")
         at = jog()
         for process in renderers():
             process.send_signal(signal.SIGSTOP)
         try:
-            wait_until(lambda: not control.arm("right").moving, "it stands")
+            wait_until(lambda: not control.arm("right").moving, "it is at rest")
             ended = control.arm("right").positions_rad
             assert ended[5] < at + MOST_RAD
             assert ended[:5] == pytest.approx(began[:5], abs=1e-2)

@@ -152,6 +152,6 @@ BREAK: dict[str, Callable[[], None]] = {
     "endless-leases": _put(lock_table.LockTable, "expire", lambda self: None),
     "grants-what-moves": _put(lock_table.LockTable, "_running", lambda self, waiter: None),
     "answers-nonsense": _put(local_service.Signature, "encode_result", _nonsense),
-    "tells-no-tally": _put(Announcer, "beat", lambda self: None),
+    "sends-no-report": _put(Announcer, "beat", lambda self: None),
 }
 """By name, what breaks it: called before the container begins."""

@@ -35,7 +35,7 @@ class Arm:
 
     @service(effect="read")
     def angle(self) -> float:
-        """Where it stands, in rad."""
+        """Its position, in rad."""
         return self._angle_rad
 
     @service(effect="read")
@@ -45,7 +45,7 @@ class Arm:
 
     @service
     def turn(self, angle_rad: float) -> float:
-        """Go there; returns the angle when it is there."""
+        """Go there; returns the angle on arrival."""
         if not abs(angle_rad) <= MOST_RAD:
             raise LimitExceeded(what="angle_rad", value=angle_rad, lower=-MOST_RAD, upper=MOST_RAD, unit="rad")
         call = current_call()
@@ -84,7 +84,7 @@ class Arm:
 
 
 class Relay:
-    """Calls others for whoever asks."""
+    """Calls others for any client."""
 
     @service
     def relay(self, service: Handle, resources: list[str], args: list[Any]) -> Any:

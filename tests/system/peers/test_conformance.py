@@ -38,7 +38,7 @@ NOTICED_BY = {
     "endless-leases": "leases",
     "grants-what-moves": "waits-for-motion",
     "answers-nonsense": "turns",
-    "tells-no-tally": "reports-late",
+    "sends-no-report": "reports-late",
 }
 """What is broken, and which check has to fail."""
 

@@ -1,4 +1,4 @@
-"""candump's record of an interface, as the judge: somebody else's program wrote down what was on the wire."""
+"""candump's record of an interface, as the judge: an independent program wrote down what was on the wire."""
 
 import itertools
 import re
@@ -17,7 +17,7 @@ __all__ = ["Candump", "RecordedLeg", "cansend"]
 
 _LINE = re.compile(r"\((?P<t>[0-9.]+)\) \S+ (?P<id>[0-9A-F]+)#(?P<remote>R?)(?P<data>[0-9A-F]*)")
 _MARK = 0x7FE
-"""An id that nobody has: frames of it say how far the record goes."""
+"""An id that no device has: frames of it say how far the record goes."""
 _FUNCTIONS = {
     0x180: "tpdo1",
     0x200: "rpdo1",
@@ -115,5 +115,5 @@ def _meaning(can_id: int, data: str) -> tuple[str, int | None]:
 
 
 def _is_heard(interface: str) -> bool:
-    """Whether somebody listens to all frames there."""
+    """Whether a program listens to all frames there."""
     return any(interface in line.split() for line in Path("/proc/net/can/rcvlist_all").read_text().splitlines())

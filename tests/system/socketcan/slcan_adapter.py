@@ -20,7 +20,7 @@ _FRAME = b"t"
 class SlcanAdapter:
     """An interface of its own whose wire is another one, ``vcan``, where the drives are.
 
-    It says of its controller what it is told to: error-active, error-warning, error-passive or bus-off.
+    It reports the state of its controller that the test sets: error-active, error-warning, error-passive or bus-off.
     """
 
     def __init__(self, wire: str) -> None:

@@ -1,4 +1,4 @@
-"""A real controller's states, and interfaces that go: told, no motion when they come back, and back by themselves."""
+"""A real controller's states, and lost interfaces: reported, no motion when they return, and back by themselves."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Other people's programs on the same interface: candump sees what was meant, cansend stirs and misleads nobody."""
+"""Independent programs on one interface: candump sees what was meant, cansend disturbs and misleads no device."""
 
 import itertools
 import struct
@@ -16,15 +16,15 @@ __all__ = ["leg"]
 NOISE = (
     "181#",  # measurements cut short
     "181#27",
-    "00000181#3706FFFFFF7F0000",  # with identifiers twice as long: somebody else's
+    "00000181#3706FFFFFF7F0000",  # with identifiers twice as long: of another device
     "00000581#4341600000000000",
     "00000701#7F",
     "181#R",  # asks for a measurement
-    "183#3706FFFFFF7F0000",  # of nobody
+    "183#3706FFFFFF7F0000",  # of no device
     "703#7F",
-    "581#DEADBEEF",  # an answer that nobody asked for, and one cut short
+    "581#DEADBEEF",  # an unrequested answer, and one cut short
     "581#4341600000000000",
-    "000#8103",  # "restart", to nobody
+    "000#8103",  # "restart", to no device
     "080#",  # a SYNC that is not ours
     "7FF#0011223344556677",
 )
@@ -45,7 +45,7 @@ def test_the_frames_of_a_move_are_those_of_the_standard(leg: RecordedLeg) -> Non
     robot.motor("leg.hip").move_to(0.3)
     robot.close()
     entries = leg.candump.entries()
-    # CiA 301: NMT "start" of both nodes, to nobody else; our heartbeat "operational"
+    # CiA 301: NMT "start" of both nodes, to no other; our heartbeat "operational"
     assert set(of(entries, 0x000)) == {b"\x01\x01", b"\x01\x02"}
     assert set(of(entries, 0x77F)) == {b"\x05"}
     # 1016h:1 := node 127 within 2 s, and 6007h := quick stop without it

@@ -1,4 +1,4 @@
-"""Interfaces that go: told by whoever waits, no motion when they come back, and back by themselves."""
+"""Interfaces that disappear: reported to each waiting caller, no motion when they come back, and back by themselves."""
 
 import re
 
@@ -56,10 +56,10 @@ def test_S18_an_interface_lost_while_moving_is_reported_and_reconnects_by_itself
     mark = written_now()
     if going == "deleted":
         wait_until(lambda: not leg.sim.state().plugged, "the simulator has noticed")
-        wait_until(lambda: "there is no interface" in reason(robot), "the caller is told why")
+        wait_until(lambda: "there is no interface" in reason(robot), "the caller gets the reason")
         ip("link", "add", leg.interface, "type", "vcan")
     else:
-        wait_until(lambda: "it is down; `ip link set" in reason(robot), "the caller is told why")
+        wait_until(lambda: "it is down; `ip link set" in reason(robot), "the caller gets the reason")
     up(leg.interface)
     if going == "deleted":
         leg.sim.do(Replug())
