@@ -22,7 +22,7 @@ SLOW = 0.3
 
 
 class ArmRig:
-    """A simulated arm, and whoever is attached to it."""
+    """A simulated arm, and the driver attached to it."""
 
     def __init__(self, undo: ExitStack, arm: SimArm | None = None, text: str = ARM) -> None:
         self.undo, self._text = undo, text
@@ -61,7 +61,7 @@ class ArmRig:
         return moving
 
     def stands(self) -> None:
-        wait_until(lambda: not self.moving, "it stands")
+        wait_until(lambda: not self.moving, "it is at rest")
         assert self.base_rad < FAR[0] - 0.5
 
 
@@ -75,7 +75,7 @@ def arm_rig() -> Iterator[ArmRig]:
 
 @pytest.fixture(name="free")
 def free_rig() -> Iterator[ArmRig]:
-    """A simulated arm that nobody has attached to."""
+    """A simulated arm without an attached driver."""
     with ExitStack() as undo:
         yield ArmRig(undo)
 

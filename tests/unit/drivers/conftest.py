@@ -54,7 +54,7 @@ class Outcome:
             else:
                 with call(self._deadline_s):
                     self.result = self._act()
-        except BaseException as error:  # noqa: BLE001 - told to whoever waits
+        except BaseException as error:  # noqa: BLE001 - raised in the thread that waits
             self.error = error
 
     def wait(self) -> "Outcome":
@@ -64,7 +64,7 @@ class Outcome:
 
 
 class Rig:
-    """A simulated bus and whoever is attached to it."""
+    """A simulated bus and the driver attached to it."""
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo

@@ -39,7 +39,7 @@ class Process(msgspec.Struct, frozen=True, tag_field="do", tag="process"):
 
 
 class Dashboard(msgspec.Struct, frozen=True, tag_field="do", tag="dashboard"):
-    """Somebody else says a line to the dashboard of an arm's controller."""
+    """Another client sends a line to the dashboard of an arm's controller."""
 
     line: str
 
@@ -68,7 +68,7 @@ class Stop(Enum):
 
 
 class Recovery(Enum):
-    """What somebody has to do, once the cause is gone, before it moves again."""
+    """What a person has to do, once the cause is gone, before it moves again."""
 
     NOTHING = "nothing"
     ENABLE = "`enable()`"
@@ -88,7 +88,7 @@ class Row(NamedTuple):
     says: str = ""
     """Part of its message."""
     state: type[DeviceError] | str = ""
-    """What ``state()`` raises while it lasts, or part of the fault it tells."""
+    """What ``state()`` raises while it lasts, or part of the fault it reports."""
     stop: Stop = Stop.HOLD
     stop_error: type[DeviceError] | None = None
     """What ``stop()`` raises while it lasts."""

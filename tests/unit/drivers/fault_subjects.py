@@ -66,7 +66,7 @@ class Subject(ABC):
 
     @abstractmethod
     def holds(self, since: float) -> list[Entry]:
-        """What it was told on the wire that makes it hold, or stand."""
+        """The commands on the wire that make it hold or stop."""
 
     @abstractmethod
     def exchanges(self, since: float) -> list[Entry]:
@@ -86,7 +86,7 @@ class Subject(ABC):
         return list(self.rig.log)
 
     def moves(self, since: float) -> list[Entry]:
-        """What it was told that could move it."""
+        """The commands it got that could move it."""
         return motion_writes(self.log, device_id=self.device_id, since=since)
 
     def events(self, name: str, since: float) -> list[Entry]:
@@ -125,7 +125,7 @@ class Subject(ABC):
         wait_until(lambda: len(self.exchanges(since)) >= _BEATS, "it is asked as usual")
 
     def fault(self) -> str | None:
-        """What ``state()`` tells; None while that is an error."""
+        """The fault that ``state()`` reports; None while that is an error."""
         try:
             return str(self.provider.state().fault)
         except DeviceError:
@@ -165,7 +165,7 @@ class Servo(_Joint):
         return [entry for entry in asked if self.device_id in (entry.ids or (entry.device_id,))]
 
     def moves(self, since: float) -> list[Entry]:
-        """To be told to hold where it stands does not count."""
+        """A command to hold its position does not count."""
         here = self.truth.position_counts
         found = super().moves(since)
         return [
@@ -234,7 +234,7 @@ class TailServo(_Joint):
     """A Feetech servo of a tail."""
 
     full_speed = 1620
-    """In steps/s: the move is slower, and a joint that is told to hold is told so with its full speed."""
+    """In steps/s: the move is slower, and a command to hold has the joint's full speed."""
 
     def get(self) -> Motor:
         return self.robot.motor("tail.root")
@@ -248,7 +248,7 @@ class TailServo(_Joint):
         return [entry for entry in asked if self.device_id in entry.ids]
 
     def moves(self, since: float) -> list[Entry]:
-        """To be told to hold where it stands does not count."""
+        """A command to hold its position does not count."""
         here = self.truth.position_counts
         found = super().moves(since)
         return [
@@ -273,7 +273,7 @@ class TailMotor(_Joint):
         return [entry for entry in self.rig.frames(device_id=ROOT, since=since) if entry.direction == "out"]
 
     def moves(self, since: float) -> list[Entry]:
-        """To be told to hold where it stands does not count."""
+        """A command to hold its position does not count."""
         here_rad = self.truth.position_rad * self.rig.robot.joints[0].gear
         return [entry for entry in super().moves(since) if not self._holds_at(entry, here_rad)]
 
@@ -318,7 +318,7 @@ class ArmSubject(Subject):
         return instructions(self.log, "stop_j", since=since)
 
     def exchanges(self, since: float) -> list[Entry]:
-        raise NotImplementedError  # what it tells is not in the log
+        raise NotImplementedError  # its answers are not in the log
 
     def wait_for_exchanges(self, since: float) -> None:
         measured: set[float] = set()

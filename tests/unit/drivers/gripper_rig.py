@@ -13,7 +13,7 @@ from trade_hil_sim import Entry, GripperTruth, RobotiqBus, events, motion_writes
 
 
 class HandRig:
-    """A simulated bus and whoever is attached to it."""
+    """A simulated bus and the driver attached to it."""
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo

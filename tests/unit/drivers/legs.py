@@ -70,7 +70,7 @@ def only(*modes: int) -> Callable[[Cia402Bus], None]:
 
 
 class Leg:
-    """The simulated bus and whoever is attached to it: on its own adapter, or on an interface of the system."""
+    """The simulated bus and the driver attached to it: on its own adapter, or on an interface of the system."""
 
     def __init__(self, undo: ExitStack, interface: str = "", rate_hz: int = 20) -> None:
         self._undo = undo

@@ -61,7 +61,7 @@ DAMIAO = _BUS.format(driver="damiao") + _JOINTS.format(model="DM4310", gear="1.0
 
 
 class MotorRig(Leg):
-    """The simulated bus and whoever is attached to it."""
+    """The simulated bus and the driver attached to it."""
 
     kind: str
     text: str
@@ -99,7 +99,7 @@ class MotorRig(Leg):
         return [struct.unpack("<f", e.data[:4])[0] * self.unit_rad for e in found]
 
     def sent_away(self, device_id: int, since: float, rad: float = 0.05) -> bool:
-        """Whether it was told to go elsewhere than where it was when it was told first."""
+        """Whether it got a goal other than its position at its first command."""
         targets = self.targets(device_id, since)
         return any(abs(target - targets[0]) > rad for target in targets)
 

@@ -22,7 +22,7 @@ _NEAR = 20
 
 
 class TailRig:
-    """A simulated bus and whoever is attached to it."""
+    """A simulated bus and the driver attached to it."""
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
@@ -88,7 +88,7 @@ class TailRig:
         return next(servo for servo in self.sim.devices if servo.device_id == device_id)
 
     def poke(self, address: int, *data: int, device_id: int = 1) -> None:
-        """Write to a servo's memory as if somebody else had."""
+        """Write to a servo's memory as if another program had."""
         self.servo(device_id).write(address, bytes(data), time.monotonic())
 
 
@@ -105,7 +105,7 @@ def lead_counts(speed_rad_s: float, accel_rad_s2: float = 20.0) -> float:
 
 
 def measured_before(log: list[Entry], write: Entry) -> int:
-    """The position that the servo had last told of when this write came."""
+    """The position that the servo had last reported when this write came."""
     told = [entry for entry in log if entry.kind == "sent" and entry.device_id == write.device_id]
     told = [entry for entry in told if entry.name == "sync_read" and entry.t <= write.t]
     return int.from_bytes(told[-1].data[5:7], "little")

@@ -33,7 +33,7 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
     return prepare
 
 
-# --- who is there
+# --- which devices answer
 
 
 def test_an_unknown_model_is_named_by_its_number(head: Rig) -> None:
@@ -114,7 +114,7 @@ def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig)
     robot.motor("neck.tilt").move_to(0.1)
 
 
-# --- what the file alone tells
+# --- mistakes that show in the file alone
 
 
 def test_a_servo_on_a_can_bus_is_refused(head: Rig) -> None:
@@ -207,7 +207,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
         deregister=announced.remove,
         ports={"neck": str(head.sim.port)},
     )
-    assert len(announced) == 4  # two joints, their group, and what tells of faults
+    assert len(announced) == 4  # two joints, their group, and what reports faults
     closing = [Outcome(robot.close) for _ in range(3)]
     assert [outcome.wait().error for outcome in closing] == [None] * 3
     assert not announced

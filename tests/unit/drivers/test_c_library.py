@@ -47,9 +47,9 @@ float half(float of) { return of / 2; }
 int with_mode(const double *of, int mode, size_t n) { return (int)n + mode + (of != NULL); }
 colour_t paint(void) { return GREEN; }
 static void rest(long ms) { struct timespec s = {0, ms * 1000000}; nanosleep(&s, NULL); }
-static atomic_int told;
-int go(void) { rest(200); told = 0; for (int i = 0; i < 20000 && !told; i++) rest(1); return told ? -2 : 0; }
-int halt(void) { told = 1; return 0; }
+static atomic_int halted;
+int go(void) { rest(200); halted = 0; for (int i = 0; i < 20000 && !halted; i++) rest(1); return halted ? -2 : 0; }
+int halt(void) { halted = 1; return 0; }
 """
 MORE_HEADER = """
 typedef struct { double x, y; } pair_t;
@@ -110,7 +110,7 @@ class Hand:
 
     @property
     def widths_m(self) -> list[float]:
-        """What the device was told."""
+        """The commands of the device."""
         return [float(line) for line in self.port.read_text().split()]
 
 
@@ -266,7 +266,7 @@ def test_a_number_that_a_float_of_c_cannot_hold_is_refused(lib: CLibrary) -> Non
 
 
 class Slow:
-    """Begins late, and forgets then whatever it was told before."""
+    """Begins late, and then forgets all earlier commands."""
 
     def __init__(self, lib: CLibrary) -> None:
         def go(self: object) -> None: ...

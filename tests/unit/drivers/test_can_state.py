@@ -1,4 +1,4 @@
-"""How a CAN bus is: what its service tells, what the health of its joints says, and what the system knows of it."""
+"""The state of a CAN bus: by its service, by the health of its joints, and by the operating system."""
 
 import itertools
 import struct
@@ -106,7 +106,7 @@ def test_health_is_degraded_from_error_passive_on(frame_id: int, data: int, heal
     port.close()
 
 
-# --- what the system tells
+# --- what the operating system reports
 
 
 def attribute(kind: int, value: bytes) -> bytes:

@@ -47,7 +47,7 @@ class Mind:
 
     @service
     def look_about(self) -> None:
-        """Goes on to the next place, whatever became of the one before."""
+        """Continues to the next place, whatever became of the one before."""
         for goal in (FAR, -FAR, FAR):
             try:
                 self._move(goal, SLOW)

@@ -113,5 +113,5 @@ def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
 
 
 def test_on_a_virtual_bus_without_anybody_the_drive_is_absent(rig: Leg) -> None:
-    with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:nobody"):
-        rig.attach(ports={"legs": "virtual:nobody"})
+    with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:empty"):
+        rig.attach(ports={"legs": "virtual:empty"})

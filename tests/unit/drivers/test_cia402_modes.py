@@ -248,7 +248,7 @@ def test_a_drive_holds_its_position_after_a_trajectory_and_moves_again(leg: Leg)
     group, hip = robot.group("leg"), robot.motor("leg.hip")
     assert swing(group).wait().error is None
     mark, told = written_now(), len(positions(leg))
-    wait_until(lambda: len(positions(leg)) > told + 5, "it is told where to stand")
+    wait_until(lambda: len(positions(leg)) > told + 5, "it gets the position to hold")
     assert len(set(positions(leg, HIP, mark))) == 1
     assert hip.move_to(0.2) == pytest.approx(0.2, abs=0.01)
     assert not leg.events("torque_off", HIP, mark)

@@ -161,7 +161,7 @@ class Stand:
         return [entry for entry in frames(self.sim.entries(), "rpdo1", since=since) if entry.data[0] & 1 << 4]
 
     def freeze(self, pid: int, seconds: float) -> float:
-        """Stop a process for so long; the moment it goes on."""
+        """Stop a process for so long; returns when it continues."""
         os.kill(pid, signal.SIGSTOP)
         try:
             sleep_past(int((written_now() + seconds) * 1e9))
@@ -246,7 +246,7 @@ def test_a_drive_that_network_management_has_stopped_says_so_and_enable_takes_it
     for refused in (hip.state, lambda: hip.move_to(0.1)):
         with pytest.raises(DeviceFault, match=r"network management has stopped it.*call enable\(\)"):
             refused()
-    assert not leg.frames("nmt", since=mark)  # nobody has asked for it
+    assert not leg.frames("nmt", since=mark)  # no client has asked for it
     hip.enable()
     assert leg.frames("nmt", HIP, mark)[0].data == bytes((table.NMT_PREOPERATIONAL, HIP))
     assert [entry.message for entry in caplog.records if "put to pre-operational" in entry.message]

@@ -58,7 +58,7 @@ def test_S06_the_watchdog_of_every_drive_is_armed_at_attach_and_fed_from_then_on
         assert bytes.fromhex("23161001") + (127 << 16 | 300).to_bytes(4, "little") in writes
         assert bytes.fromhex("2b076000 03000000") in writes
     count = len(heartbeats(leg))
-    wait_until(lambda: len(heartbeats(leg)) >= count + 3, "the heartbeat goes on")
+    wait_until(lambda: len(heartbeats(leg)) >= count + 3, "the heartbeat continues")
 
 
 # --- stop
@@ -106,7 +106,7 @@ class Lost:
     def gate(self) -> None:
         self.left -= 1
         if self.left < 0:
-            raise LockedByOther(resources=["rosie.leg.hip"], owner="somebody else", purpose="walk")
+            raise LockedByOther(resources=["rosie.leg.hip"], owner="another client", purpose="walk")
 
 
 @pytest.mark.parametrize("looks", [0, 3])

@@ -198,7 +198,7 @@ def test_a_servo_that_answers_pings_but_not_reads_is_listed_with_that_problem(li
     line.plug(1)
     line.sim.do(Mute(instruction="read"))
     problems = ["register 68" in found.problem for found in line.scan(1)]
-    assert problems == ([] if line.make is MAKES["feetech"] else [True])  # a Feetech servo tells no model then
+    assert problems == ([] if line.make is MAKES["feetech"] else [True])  # a Feetech servo reports no model then
 
 
 def test_a_new_rate_outlives_the_power(line: Line) -> None:

@@ -132,7 +132,7 @@ def is_answer(one: Entry) -> bool:
 
 
 def test_turns_keep_nothing(running: Running) -> None:
-    """But for the last seconds, which faults are told with: so it is looked at until that has grown no more.
+    """But for the last seconds, which faults are reported with: so it is looked at until that has grown no more.
 
     Of memory that the driver's own lines ask for: the simulator is in this process, too, and its log grows.
     """

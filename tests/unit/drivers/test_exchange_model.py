@@ -124,7 +124,7 @@ class Model(RuleBasedStateMachine):
         assert all(job.ended for job in self.jobs)
         assert all(ticket.ended for ticket in self.tickets.values())
 
-    # --- told by what happens
+    # --- by what happens
 
     def turn_of(self, job: Job) -> None:
         """Before one shares a device with an earlier one, that one has ended."""
@@ -275,7 +275,7 @@ TestModel.settings = hypothesis.settings(max_examples=60, stateful_step_count=40
 
 
 def test_what_is_handed_in_while_all_of_it_is_ended_is_ended_or_still_there() -> None:
-    """Else a service would wait for a job that nobody has."""
+    """Else a service would wait for a lost job."""
     inbox: deque[int] = deque()
     many = 200_000
     handing_in = threading.Thread(target=lambda: [inbox.append(number) for number in range(many)])

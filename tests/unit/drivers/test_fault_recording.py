@@ -217,7 +217,7 @@ def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> No
     assert 0 < spent["look"] < 0.2 * spent["cycle"], spent
 
 
-# --- devices of which nobody tells
+# --- devices that report no faults
 
 
 def asked(log: FaultLog, name: str, device: object) -> FaultPoller:

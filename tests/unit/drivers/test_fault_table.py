@@ -49,7 +49,7 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
     _check_stop(row, subject, struck)
 
     stood, rested = subject.travelled, written_now()
-    wait_until(lambda: _tells(subject, row.state), f"state() tells {row.state!r}")
+    wait_until(lambda: _tells(subject, row.state), f"state() reports {row.state!r}")
     wait_until(lambda: _one_of(row.registry, subject.told.get(subject.provider, "healthy")), row.registry)
     if row.refuses:
         _check_refused(row, subject)
@@ -88,7 +88,7 @@ def test_a_small_fault_goes_unnoticed(row: Row, subject: Subject) -> None:
 
 def test_the_page_of_the_docs_is_what_the_table_says() -> None:
     kept = (Path(__file__).parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
-    assert kept == page(), "write it anew: python -m tests.unit.drivers.fault_table > docs/faults.md"
+    assert kept == page(), "write it again: python -m tests.unit.drivers.fault_table > docs/faults.md"
 
 
 def _check_stop(row: Row, subject: Subject, struck: float) -> None:

@@ -1,4 +1,4 @@
-"""What happens on a bad bus: nobody is believed who must not be, and nobody suffers for another.
+"""What happens on a bad bus: no bad answer is believed, and no device suffers for another.
 
 What comes of each fault by itself is in the table of faults.
 """
@@ -112,7 +112,7 @@ def test_stopping_a_silent_joint_once_more_does_not_turn_it_back(head: Rig, robo
     mark = written_now()
     head.sim.do(sim.Mute(ids=(1,)))
     assert isinstance(moving.wait().error, DeviceSilent)
-    wait_until(lambda: head.goals(1, mark), "it is told to hold")
+    wait_until(lambda: head.goals(1, mark), "it gets a command to hold")
     held = [goal_counts(entry) for entry in head.goals(1, mark)]
     with pytest.raises(DeviceSilent):
         robot.motor("neck.pan").stop()
@@ -278,7 +278,7 @@ def test_enabling_alone_reboots_a_servo_that_has_shut_down(head: Rig, robot: Att
     pan, tilt = robot.motor("neck.pan"), robot.motor("neck.tilt")
     pan.move_to(0.2)
     head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
-    wait_until(lambda: "overload" in pan.state().fault, "its fault is told")
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is reported")
     for act in (lambda: pan.move_to(0.1), pan.stop, pan.relax):
         with suppress(DeviceFault):
             act()
@@ -294,7 +294,7 @@ def test_enabling_alone_reboots_a_servo_that_has_shut_down(head: Rig, robot: Att
 def test_a_servo_whose_fault_comes_back_at_once_is_not_enabled(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     head.sim.do(sim.Supply(ids=(1,), temperature_c=90))
-    wait_until(lambda: "overheating" in pan.state().fault, "its fault is told")
+    wait_until(lambda: "overheating" in pan.state().fault, "its fault is reported")
     with pytest.raises(DeviceFault, match="overheating"):
         pan.enable()
     assert not head.truth(1).torque
@@ -306,7 +306,7 @@ def test_a_faulty_servo_with_torque_on_is_not_rebooted(head: Rig, robot: Attache
     head.sim.devices[0].write(63, b"\0", time.monotonic())  # shut down for nothing
     pan.enable()
     head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
-    wait_until(lambda: "overload" in pan.state().fault, "its fault is told")
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is reported")
     with pytest.raises(DeviceFault, match=r"it has not let go: call relax\(\)"):
         pan.enable()
     assert head.truth(1).torque

@@ -233,7 +233,7 @@ def test_a_new_one_takes_over_and_nothing_holds_in_between(head: Rig, group: Joi
     assert isinstance(first.wait().error, MotionStopped)
     assert "another move" in str(first.error)
     whole = [entry for entry in head.goals(1, mark) if len(entry.data) == 12]
-    [begins] = whole  # its own beginning: nobody told the joint to hold before
+    [begins] = whole  # its own beginning: no hold was sent before
     braking_rad = pan.velocity_rad_s**2 / (2 * 20.0)
     assert goal_counts(begins) - 2048 > (pan.position_rad + braking_rad / 2) * COUNTS_PER_RAD  # nor to come back
 
@@ -309,7 +309,7 @@ def test_cancelled_it_stops(head: Rig) -> None:
         for groups, provider in head.attach().providers.items():
             driver.register(provider, groups)
         run = caller.find(where(name="follow", group="rosie.head")).with_(deadline_s=30).start(SLOW)
-        wait_until(lambda: run.progress() is not None, "it tells how far it is")
+        wait_until(lambda: run.progress() is not None, "it reports its progress")
         assert 0 <= run.progress()["fraction"] < 1
         run.cancel()
         with pytest.raises(TradeError):

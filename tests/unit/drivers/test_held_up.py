@@ -1,4 +1,4 @@
-"""A driver that was held up for longer than its watchdog goes on with nothing; the judge is what the devices were sent.
+"""A driver that was held up for longer than its watchdog resumes no motion; what the devices were sent decides.
 
 Its process was frozen, or the whole host was suspended: the joints have stopped by themselves meanwhile.
 """
@@ -208,7 +208,7 @@ def test_S06_nor_does_a_stop_that_came_meanwhile(joint: Joint) -> None:
 def test_S06_what_moved_when_its_host_was_suspended_does_not_go_on(
     joint: Joint, act: Callable[[Joint], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The clock of everything else stands still meanwhile: it is as if nothing had happened."""
+    """The clock of everything else does not run meanwhile: it is as if nothing had happened."""
     moving = joint.set_off(lambda: act(joint))
     exchange = joint.motor._exchange  # type: ignore[attr-defined]
     clock = exchange.lasting_clock

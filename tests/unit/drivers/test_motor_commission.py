@@ -36,7 +36,7 @@ def look(rig: MotorRig, **options: Any) -> list[Found]:
 
 @contextmanager
 def talking(port: str, *messages: can.Message) -> Iterator[None]:
-    """Somebody else on the bus, who says this again and again."""
+    """Another sender on the bus, which repeats these messages."""
     address, _, channel = port.removeprefix("socketcand:").partition("/")
     host, _, number = address.partition(":")
     ended = threading.Event()
@@ -47,7 +47,7 @@ def talking(port: str, *messages: can.Message) -> Iterator[None]:
                 bus.send(message)
 
     with can.Bus(interface="socketcand", host=host, port=int(number), channel=channel, tcp_tune=True) as bus:
-        thread = threading.Thread(target=talk, name="somebody")
+        thread = threading.Thread(target=talk, name="talking")
         thread.start()
         try:
             yield

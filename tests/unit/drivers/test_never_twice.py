@@ -39,7 +39,7 @@ class CanRig:
 
     @property
     def elsewhere(self) -> str:
-        """The bus, as somebody reaches it of whom this host knows nothing: by another address."""
+        """The bus, as reached by a client that this host does not know: by another address."""
         return self.rig.sim.port.replace("127.0.0.1", "localhost")
 
     def senders(self, since: float = 0.0) -> set[str]:

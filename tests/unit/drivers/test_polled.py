@@ -1,4 +1,4 @@
-"""Sensors that are asked again and again: whose wire it is, how old readings are told, silence and coming back."""
+"""Polled sensors: the owner of the wire, the age of readings, silence and return."""
 
 import termios
 import threading
@@ -75,7 +75,7 @@ def test_readers_never_touch_the_wire(scale: Scale) -> None:
     asked = scale.asked
     readings = [scale.read() for _ in range(5000)]
     assert scale.asked - asked < len(readings)
-    wait_until(lambda: scale.asked > asked + 1, "its thread goes on")
+    wait_until(lambda: scale.asked > asked + 1, "its thread continues")
     assert scale.threads == {threading.current_thread().name, "sensor rosie.scale"}, "the first, and all others"
 
 
@@ -95,7 +95,7 @@ def test_whatever_measuring_raises_it_is_silent_until_it_is_back(
     wait_until(lambda: _is_silent(scale), "the last reading is too old")
     scale.trouble = None
     wait_until(lambda: not _is_silent(scale), "it is back")
-    assert scale.opened >= 2, "its wire was taken anew"
+    assert scale.opened >= 2, "its wire was opened again"
 
 
 def test_a_lost_port_is_reported_with_the_reason(start: Callable[[Scale], Scale]) -> None:

@@ -1,6 +1,6 @@
 """A walk as others see it: python-can records the frames in candump's format, cantools decodes them by a DBC.
 
-The DBC is written here by hand from what the frames carry (CiA 402-2, docs/drivers.md): no table of ours is asked.
+The DBC is written here by hand from what the frames carry (CiA 402-2, docs/drivers.md): no table of ours is used.
 """
 
 import threading

@@ -25,7 +25,7 @@ def hand(tmp_path: Path) -> Iterator[HandRig]:
 
 
 def tell(bus: RobotiqBus, *values: int) -> None:
-    """What somebody else wrote before."""
+    """What another client wrote before."""
     bus.devices[0].write(0x03E8, values, time.monotonic())
     bus._line.nudge()
 
@@ -46,7 +46,7 @@ def test_S18_a_gripper_found_moving_is_stopped(hand: HandRig) -> None:
     tell(hand.sim, 0x0900, 255, 0x00FF)
     hand.under_way()
     hand.gripper()
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     assert not hand.moves()
     assert hand.truth.activated
     assert hand.truth.width_m > 0.02
@@ -56,7 +56,7 @@ def test_S18_a_gripper_found_activating_is_stopped(hand: HandRig) -> None:
     tell(hand.sim, 0x0100, 0, 0)
     wait_until(lambda: hand.truth.moving, "its fingers move")
     hand.gripper()
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     assert not hand.moves()
     assert not hand.truth.activated
 

@@ -131,7 +131,7 @@ def test_fingers_that_still_move_when_the_bus_is_back_are_stopped(hand: HandRig,
     mark = written_now()
     hand.sim.do(sim.Replug())
     wait_until(lambda: hand.writes(mark), "it is stopped")
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     assert not hand.moves(mark)
     assert hand.truth.width_m > 0.005
 

@@ -63,7 +63,7 @@ def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_st
     assert moves
     assert max(entry.t for entry in moves) - min(entry.t for entry in moves) < 0.1
     hand.sim.do(Heal())
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     assert hand.truth.width_m > 0.03
     assert len(hand.moves(mark)) == len(moves)
 
@@ -83,7 +83,7 @@ def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: 
     mark = written_now()
     gate.says = False
     assert moving.wait().error is not None
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     [stop] = [entry for entry in hand.writes(mark) if not entry.moves]
     assert hand.truth.width_m > 0.03
     wait_until(lambda: silent(gripper), "what was measured is too old")
@@ -103,7 +103,7 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, 
     gate.hold_up()
     mark = written_now()
     stop = Outcome(gripper.stop)
-    wait_until(lambda: gripper._exchange._stops, "the stop is there")  # type: ignore[attr-defined]
+    wait_until(lambda: gripper._exchange._stops, "the stop is queued")  # type: ignore[attr-defined]
     gate.let_go()
     assert stop.wait().error is None
     assert isinstance(moving.wait().error, MotionStopped)
@@ -144,7 +144,7 @@ def test_S08_a_stop_of_a_silent_gripper_is_sent_blind_and_cannot_activate_it(han
     hand.under_way()
     hand.sim.do(Mute())
     assert isinstance(moving.wait().error, DeviceSilent)
-    wait_until(lambda: not hand.truth.moving, "it stands")
+    wait_until(lambda: not hand.truth.moving, "it is at rest")
     mark = written_now()
     with pytest.raises(DeviceSilent):
         gripper.stop()

@@ -44,7 +44,7 @@ def test_S04_it_ramps_to_its_stop_at_the_joints_acceleration(rig: Rig) -> None:
     pan.move_to(-1.4)
     mark = written_now()
     pan.set_velocity(1.0, 1.0)
-    wait_until(lambda: rig.goals(1, mark), "it was told")
+    wait_until(lambda: rig.goals(1, mark), "it got a goal")
     told = rig.goals(1, mark)[0]
     rest = rig.wait_for("at_rest", 1, told.t)
     held = rig.goals(1, told.t + 1e-6)[0]

@@ -151,7 +151,7 @@ def test_S22_a_joint_that_is_measured_outside_its_range_is_stopped_by_the_bus_th
     high, low = rig.base_rad + 0.1, rig.base_rad - 0.1
     rig.arm._limb.arm.max_rad[0], rig.arm._limb.arm.min_rad[0] = high, low  # type: ignore[attr-defined]
     assert isinstance(moving.wait().error, LimitExceeded)
-    wait_until(lambda: not rig.moving, "it stands")
+    wait_until(lambda: not rig.moving, "it is at rest")
     assert low - 0.4 < rig.base_rad < high + 0.4
 
 
@@ -169,7 +169,7 @@ def test_S18_an_arm_found_moving_is_stopped(free: ArmRig) -> None:
     free.sim._in_thread(free.sim._program.play)
     wait_until(lambda: free.moving, "its own program moves it")
     free.attach()
-    wait_until(lambda: not free.moving, "it stands")
+    wait_until(lambda: not free.moving, "it is at rest")
     assert not free.moves()
 
 
@@ -178,7 +178,7 @@ def test_S18_a_controller_that_comes_back_is_read_and_not_commanded(rig: ArmRig,
     moving = rig.set_off()
     rig.sim.do({"cable": Unplug(), "reboot": BrownOut(), "silence": Absent()}[how])
     assert isinstance(moving.wait().error, DeviceSilent | DeviceFault)
-    wait_until(lambda: not rig.moving, "it stands")
+    wait_until(lambda: not rig.moving, "it is at rest")
     mark = written_now()
     if how == "cable":
         rig.sim.do(Replug())

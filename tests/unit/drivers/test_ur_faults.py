@@ -24,7 +24,7 @@ def test_a_protective_stop_cannot_be_unlocked_at_once() -> None:
         rig = ArmRig(undo, SimArm(name="right", unlock_s=3600.0))
         rig.attach()
         rig.sim.do(HardwareFault(bits=3))
-        wait_until(lambda: rig.arm.safety_state() == "protective stop", "it is told")
+        wait_until(lambda: rig.arm.safety_state() == "protective stop", "it is reported")
         with pytest.raises(DeviceFault, match="Cannot unlock"):
             rig.arm.unlock_protective_stop()
 

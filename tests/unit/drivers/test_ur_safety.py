@@ -135,7 +135,7 @@ def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_go_on(
     monkeypatch.setattr(exchange, "lasting_clock", lambda: clock() + 3600 * 10**9)
     error = moving.wait().error
     rig.stands()
-    assert len(rig.moves(asleep)) < 20  # a set-point that goes on for its second is sent more than a hundred times
+    assert len(rig.moves(asleep)) < 20  # a set-point that continues for its second is sent more than a hundred times
     mark = written_now()
     if how != "servo":  # whose call was answered when it began
         assert isinstance(error, DeviceFault)
@@ -183,7 +183,7 @@ def test_S07_a_stop_and_the_state_are_answered_at_once_while_a_lost_controller_i
             rig.arm.state()
     with pytest.raises(BusGone):
         rig.arm.stop()
-    assert pid in children("control")  # nobody has waited for it
+    assert pid in children("control")  # no thread has waited for it
 
 
 def test_S07_a_driver_is_closed_while_a_silent_controller_is_looked_for(
