@@ -64,12 +64,12 @@ def test_P58_a_dialogue_about_what_there_is(talk: Talk, robot: Container, memory
         ("What can the eyes do?", "eyes has one service: rosie.eyes.check_for."),
         ("Where is the check_for service?", f"check_for is in container robot on host {host}."),
         ("Who can see?", "rosie.eyes.check_for can."),
-        ("Who can fly(?x)?", "Nobody can fly(?x)."),
+        ("Who can fly(?x)?", "Nobody can fly(?x)."),  # plain: Nobody
         (
             "How do I ask check_for?",
             "rosie.eyes.check_for is check_for(what: str) -> bool: Look for something in front of the robot.",
         ),
-        ("Who has the head?", "Nobody has it: head is free."),
+        ("Who has the head?", "Nobody has it: head is free."),  # plain: Nobody
         ("Is everything all right?", "All is well."),
         ("What is new?", "I have not looked before; from now on I know."),
         ("what's new", "Nothing is new."),
@@ -214,7 +214,7 @@ def test_on_the_command_line_what_is_new_is_since_it_was_asked_last(start_contai
     assert ask("what", "is", "new?") == "I have not looked before; from now on I know."
     robot.register(Head(), "rosie.head")
     assert json.loads(ask("anything new?", "--json"))["data"]["came"] == ["rosie.head.stop", "rosie.head.turn"]
-    done = CliRunner().invoke(app, ["ask"], input="what is new\nfoo\nwho is there\n")
+    done = CliRunner().invoke(app, ["ask"], input="what is new\nfoo\nwho is there\n")  # plain: is there
     assert done.stdout.splitlines()[1:] == ["Nothing is new.", "There is one container: robot."]
     assert "I do not understand that" in done.stderr
     assert "what is new" in ask("--phrases")

@@ -308,7 +308,7 @@ def test_a_link_does_not_lead_it_out_of_its_folder(config: Path, state: Path, ou
     assert not (to / "policy.toml").is_symlink()
 
 
-# --- archives that somebody has changed
+# --- archives that were changed
 
 Members = list[tuple[tarfile.TarInfo, bytes]]
 
@@ -374,7 +374,7 @@ def test_what_was_changed_is_refused_before_anything_is_written(
 ) -> None:
     back_up(config, out, state)
     write(out, read(out))
-    assert run("backup", "--check", out).exit_code == 0  # written anew as it was, it is whole
+    assert run("backup", "--check", out).exit_code == 0  # written again as it was, it is whole
     write(out, CHANGES[change](read(out)))
     for words in (["restore", out, "--to", tmp_path / "new"], ["backup", "--check", out]):
         with pytest.raises(ConfigurationError, match="is no backup, or a damaged one"):

@@ -1,4 +1,4 @@
-"""The files of the dashboard, as the HTTP gateway gives them to whoever asks."""
+"""The files of the dashboard, as the HTTP gateway serves them to any client."""
 
 import re
 from pathlib import Path

@@ -261,7 +261,7 @@ class ScriptedStand:
         ([(0.002, False), (0.003, True)], [], "did not stop"),
         ([(0.002, False)], [(0.001, True), (0.002, False)], "moved again"),
     ],
-    ids=["rests", "is led on", "goes on", "begins anew", "moves by itself later"],
+    ids=["rests", "is led on", "continues", "begins again", "moves by itself later"],
 )
 def test_a_joint_is_judged_by_when_it_rested_for_good(
     monkeypatch: pytest.MonkeyPatch,

@@ -1,4 +1,4 @@
-"""What `trade up` tells of its devices, once for each change; and that `trade services` shows what is not well."""
+"""What `trade up` reports of its devices, once for each change; and that `trade services` shows what is unhealthy."""
 
 import json
 from typing import Any

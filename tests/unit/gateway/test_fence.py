@@ -16,7 +16,7 @@ from trade_gateway.supervisor._single_instance import alone, is_free
 STAYS = """
 import os, signal, sys, threading
 from trade_gateway.process._parent_watch import end_with_stdin
-signal.signal(signal.SIGTERM, lambda *_: os.write(1, b"told to leave\\n"))  # print may be at work
+signal.signal(signal.SIGTERM, lambda *_: os.write(1, b"asked to leave\\n"))  # print may be at work
 end_with_stdin(leased=True)
 print("up", flush=True)
 while True:
@@ -25,7 +25,7 @@ while True:
 
 
 class Staying:
-    """A process that ignores being told to leave."""
+    """A process that ignores the request to leave."""
 
     def __init__(self, *term: float) -> None:
         self.process = subprocess.Popen(
@@ -61,13 +61,13 @@ def staying() -> Iterator[Staying]:
 
 def test_a_child_that_does_not_end_on_request_is_killed(staying: Staying) -> None:
     staying.until(0.0, 0.5)
-    assert staying.says() == "told to leave"
+    assert staying.says() == "asked to leave"
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
 
 def test_S20_one_that_is_frozen_is_ended_while_it_is(staying: Staying) -> None:
     staying.until(0.0, 2.0)
-    assert staying.says() == "told to leave"  # so it has heard of both
+    assert staying.says() == "asked to leave"  # so it has heard of both
     staying.process.send_signal(signal.SIGSTOP)
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
@@ -83,7 +83,7 @@ def test_a_child_that_is_renewed_in_time_stays(staying: Staying) -> None:
 def test_a_child_ends_with_the_process_that_started_it_whatever_its_orders(staying: Staying) -> None:
     assert staying.process.stdin is not None
     staying.process.stdin.close()
-    assert staying.says() == "told to leave"
+    assert staying.says() == "asked to leave"
 
 
 def test_a_lock_is_free_when_the_process_that_has_it_has_ended_and_not_before(tmp_path: Path) -> None:

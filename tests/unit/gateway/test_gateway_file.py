@@ -1,4 +1,4 @@
-"""Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
+"""Gateway files: a right file is accepted, and each mistake is named with its remedy before anything starts."""
 
 import os
 import queue
@@ -78,7 +78,7 @@ def test_the_commands_in_the_example_make_all_that_it_names(tmp_path: Path, monk
 
 def test_a_gateway_that_its_policy_does_not_name_is_reported(file: Path) -> None:
     change(file.parent / "policy.toml", 'gateways = ["door"]', 'gateways = ["other"]')
-    assert read_gateway_file(file).settings  # it goes on, as it did before
+    assert read_gateway_file(file).settings  # it continues, as it did before
     with pytest.raises(ConfigurationError, match=r'door.*gateways = \["other", "door"\]'):
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
 
@@ -167,7 +167,7 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ("restarts = -1\n", 4, ">= 0"),
         ("answers_within_s = 0.0\n", 4, ">= 0.2"),
         ('host = "far"\n', 4, "a gateway supervises containers of its own host; leave it out"),
-        ('after = ["nobody"]\n', 4, "there is no container 'nobody'; there is eyes"),
+        ('after = ["missing"]\n', 4, "there is no container 'missing'; there is eyes"),
         ('rules = "care.toml"\n', 4, "there is providers and rules"),
         ('lease_from = "base"\nstands_in_for = "base"\n', 4, "leave one of them out"),
         ("lease_s = 5.0\n", 4, "goes with stands_in_for; leave it out"),
@@ -175,9 +175,9 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ('stands_in_for = "rover"\nlease_s = 1.0\n', 5, ">= 2"),
         ('lease_from = "base"\nrestart = "never"\n', 5, "does not go with lease_from"),
         ('[container.care]\nrules = "care.toml"\nlease_from = "base"\n', 6, "a rules is pinned to its host"),
-        ('[container.rosie]\nrobot = "nobody.toml"\nstands_in_for = "rover"\n', 6, "a robot is pinned to its host"),
+        ('[container.rosie]\nrobot = "missing.toml"\nstands_in_for = "rover"\n', 6, "a robot is pinned to its host"),
         ('[container.door]\ngateway = "door.toml"\n', 5, "is this file"),
-        ('[container.rosie]\nrobot = "nobody.toml"\n', 5, "there is no such file"),
+        ('[container.rosie]\nrobot = "missing.toml"\n', 5, "there is no such file"),
     ],
 )
 def test_what_is_wrong_with_a_container_is_named_with_its_line(tmp_path: Path, text: str, line: int, said: str) -> None:

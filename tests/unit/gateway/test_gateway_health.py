@@ -1,4 +1,4 @@
-"""When a gateway tells that it is alive: while it takes calls, and looks after whom it has to."""
+"""When a gateway reports that it is alive: while it takes calls and supervises its children."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -289,7 +289,7 @@ def test_S09_an_e_stop_that_no_container_received_is_no_success_and_stays_open(t
         assert "use the switch that cuts the power" in refused.body["detail"]
         [known] = anna.ask("GET", "/estops").body
         assert known["id"] in refused.body["detail"]
-        robot = Robot(system)  # who comes into sight is told
+        robot = Robot(system)  # a container that appears gets the e-stop
         move = robot.find("a")
 
         def stopped() -> bool:

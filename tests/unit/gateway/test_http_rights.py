@@ -182,7 +182,7 @@ def test_traced_calls_are_reported_as_they_end_to_clients_that_read_the_system(s
     try:
         with chief.socket() as page:
             say(page, do="calls", id=1)
-            for number in (1.0, 2.0):  # what was noted before is told at most once, what comes is told, too
+            for number in (1.0, 2.0):  # earlier calls are shown at most once, new ones are shown, too
                 anna.call("robot.a.where_is_it")
                 anna.call("robot.a.move", number)
                 told = [heard(page)["call"] for _ in ("asked", "served")]

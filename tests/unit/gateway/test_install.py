@@ -118,20 +118,20 @@ def test_a_file_that_another_program_wrote_or_changed_is_overwritten_only_by_for
 def test_what_the_services_user_may_not_read_is_warned_of_with_the_remedy(tmp_path: Path) -> None:
     own, papers = tmp_path / "etc", tmp_path / "etc" / "gate"
     papers.mkdir(parents=True)
-    user = pwd.getpwnam("nobody")
+    user = pwd.getpwnam("nobody")  # plain: nobody
     file, key, elsewhere = own / "gateway.toml", papers / "key.pem", tmp_path / "elsewhere"
     for path, mode in ((file, 0o644), (key, 0o600), (elsewhere, 0o600), (own, 0o755), (papers, 0o700)):
         path.touch()
         path.chmod(mode)
-    told = list(_closed_to("nobody", [file, key, elsewhere]))
+    told = list(_closed_to("nobody", [file, key, elsewhere]))  # plain: nobody
     assert [words.split(", so")[0] for words in told] == [
-        f"user nobody cannot enter {papers}",
-        f"user nobody cannot read {key}",
+        f"user nobody cannot enter {papers}",  # plain: nobody
+        f"user nobody cannot read {key}",  # plain: nobody
     ]
     assert f"sudo chgrp {user.pw_gid} {papers} && sudo chmod 0750 {papers}" in told[0]
     papers.chmod(0o755)
     key.chmod(0o644)
-    assert not list(_closed_to("nobody", [file, key]))
+    assert not list(_closed_to("nobody", [file, key]))  # plain: nobody
     assert not list(_closed_to("no-such-user", [file, key]))
 
 

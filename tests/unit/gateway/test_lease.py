@@ -1,4 +1,4 @@
-"""A lease, told event by event: whatever is lost, late or frozen, of two hosts one at most has the container up."""
+"""A lease, event by event: whatever is lost, late or frozen, of two hosts one at most has the container up."""
 
 import math
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ def test_what_it_is_given_by_an_old_answer_is_neither_a_longer_lease_nor_another
     holder.answered(11.0, "", Lease("b", LEASE_S, states=b"late"))
     assert (holder.turn, holder.states) == ("a", b"first")
     holder.answered(21.0, "a", Lease("c", LEASE_S, states=b"of the arbiter"))
-    assert (holder.turn, holder.states) == ("c", b"first")  # what is up goes on with what it knows
+    assert (holder.turn, holder.states) == ("c", b"first")  # a running container continues with its own state
 
 
 def test_after_a_lease_has_ended_it_begins_with_what_the_arbiter_knows() -> None:
@@ -138,7 +138,7 @@ class Message:
 
 
 class TwoHosts(RuleBasedStateMachine):
-    """Time passes by three clocks; messages come in any order, late, twice or never."""
+    """Time runs on three clocks; messages come in any order, late, twice or never."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class TwoHosts(RuleBasedStateMachine):
         self.host = Host(rover, Holder(self.now * rover, "base"))
         self.arbiter = Arbiter("rover", "boot0")
         self.on_base = False
-        """A process is there, whoever started it."""
+        """A process exists, whichever gateway started it."""
         self.base_frozen = False
 
     @property
@@ -180,7 +180,7 @@ class TwoHosts(RuleBasedStateMachine):
         if not host.frozen:
             if host.holder.asks(self.at_rover):
                 self.questions.append(Message(self.at_rover, host.holder.turn, self.boots))
-            if host.holder.held(self.at_rover):  # started, or told that it may stay
+            if host.holder.held(self.at_rover):  # started, or allowed to stay
                 host.lives_until = max(host.lives_until, host.holder.term.until)
 
     clocks = st.sampled_from([0.99, 1.0, 1.01])
@@ -247,7 +247,7 @@ class TwoHosts(RuleBasedStateMachine):
 
     @rule()
     def the_gateway_of_rover_starts_again(self) -> None:
-        """What it left behind lives as long as it was told to at most."""
+        """The processes it left behind live at most as long as their lease."""
         self.boots += 1
         self.host = Host(self.host.rate, Holder(self.at_rover, "base"), self.host.lives_until)
 

@@ -1,4 +1,4 @@
-"""The life of a child, told event by event on a clock of the test's own."""
+"""The life of a child, event by event on a clock of the test's own."""
 
 import math
 from typing import Any

@@ -37,7 +37,7 @@ def test_the_usage_says_where_the_command_goes() -> None:
 def test_options_after_the_dashes_belong_to_the_command_and_those_before_to_trade_lock() -> None:
     assert CliRunner().invoke(app, ["lock", "--no-such", "--", "true"]).exit_code == 2
     said = CliRunner().invoke(app, ["lock", "--", "true", "--help", "--no-such"])
-    assert isinstance(said.exception, UsageError)  # none of ours: nothing to lock is what is wrong
+    assert isinstance(said.exception, UsageError)  # no TradeError: the mistake is that there is nothing to lock
     assert "say what to lock" in str(said.exception)
 
 

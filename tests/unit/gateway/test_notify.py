@@ -1,4 +1,4 @@
-"""What systemd is told: by a datagram to its socket, and by nothing else."""
+"""Notifications to systemd: by a datagram to its socket, and by nothing else."""
 
 import os
 import secrets

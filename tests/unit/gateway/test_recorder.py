@@ -1,4 +1,4 @@
-"""A recording under way, in one process: what is listened to, what of calls, locks, health and e-stops is told."""
+"""A recording under way, in one process: its streams, and what it records of calls, locks, health and e-stops."""
 
 import json
 import sys

@@ -204,7 +204,7 @@ def test_the_ring_never_takes_more_memory_than_it_was_given() -> None:
 
 
 class Kept:
-    """A folder, and what is told of it; time stands still unless it is moved."""
+    """A folder, and the reports about it; time passes only when the test advances it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

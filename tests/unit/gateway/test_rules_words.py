@@ -1,4 +1,4 @@
-"""``trade rules``: run a file, try one out, list what stands."""
+"""``trade rules``: run a file, try one out, list the active rules."""
 
 import json
 import re
@@ -27,7 +27,7 @@ do = [{ call = { name = "note" }, args = ["$service"] }]
 [rule.alone]
 when = { missing = { name = "dance" } }
 if = { service = { name = "is_dark" } }
-do = [{ call = { name = "note" }, args = [7] }, { call = { name = "nobody" } }]
+do = [{ call = { name = "note" }, args = [7] }, { call = { name = "missing" } }]
 cooldown_s = 600
 """
 
@@ -141,7 +141,7 @@ def test_a_file_is_tried_out_without_calling_anything(desk: Desk, file: Path) ->
     assert "greet: joined name='switch': would not fire now (nothing matches)" in text
     assert "alone: missing name='dance', if the service with name='is_dark': would fire now" in text
     assert "call name='note': desk.note in desk: would be called" in text
-    assert "NoSuchService: no service matches name='nobody'" in text
+    assert "NoSuchService: no service matches name='missing'" in text
     told = json.loads(trade("rules", "test", str(file), "--json").stdout)
     assert [(one["rule"], one["fires"]) for one in told] == [("greet", False), ("alone", True)]
     assert desk.noted == []

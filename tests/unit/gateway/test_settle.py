@@ -1,4 +1,4 @@
-"""What stands when a robot is up is not looked through by garbage collections: its bus threads would wait for them."""
+"""Garbage collections skip the objects of a robot that is up: its bus threads would wait for them."""
 
 import gc
 from collections.abc import Iterator

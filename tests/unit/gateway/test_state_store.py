@@ -1,4 +1,4 @@
-"""What is saved survives whatever ends the process, the disk or the file; and nobody is held up by it."""
+"""What is saved survives whatever ends the process, the disk or the file; and it delays no caller."""
 
 import contextlib
 import random
@@ -24,7 +24,7 @@ from trade_gateway.supervisor._store import StateStore
 def states(turn):
     return {f"object {n}": [turn, "x" * 20_000] for n in range(5)}
 
-def save_for_ever(path):
+def save_repeatedly(path):
     store = StateStore(path, print)
     for turn in range(1, 100_000):
         assert store.save("a", states(turn))
@@ -42,8 +42,8 @@ def save_twice_and_die(path, step):
     saved = store.save("a", states(2))
     os._exit(0 if saved else 1)
 
-if sys.argv[2] == "for ever":
-    save_for_ever(Path(sys.argv[1]))
+if sys.argv[2] == "repeatedly":
+    save_repeatedly(Path(sys.argv[1]))
 step, code = 0, None
 while code != 0:
     step += 1
@@ -214,7 +214,7 @@ def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: 
 def test_killed_at_any_moment_every_confirmed_save_is_kept(tmp_path: Path) -> None:
     path, dice = tmp_path / "state.sqlite", random.Random(7)
     for _ in range(4):
-        child = _saver(path, "for ever")
+        child = _saver(path, "repeatedly")
         assert child.stdout is not None
         said = [int(child.stdout.readline()) for _ in range(dice.randrange(3, 30))]
         child.kill()

@@ -108,7 +108,7 @@ class Kept:
         self.until = math.inf
         """When something is to be done for it."""
         self.then = ""
-        """What its end will mean, while it is told to leave."""
+        """What its end will mean, while it is asked to leave."""
         self.begun = self.been_up = self.leaving = self.asking = False
         self.launches = self.missed = 0
         self.asked = -math.inf
@@ -408,7 +408,7 @@ class Model(RuleBasedStateMachine):
             self._start(child)
         self._settle()
         assert self.real.restart(name, "anna")
-        assert not self.real.restart("nobody", "anna")
+        assert not self.real.restart("missing", "anna")
 
     @rule(duration_s=st.sampled_from([0.125, 0.25, 1.0, 1.0, 5.0, GRACE_S, START_S, WINDOW_S]))
     def advance(self, duration_s: float) -> None:

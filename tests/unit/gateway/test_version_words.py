@@ -1,4 +1,4 @@
-"""What an operator is told while containers of two protocol versions are up."""
+"""What an operator sees while containers of two protocol versions are up."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""``trade notifications`` and ``trade hooks``: what stands anywhere is listed and ended from the command line."""
+"""``trade notifications`` and ``trade hooks``: those of the whole system are listed and ended from the command line."""
 
 import json
 import re

@@ -27,7 +27,9 @@ def test_an_agent_looks_at_what_there_is(agent: Container) -> None:
         assert told["arguments"]["properties"]["angle_rad"]["type"] == "number"
         assert (told["needs_lock"], told["needs_approval"]) == (True, False)
         assert await client("call", group="rosie.head", name="state") == {"result": {"position_rad": 0}}
-        assert (await client("ask", sentence="Who has the head?"))["text"] == "Nobody has it: head is free."
+        assert (await client("ask", sentence="Who has the head?"))[
+            "text"
+        ] == "Nobody has it: head is free."  # plain: Nobody
 
     run(looks, agent)
 
@@ -203,7 +205,7 @@ def test_P58_the_dialogue_of_trade_ask_is_the_same_over_the_protocol(agent: Cont
     dialogue = [
         ("Which computers are there?", f"There is one host: {host}."),
         ("Where is the turn service?", f"turn is in container robot on host {host}."),
-        ("Who has the legs?", "Nobody has it: legs is free."),
+        ("Who has the legs?", "Nobody has it: legs is free."),  # plain: Nobody
         ("Is everything all right?", "All is well."),
         ("What is new?", "I have not looked before; from now on I know."),
         ("what's new", "Nothing is new."),

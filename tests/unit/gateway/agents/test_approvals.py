@@ -46,9 +46,9 @@ def test_what_is_marked_waits_for_a_persons_word(
             assert await client("call", **call) == {"result": 0.5}
         assert "waits for a person's approval" in client.progress
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(run_sync, lambda: _decide(person, "refuse", "somebody stands there"))
+            tasks.start_soon(run_sync, lambda: _decide(person, "refuse", "a person is in the way"))
             refusal = await client.refused("call", **{**call, "args": [0.7]})
-        assert "ann refused: somebody stands there" in refusal
+        assert "ann refused: a person is in the way" in refusal
 
     run(asks, agent)
     assert robot.legs.angle == 0.5
