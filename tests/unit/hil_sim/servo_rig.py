@@ -1,4 +1,4 @@
-"""A servo under an injected clock, and what it has told."""
+"""A servo under an injected clock, and its reports."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +15,7 @@ SIZES = {register.address: register.size for register in XM430_W350.registers}
 
 
 class Rig:
-    """A servo, its clock, and what it has told."""
+    """A servo, its clock, and its reports."""
 
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock

@@ -57,7 +57,7 @@ def test_a_frame_has_as_many_bits_as_the_standard_says() -> None:
 
 
 class Notes:
-    """A referee that lets all pass, but for ids it is told to destroy."""
+    """A referee that lets all pass, but for the ids it has to destroy."""
 
     def __init__(self) -> None:
         self.bad: set[int] = set()
@@ -134,7 +134,7 @@ def test_a_destroyed_frame_is_sent_again_until_its_sender_is_bus_off() -> None:
     wire.send(two, Frame(0x200), 1.0)
     run(wire)
     assert (one.off, two.off) == (True, False)
-    assert notes.log[-1][0] == "destroyed"  # nobody is left to acknowledge what the other wants to say
+    assert notes.log[-1][0] == "destroyed"  # no node is left to acknowledge what the other wants to send
     third = station(wire)
     run(wire)
     assert notes.log[-1][:2] == ("passed", 0x200)

@@ -120,7 +120,7 @@ def test_ids_are_looked_up_on_every_bus_unless_one_is_named(control: SimControl)
 
 
 class Listener(FaultMethods):
-    """Keeps what it is told to do."""
+    """Records its commands."""
 
     def __init__(self) -> None:
         self.done: list[Command] = []

@@ -1,4 +1,4 @@
-"""What is asked of the thread of a bus is done there, or refused; nobody waits for a thread that has ended."""
+"""What is asked of the thread of a bus is done there, or refused; no caller waits for a thread that has ended."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor

@@ -12,7 +12,7 @@ BY_ADDRESS = {register.address: register for register in STS3215.registers}
 
 
 class Rig:
-    """A servo, its clock, and what it has told."""
+    """A servo, its clock, and its reports."""
 
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock

@@ -15,7 +15,7 @@ from trade_hil_sim import ByteLog, SerialLine, SimulationError, received, sent
 
 
 class Parrot:
-    """Answers what it hears; wakes when told to."""
+    """Answers what it hears; wakes at a set time."""
 
     def __init__(self) -> None:
         self.line: SerialLine | None = None

@@ -126,7 +126,7 @@ def test_reg_write_waits_for_action(rig: Rig, refused: Any) -> None:
 
 
 def test_without_torque_a_goal_moves_nothing_and_switching_on_goes_for_it(rig: Rig) -> None:
-    """The harder reading of the manual: whoever enables without seeding the goal sees a jump."""
+    """The harder reading of the manual: enabling without seeding the goal causes a jump."""
     rig.write(GOAL, 3000)
     rig.pass_s(1.0)
     assert rig.read(132) == 2048

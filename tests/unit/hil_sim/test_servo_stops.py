@@ -51,7 +51,7 @@ def test_after_the_watchdog_goals_are_refused_until_0_is_written(rig: Rig, refus
     refused(ErrorCode.DATA_RANGE, rig.write, GOAL, 2048)
     rig.write(WATCHDOG, 0)
     rig.pass_s(2.0)
-    assert rig.read(132) == stopped_at  # nothing goes on by itself
+    assert rig.read(132) == stopped_at  # nothing continues by itself
     rig.write(GOAL, 2048)
     rig.pass_s(5.0)
     assert rig.read(132) == 2048

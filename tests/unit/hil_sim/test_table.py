@@ -33,7 +33,7 @@ def test_the_simulator_has_every_register_of_the_vendors_table_at_its_address_an
 @pytest.mark.parametrize("model", MODELS.values(), ids=lambda model: model.name)
 def test_the_vendor_files_the_model_number_under_this_name(model: Model) -> None:
     rows = dict(line.split() for line in (FILES / "dynamixel.model").read_text().splitlines()[1:])
-    if model.name == "XW430-T200":  # its table is there, but the list of numbers leaves it out
+    if model.name == "XW430-T200":  # its table exists, but the list of numbers leaves it out
         assert str(model.number) not in rows
     else:
         assert rows[str(model.number)] == f"{_file(model.name)}.model"

@@ -177,7 +177,7 @@ def test_a_frozen_stream_continues_with_the_same_values(controller: UrBus) -> No
     with client(controller) as rtde:
         rtde.stream("timestamp")
         controller.do(Freeze(tick=True))
-        wait_until(lambda: len(set(times(rtde, 5))) == 1, "the clock stands")
+        wait_until(lambda: len(set(times(rtde, 5))) == 1, "the clock is frozen")
         controller.do(Heal())
         wait_until(lambda: len(set(times(rtde, 5))) == 5, "the clock goes")
 

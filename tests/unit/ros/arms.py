@@ -1,4 +1,4 @@
-"""Joints of ours that have no hardware: what moves them is recorded, and they are where they are told."""
+"""Joints of TRADE without hardware: their commands are recorded, and they are at once where they should go."""
 
 import threading
 from typing import Any

@@ -37,12 +37,12 @@ class MemoryRos:
         self.parameters: dict[str, dict[str, Any]] = {}
         self.watchers: list[_Watch] = []
         self.problem = ""
-        """Why nobody can be seen any more; empty: all is well."""
+        """Why no node can be seen any more; empty: the graph is healthy."""
         self.anonymous = False
-        """Whether nobody is told who sends and calls."""
+        """Whether senders and callers are unknown."""
 
     def graph(self, node: str, *, seen: bool = True) -> "MemoryGraph":
-        """A node; ``seen``: those who watch are told of it."""
+        """A node; ``seen``: those who watch are notified of it."""
         made = MemoryGraph(self, node)
         with self.guard:
             self.nodes[node] = made
@@ -103,7 +103,7 @@ class MemoryGraph:
     ) -> Message:
         found = self._ros.services.get(name)
         if found is None or self.closed:
-            raise RosUnreachable(what=name, problem="nobody serves it")
+            raise RosUnreachable(what=name, problem="no node serves it")
         return found.call(type_name, request, self._ros.who(self.node), timeout_s)
 
     def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> "_Action":
@@ -115,7 +115,7 @@ class MemoryGraph:
     ) -> "_Pursuit":
         found = self._ros.actions.get(name)
         if found is None:
-            raise RosUnreachable(what=name, problem="nobody serves it")
+            raise RosUnreachable(what=name, problem="no node serves it")
         return found.begin(type_name, goal, self._ros.who(self.node), feedback)
 
     def parameters(self, node: str, timeout_s: float) -> dict[str, Any]:
@@ -223,7 +223,7 @@ class _Service:
                     finally:
                         self.answered += 1
                 said.put(types.from_bytes(self._response, types.to_bytes(self._response, told)))
-            except Exception as error:  # noqa: BLE001 - it is told to who asked
+            except Exception as error:  # noqa: BLE001 - it is sent to the caller
                 said.put(error)
 
         threading.Thread(target=run, name="memory-ros-service", daemon=True).start()
@@ -287,7 +287,7 @@ class _Pursuit:
             outcome = self._action.do(self)
             told = types.from_bytes(result, types.to_bytes(result, outcome.result))
             self._ended.put(Outcome(outcome.how, told, outcome.text))
-        except Exception as error:  # noqa: BLE001 - it is told to who asked
+        except Exception as error:  # noqa: BLE001 - it is sent to the caller
             self._ended.put(Outcome(Ended.ABORTED, types.zero(result), str(error)))
 
     def feedback(self, message: Mapping[str, Any]) -> None:

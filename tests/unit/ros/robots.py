@@ -1,4 +1,4 @@
-"""A robot of ours that records what is done to it, a bridge, and nodes of ROS around them."""
+"""A robot of TRADE that records what is done to it, a bridge, and nodes of ROS around them."""
 
 import threading
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class Part:
 
     @service(cancel="stop")
     def go(self, angle_rad: float) -> None:
-        """Be on the way there until it is stopped, or told another angle."""
+        """Be on the way there until it is stopped, or gets another angle."""
         self._moves += 1
         mine = self._moves
         self.commands.append(angle_rad)

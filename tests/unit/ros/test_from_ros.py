@@ -1,4 +1,4 @@
-"""What ROS has, as providers of ours: with its types, and with stops that reach it."""
+"""What ROS has, as providers of TRADE: with its types, and with stops that reach it."""
 
 import threading
 import time
@@ -68,7 +68,7 @@ def test_a_service_of_ros_has_its_fields_as_parameters_and_results(stand: Stand)
 
 def test_a_service_of_ros_that_is_not_there_says_so(stand: Stand) -> None:
     stand.up(PART + 'effect = "read"\n')
-    with pytest.raises(RosUnreachable, match="nobody serves it"):
+    with pytest.raises(RosUnreachable, match="no node serves it"):
         found(stand, "lab", "door")(True)
 
 
@@ -127,7 +127,7 @@ def test_what_ros_refuses_does_not_count_as_moving(stand: Stand) -> None:
         found(stand, "lab", "door")(True)
     person = stand.memory.container("person")
     stand.memory.settle()
-    with person.lock(where(group="lab"), wait_s=0):  # nobody waits until it rests
+    with person.lock(where(group="lab"), wait_s=0):  # without waiting until it rests
         pass
 
 
@@ -219,7 +219,7 @@ class RosArm:
         self.goes, self.canceled = threading.Event(), threading.Event()
         self.holds = False
         self.falls_silent = self.dies = False
-        """What was told of its joints ends, at once or with the next motion."""
+        """The states of its joints end, at once or with the next motion."""
         self.result: dict[str, Any] = {}
         self.at = (0.0, 0.0)
         self._states = self.graph.advertise("/joint_states", "sensor_msgs/msg/JointState")

@@ -1,4 +1,4 @@
-"""What waits for its turn is overtaken by stops and by the end of who asked; what stops is told until it is heard."""
+"""Stops and the end of a caller overtake what waits for its turn; a stop is repeated until it is heard."""
 
 import threading
 import time

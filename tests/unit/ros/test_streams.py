@@ -1,4 +1,4 @@
-"""What services of ours read is on topics, as long as it is true."""
+"""Values that TRADE services read are published on topics while they are valid."""
 
 import threading
 from typing import Any

@@ -1,4 +1,4 @@
-"""Goals of FollowJointTrajectory move joints of ours, under a lock, and end as their clients are told."""
+"""Goals of FollowJointTrajectory move joints of TRADE, under a lock, and report their end to their clients."""
 
 import time
 from collections.abc import Sequence
@@ -210,7 +210,7 @@ def test_the_action_has_the_fields_published_for_each_ros(version: Literal[1, 2]
     assert {field.name for field in types.fields(result)} == {"error_code", "error_string"}
     assert {"header", "joint_names", "desired", "actual", "error"} <= {one.name for one in types.fields(feedback)}
     assert types.from_bytes(asked, types.to_bytes(asked, TO_THERE))["trajectory"]["joint_names"] == ["a", "b"]
-    if version == 1:  # as `rosmsg md5` tells of Noetic's
+    if version == 1:  # as `rosmsg md5` prints for Noetic's
         sums = [types.definition(part)[1] for part in (asked, result, feedback)]
         assert sums == [
             "69636787b6ecbde4d61d711979bc7ecb",

@@ -80,7 +80,7 @@ def send(topic, values) -> None:
 
 
 def meet(topic) -> None:
-    """Wait until somebody hears a topic of ours."""
+    """Wait until a subscriber hears a topic of this node."""
     while not opened[topic].get_num_connections():
         time.sleep(0.01)
     tell("met", topic)
@@ -160,7 +160,7 @@ def main() -> None:
         else:
             job(*args)
             tell("did", what)
-    rospy.signal_shutdown("told to")
+    rospy.signal_shutdown("requested")
 
 
 main()

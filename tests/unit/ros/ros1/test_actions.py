@@ -95,7 +95,7 @@ def test_a_goal_whose_server_is_killed_fails_and_the_next_server_takes_goals(gra
 
 
 class Lossy:
-    """A publisher whose first messages are lost, as they are while nobody is connected yet."""
+    """A publisher whose first messages are lost, as they are while no node is connected yet."""
 
     def __init__(self, real: Any, lost: int) -> None:
         self.real = real
@@ -171,7 +171,7 @@ def client(stand: Stand, goal: int, name: str = "planner") -> Peer:
 
 
 class Mover:
-    """What an action of ours does: as the goal says, and until it is canceled."""
+    """What an action of TRADE does: as the goal says, and until it is canceled."""
 
     def __init__(self) -> None:
         self.came: list[tuple[int, str]] = []
@@ -299,12 +299,12 @@ def test_a_goal_that_waits_for_the_end_of_another_is_recalled_by_the_next(graph:
 
 
 def _states(graph: Ros1, stand: Stand) -> int:
-    """How many goals the action tells of."""
+    """How many goals the action reports."""
     seen: list[int] = []
     heard = graph.subscribe(
         "/move/status", "actionlib_msgs/msg/GoalStatusArray", lambda told, who: seen.append(len(told["status_list"]))
     )
-    wait_until(lambda: seen, "its state is told")
+    wait_until(lambda: seen, "its state is reported")
     heard.close()
     return seen[-1]
 

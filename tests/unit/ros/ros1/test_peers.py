@@ -6,7 +6,7 @@ import sys
 PROGRAM = """
 import socket, sys, threading, time
 from trade_gateway.ros.ros1._node._peers import Peers
-told, closed = [], []
+reported, closed = [], []
 server = socket.create_server(("127.0.0.1", 0))
 def serve():
     while len(closed) < 4:
@@ -17,42 +17,42 @@ def serve():
     server.close()
     kept.close()
 threading.Thread(target=serve, daemon=True).start()
-peers = Peers(lambda name, there: told.append((name, there)))
+peers = Peers(lambda name, there: reported.append((name, there)))
 uri = "http://127.0.0.1:%d/" % server.getsockname()[1]
 peers.at("/arm", uri)
 deadline = time.monotonic() + 60
-while len(told) < 2 and time.monotonic() < deadline:
+while len(reported) < 2 and time.monotonic() < deadline:
     time.sleep(0.01)
-print(told, len(closed), peers.uri("/arm"), flush=True)
+print(reported, len(closed), peers.uri("/arm"), flush=True)
 """
 
 BESIDE_STALE = """
 import os, socket, threading, time
 from trade_gateway.ros.ros1._node._peers import Peers
-told, asked, forever = [], [], threading.Event()
+reported, asked, never = [], [], threading.Event()
 real = socket.getaddrinfo
 def look_up(host, *rest, **named):
-    if host != "127.0.0.1" and told:
+    if host != "127.0.0.1" and reported:
         asked.append(host)
-        forever.wait()
+        never.wait()
     return real("127.0.0.1" if host == "arm.example" else host, *rest, **named)
 socket.getaddrinfo = look_up
 server = socket.create_server(("127.0.0.1", 0))
-peers = Peers(lambda name, there: told.append((name, there)))
+peers = Peers(lambda name, there: reported.append((name, there)))
 deadline = time.monotonic() + 60
 def wait(true):
     while not true() and time.monotonic() < deadline:
         time.sleep(0.01)
 peers.at("/arm", "http://arm.example:%d/" % server.getsockname()[1])
-wait(lambda: told)
+wait(lambda: reported)
 for number in range(100):
     peers.at("/stale%d" % number, "http://stale%d.example:1/" % number)
 wait(lambda: len(asked) >= 8)
 kept, _ = server.accept()
 server.close()
 kept.close()
-wait(lambda: len(told) > 1)
-print(told, flush=True)
+wait(lambda: len(reported) > 1)
+print(reported, flush=True)
 os._exit(0)
 """
 

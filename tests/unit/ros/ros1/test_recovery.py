@@ -22,7 +22,7 @@ class Watch:
         self.watch = graph.watch_nodes(lambda name, there: self.told.append((name, there)))
 
     def until(self, name: str, there: bool) -> None:
-        wait_until(lambda: (name, there) in self.told, f"{name} is told of: {self.told}")
+        wait_until(lambda: (name, there) in self.told, f"{name} is reported: {self.told}")
 
 
 def answers(graph: Ros1) -> bool:
@@ -42,7 +42,7 @@ def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Sta
     peer.end(signal.SIGKILL)
     watch.until("/arm", there=False)
     stand.peer("arm")
-    wait_until(lambda: watch.told.count(("/arm", True)) == 2, "it is told again")
+    wait_until(lambda: watch.told.count(("/arm", True)) == 2, "it is reported again")
     assert [there for name, there in watch.told if name == "/arm"] == [True, False, True]
     assert "/trade" not in {name for name, _ in watch.told}
 

@@ -113,7 +113,7 @@ def test_requests_are_answered_in_order_and_fail_when_the_service_is_withdrawn(g
     assert not begun.acquire(timeout=0.2)
     served.close()
     served.close()
-    wait_until(lambda: len(peer.all("failed")) == 2, "both callers were told")
+    wait_until(lambda: len(peer.all("failed")) == 2, "both callers got an error")
     go_on.set()
     wait_until(lambda: is_forgotten(graph), "the master forgot it")
 
@@ -146,7 +146,7 @@ def test_a_request_that_waited_long_for_its_turn_is_refused() -> None:
     made.came(2, ago_s=_service._LATE_S + 1)
     made.came(3)
     made.go_on.set()
-    wait_until(lambda: len(made.replies) == 3, "all were told")
+    wait_until(lambda: len(made.replies) == 3, "all got a reply")
     made.served.close()
     assert made.begun == ["/1", "/3"]
     assert made.replies[1] == made.replies[3] == ""
@@ -161,7 +161,7 @@ def test_a_request_that_stops_waits_for_no_other_and_is_refused_for_nothing() ->
     wait_until(lambda: len(made.begun) == own + 1, "each has a thread, and one of the others its turn")
     assert {int(who[1:]) for who in made.begun} == set(range(own + 1))
     made.go_on.set()
-    wait_until(lambda: len(made.replies) == own + 40, "all were told")
+    wait_until(lambda: len(made.replies) == own + 40, "all got a reply")
     made.served.close()
     assert set(made.replies.values()) == {""}
     in_order = [who for who in made.begun if int(who[1:]) >= own]

@@ -15,7 +15,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 
 
 def send_until(graph_sends: Any, heard: Any) -> None:
-    """A topic has no memory: what is sent before the other end is connected is heard by nobody."""
+    """A topic has no memory: what is sent before the other end is connected is lost."""
 
     def look() -> bool:
         if not heard():

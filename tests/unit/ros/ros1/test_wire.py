@@ -37,12 +37,12 @@ DEFINITIONS = {
 }
 GENUINE = """
 import genpy.dynamic, json, roslib.message, sys
-told = {}
+types = {}
 for name, text in json.load(sys.stdin).items():
     kind = roslib.message.get_message_class(name) or roslib.message.get_service_class(name)
     made = genpy.dynamic.generate_dynamic(name, text)[name]._md5sum if text else ""
-    told[name] = [kind._type, kind._md5sum, made]
-print(json.dumps(told))
+    types[name] = [kind._type, kind._md5sum, made]
+print(json.dumps(types))
 """
 
 

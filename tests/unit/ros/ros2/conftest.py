@@ -60,7 +60,7 @@ def start_peer() -> Iterator[Callable[[Router, str], Process]]:
 
 @pytest.fixture
 def open_graph() -> Iterator[Callable[..., Ros2]]:
-    """Opens graphs of ours at a router."""
+    """Opens graphs of TRADE at a router."""
     with closing_all() as keep:
 
         def opened(router: Router, node: str = "/trade", **settings: Any) -> Ros2:

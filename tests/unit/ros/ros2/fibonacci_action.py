@@ -73,7 +73,7 @@ def pursue(graph: Ros2, action: str, order: int, feedback: Callable[[Any], objec
 
 
 class Doing:
-    """Goals that go on until the test says so, or somebody cancels them."""
+    """Goals that run until the test ends them, or a client cancels them."""
 
     def __init__(self) -> None:
         self.goals: list[Any] = []

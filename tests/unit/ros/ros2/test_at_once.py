@@ -1,4 +1,4 @@
-"""What is told at once."""
+"""A queue that handles its items at once."""
 
 import threading
 
@@ -9,7 +9,7 @@ from trade_gateway.ros._mailbox import AtOnce
 
 
 class Hanging:
-    """Is told any number of things at a time; those that are to hang do so until the test lets them."""
+    """Takes any number of items at a time; those that should hang do so until the test lets them."""
 
     def __init__(self, *hang: str) -> None:
         self.told: list[str] = []
@@ -27,7 +27,7 @@ def test_S07_one_that_hangs_delays_no_other() -> None:
     at_once = AtOnce[str]("test", hanging, most=3, drop=lambda _: None)
     for item in ("first", "second", "third", "fourth"):
         at_once.put(item)
-        wait_until(lambda item=item: item in hanging.told, f"the {item} is told")
+        wait_until(lambda item=item: item in hanging.told, f"the {item} is handled")
     hanging.go_on.set()
     at_once.close()
 
@@ -37,10 +37,10 @@ def test_threads_are_limited_and_waiting_listeners_are_notified_later() -> None:
     at_once = AtOnce[str]("test", hanging, most=2, drop=dropped.append)
     for item in ("first", "second", "third", "fourth"):
         at_once.put(item)
-    wait_until(lambda: len(hanging.told) == 2, "as many are told as there are threads")
+    wait_until(lambda: len(hanging.told) == 2, "as many are handled as there are threads")
     assert (len(at_once._threads), list(at_once._waiting)) == (2, ["third", "fourth"])
     hanging.go_on.set()
-    wait_until(lambda: len(hanging.told) == 4, "the others are told")
+    wait_until(lambda: len(hanging.told) == 4, "the others are handled")
     wait_until(lambda: not at_once._threads, "the threads have ended")
     at_once.close()
     assert not dropped
@@ -64,7 +64,7 @@ def test_a_listener_may_close_its_own_queue() -> None:
     told: list[str] = []
     at_once = AtOnce[str]("test", lambda item: (at_once.close(), told.append(item)), most=1, drop=lambda _: None)
     at_once.put("end")
-    wait_until(lambda: told, "it is told")
+    wait_until(lambda: told, "it is handled")
 
 
 def test_a_failure_is_logged_and_the_next_event_is_delivered(caplog: pytest.LogCaptureFixture) -> None:
@@ -88,6 +88,6 @@ def test_without_a_thread_it_is_dropped(monkeypatch: pytest.MonkeyPatch, caplog:
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", refuse)
         at_once.put("in vain")
-    at_once.put("told")
-    wait_until(lambda: told, "the next is told")
-    assert (told, dropped) == (["told"], ["in vain"])
+    at_once.put("later")
+    wait_until(lambda: told, "the next is handled")
+    assert (told, dropped) == (["later"], ["in vain"])

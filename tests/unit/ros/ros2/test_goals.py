@@ -1,4 +1,4 @@
-"""Actions. No package of another hand speaks them, so each end of ours is tried with the keys and bytes that published
+"""Actions. No independent package speaks them, so each end of TRADE is tried with the keys and bytes that published
 facts give (raw zenoh), and then both with each other.
 """
 
@@ -144,10 +144,12 @@ def test_the_status_of_goals_is_published(graph: Ros2, raw: zenoh.Session) -> No
     doing, told = Doing(), []
     with raw.declare_subscriber(key("fib8", "status"), lambda it: told.append(it.payload.to_bytes())):
         graph.act("/fib8", FIBONACCI, doing)
-        wait_until(lambda: list(raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**/%fib8%_action%status/**")), "it is there")
+        wait_until(
+            lambda: list(raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**/%fib8%_action%status/**")), "it is published"
+        )
         ask(raw, "fib8", "send_goal", ID + struct.pack("<i", 1))
         doing.go_on.set()
-        wait_until(lambda: told and told[-1][32] == 4, "it is told that it has succeeded")
+        wait_until(lambda: told and told[-1][32] == 4, "its success is published")
     assert told[-1][:24] == CDR + b"\1\0\0\0" + ID
     assert {each[32] for each in told} <= {1, 2, 4}
 
@@ -159,7 +161,7 @@ def test_a_goal_is_pursued_to_its_end(graph: Ros2, other: Ros2) -> None:
     doing, feedback = Doing(), []
     graph.act("/fib", FIBONACCI, doing)
     pursuit = pursue(other, "fib", 6, feedback.append)
-    wait_until(lambda: feedback, "feedback is told")
+    wait_until(lambda: feedback, "feedback is delivered")
     doing.go_on.set()
     assert pursuit.wait(LONG_S) == Outcome(Ended.SUCCEEDED, {"sequence": [6]})
     assert doing.goals[0].client == "/client"
@@ -210,7 +212,7 @@ def test_a_server_that_is_gone_is_noticed(graph: Ros2, other: Ros2, monkeypatch:
     doing = Doing()
     graph.act("/gone", FIBONACCI, doing)
     pursuit = pursue(other, "gone", 1)
-    graph._link.close()  # as if it were killed: nothing is told any more
+    graph._link.close()  # as if it were killed: nothing is sent any more
     with pytest.raises(RosUnreachable, match="its server is gone"):
         pursuit.wait(LONG_S)
     doing.go_on.set()
@@ -218,12 +220,12 @@ def test_a_server_that_is_gone_is_noticed(graph: Ros2, other: Ros2, monkeypatch:
 
 def test_an_action_without_a_server_is_unreachable(graph: Ros2) -> None:
     with pytest.raises(RosUnreachable, match="no node serves it"):
-        graph.pursue("/nobody", FIBONACCI, {"order": 1})
+        graph.pursue("/missing", FIBONACCI, {"order": 1})
 
 
 def test_a_goal_that_does_not_fit_is_not_sent(graph: Ros2) -> None:
     with pytest.raises(ConfigurationError, match="has no speed; it has order"):
-        graph.pursue("/nobody", FIBONACCI, {"speed": 1})
+        graph.pursue("/missing", FIBONACCI, {"speed": 1})
 
 
 def test_a_service_is_no_action(graph: Ros2) -> None:

@@ -17,7 +17,7 @@ from trade_gateway.ros.ros2 import Ros2
 
 
 class RawServer:
-    """Of an action; answers as it is told to."""
+    """A server of an action; its answers are set by the test."""
 
     def __init__(self, session: zenoh.Session, action: str, accepts: bool, result: bytes | None) -> None:
         self.asked: list[tuple[str, bytes]] = []
@@ -76,10 +76,10 @@ def test_the_action_client_uses_the_ros_wire_format(graph: Ros2, raw: zenoh.Sess
 
 
 def test_the_action_client_receives_feedback(graph: Ros2, raw: zenoh.Session) -> None:
-    server = RawServer(raw, "telling", accepts=True, result=None)
+    server = RawServer(raw, "reporting", accepts=True, result=None)
     feedback: list[Any] = []
-    pursuit = pursue(graph, "telling", 3, feedback.append)
-    wait_until(lambda: feedback, "feedback is told")
+    pursuit = pursue(graph, "reporting", 3, feedback.append)
+    wait_until(lambda: feedback, "feedback is delivered")
     assert feedback == [{"sequence": [server.of("send_goal")[0][4]]}]
     with pytest.raises(RosUnreachable, match=r"has not ended within 0\.1 s"):
         pursuit.wait(0.1)
@@ -113,7 +113,7 @@ def test_S07_a_goal_that_is_canceled_without_a_router_is_canceled_when_there_is_
         wait_until(lambda: graph.healthy, "the loss is noticed")
         pursuit.cancel()
         own_router.start()
-        wait_until(lambda: server.of("cancel_goal"), "it is told to cancel it")
+        wait_until(lambda: server.of("cancel_goal"), "it gets a cancel request")
         assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
 
 
@@ -134,7 +134,7 @@ def test_S05_a_goal_whose_acceptance_is_not_heard_of_is_canceled(
     server = RawServer(raw, "deaf", accepts=True, result=None)
     server._answers["send_goal"] = None
     pursuit = pursue(graph, "deaf", 3)
-    wait_until(lambda: server.of("get_result"), "it is told to cancel it, and asked for its end")
+    wait_until(lambda: server.of("get_result"), "it gets a cancel request, and one for the result")
     assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
     assert server.of("get_result")[0] == server.of("send_goal")[0][:20]
     with pytest.raises(RosUnreachable, match=r"has not ended within 0\.1 s"):
@@ -152,9 +152,9 @@ def test_S05_a_goal_that_may_have_begun_can_be_canceled_by_who_sent_it_too(
     server = RawServer(raw, "mute", accepts=True, result=None)
     server._answers |= {"send_goal": None, "cancel_goal": b"\2" + bytes(7)}  # it does not know the goal yet
     pursuit = pursue(graph, "mute", 3)
-    wait_until(lambda: len(server.of("cancel_goal")) == 1, "it is told to cancel it")
+    wait_until(lambda: len(server.of("cancel_goal")) == 1, "it gets a cancel request")
     pursuit.cancel()
-    wait_until(lambda: len(server.of("cancel_goal")) == 2, "it is told again")
+    wait_until(lambda: len(server.of("cancel_goal")) == 2, "it gets another cancel request")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What waits to be told."""
+"""A queue that handles its items one at a time."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ from trade_gateway.ros._mailbox import Mailbox
 
 
 class Slow:
-    """Is told one thing at a time, when the test lets it."""
+    """Takes one item at a time, when the test lets it."""
 
     def __init__(self) -> None:
         self.told: list[str] = []
@@ -31,7 +31,7 @@ def test_the_oldest_goes_when_there_are_too_many() -> None:
     for item in ("old", "newer", "newest"):
         mailbox.put(item)
     slow.go_on.set()
-    wait_until(lambda: len(slow.told) == 3, "all is told")
+    wait_until(lambda: len(slow.told) == 3, "all are handled")
     mailbox.close()
     assert (slow.told, dropped) == (["first", "newer", "newest"], ["old"])
 
@@ -63,7 +63,7 @@ def test_a_listener_may_close_its_own_queue() -> None:
     told = []
     mailbox = Mailbox[str]("test", lambda item: (told.append(item), mailbox.close()))
     mailbox.put("end")
-    wait_until(lambda: told, "it is told")
+    wait_until(lambda: told, "it is handled")
     mailbox.close()
     assert told == ["end"]
 
@@ -79,6 +79,6 @@ def test_a_failure_is_logged_and_the_next_event_is_delivered(caplog: pytest.LogC
     mailbox = Mailbox[str]("its name", tell)
     mailbox.put("bad")
     mailbox.put("good")
-    wait_until(lambda: told, "the next is told")
+    wait_until(lambda: told, "the next is handled")
     mailbox.close()
     assert "its name failed" in caplog.text

@@ -1,4 +1,4 @@
-"""Who is there: nodes that come, go, die, and come again under the same name."""
+"""The present nodes: nodes that come, go, die, and come again under the same name."""
 
 import threading
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def test_a_new_watcher_is_notified_of_the_nodes_already_present(graph: Ros2, pee
     graph.watch_nodes(first)
     wait_until(lambda: first.of("/sdk"), "the node is seen")
     graph.watch_nodes(second)
-    wait_until(lambda: second.of("/sdk"), "who watches later is told, too")
+    wait_until(lambda: second.of("/sdk"), "a later watcher gets it, too")
     assert set(second.of("/sdk")) == {True}
 
 
@@ -39,9 +39,9 @@ def test_a_node_in_a_namespace_has_its_whole_name(graph: Ros2, router: Router, o
     told = Told()
     graph.watch_nodes(told)
     other = open_graph(router, node="/arm/left/driver")
-    wait_until(lambda: told.of("/arm/left/driver") == [True], "it is told there")
+    wait_until(lambda: told.of("/arm/left/driver") == [True], "it is reported present")
     other.close()
-    wait_until(lambda: told.of("/arm/left/driver") == [True, False], "it is told gone")
+    wait_until(lambda: told.of("/arm/left/driver") == [True, False], "it is reported gone")
 
 
 def test_a_killed_node_is_reported_as_gone(graph: Ros2, router: Router, start_peer: Callable[..., Process]) -> None:
@@ -49,12 +49,12 @@ def test_a_killed_node_is_reported_as_gone(graph: Ros2, router: Router, start_pe
     graph.watch_nodes(told)
     doomed = start_peer(router, "doomed")
     doomed.ask("listen", topic="/doomed")
-    wait_until(lambda: told.of("/doomed") == [True], "it is told there")
+    wait_until(lambda: told.of("/doomed") == [True], "it is reported present")
     doomed.kill()
-    wait_until(lambda: told.of("/doomed") == [True, False], "it is told gone")
+    wait_until(lambda: told.of("/doomed") == [True, False], "it is reported gone")
     again = start_peer(router, "doomed")
     again.ask("listen", topic="/doomed")
-    wait_until(lambda: told.of("/doomed") == [True, False, True], "it is told there again")
+    wait_until(lambda: told.of("/doomed") == [True, False, True], "it is reported present again")
 
 
 def test_a_name_shared_by_two_nodes_is_reported_gone_and_present_when_one_ends(
@@ -66,9 +66,9 @@ def test_a_name_shared_by_two_nodes_is_reported_gone_and_present_when_one_ends(
     open_graph(router, node="/after_them")
     wait_until(lambda: told.of("/after_them"), "who came after them is seen")
     one.close()
-    wait_until(lambda: told.of("/twin") == [True, False, True], "the death of one is told")
+    wait_until(lambda: told.of("/twin") == [True, False, True], "the death of one is reported")
     other.close()
-    wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is told")
+    wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is reported")
 
 
 def test_node_lookup_waits_for_a_liveliness_token_that_arrives_late(
@@ -143,7 +143,7 @@ def test_the_node_watch_does_not_report_its_own_node(
     told = Told()
     graph.watch_nodes(told)
     open_graph(router, node="/other")
-    wait_until(lambda: told.of("/other"), "another is told of")
+    wait_until(lambda: told.of("/other"), "another is reported")
     assert not told.of("/trade")
 
 
@@ -159,11 +159,11 @@ def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Cal
 def test_a_closed_watch_receives_no_more_notifications(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
-    ended, goes_on = Told(), Told()
+    ended, other = Told(), Told()
     watch = graph.watch_nodes(ended)
-    graph.watch_nodes(goes_on)
+    graph.watch_nodes(other)
     watch.close()
     watch.close()
     open_graph(router, node="/later")
-    wait_until(lambda: goes_on.of("/later"), "it is told of")
+    wait_until(lambda: other.of("/later"), "it is reported")
     assert not ended.of("/later")

@@ -1,4 +1,4 @@
-"""Parameters. The node asked is one of ours, which answers as the definitions of ``rcl_interfaces`` say; the hashes of
+"""Parameters. The node asked is one of TRADE, which answers as the definitions of ``rcl_interfaces`` say; the hashes of
 the services' types are judged elsewhere, by those of ROS 2 itself.
 """
 
@@ -129,8 +129,8 @@ def test_a_refusal_says_why(graph: Ros2, offering: Offering) -> None:
 
 
 def test_a_node_without_the_services_is_unreachable(graph: Ros2) -> None:
-    with pytest.raises(RosUnreachable, match="/nobody/list_parameters"):
-        graph.parameters("/nobody", LONG_S)
+    with pytest.raises(RosUnreachable, match="/missing/list_parameters"):
+        graph.parameters("/missing", LONG_S)
 
 
 def test_our_own_node_has_none_and_says_so(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:

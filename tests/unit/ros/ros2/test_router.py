@@ -54,18 +54,18 @@ def test_a_router_that_was_killed_and_started_again_finds_all_as_it_was(
     peer.ask("serve", service="/add_theirs")
     peer.hear("serving")
     until_heard(lambda: publisher.send({"data": "before"}), lambda: peer.has("heard", data="before"))
-    wait_until(lambda: nodes and nodes[-1], "the node is told there")
+    wait_until(lambda: nodes and nodes[-1], "the node is reported present")
 
     own_router.kill()
     wait_until(lambda: "no zenoh router" in graph.healthy, "our graph has noticed")
-    wait_until(lambda: not nodes[-1], "the node is told gone")
+    wait_until(lambda: not nodes[-1], "the node is reported gone")
     publisher.send({"data": "while it was gone"})
     with pytest.raises(RosUnreachable, match="no zenoh router"):
         graph.call("/add_theirs", ADD, {}, LONG_S)
 
     own_router.start()
     wait_until(lambda: not graph.healthy, "our graph has found it again")
-    wait_until(lambda: nodes[-1], "the node is told there again")
+    wait_until(lambda: nodes[-1], "the node is reported present again")
     until_heard(lambda: publisher.send({"data": "after"}), lambda: peer.has("heard", data="after"))
     until_heard(lambda: peer.ask("publish", topic="/from_them", data="after"), lambda: "after" in heard)
     peer.ask("add", service="/add_ours", a=4, b=5)
@@ -76,7 +76,7 @@ def test_a_router_that_was_killed_and_started_again_finds_all_as_it_was(
 
 def test_a_graph_that_never_finds_a_router_ends_as_well(own_router: Router, open_graph: Callable[..., Ros2]) -> None:
     graph = open_graph(own_router)
-    graph.advertise("/topic", STRING).send({"data": "to nobody"})
+    graph.advertise("/topic", STRING).send({"data": "to no node"})
     graph.close()
     graph.close()
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("ros2")]

@@ -20,7 +20,7 @@ LONG_S = 60.0
 
 
 def call(graph: Ros2, name: str, request: dict[str, Any], timeout_s: float = LONG_S, type_name: str = ADD) -> Any:
-    """Call a service that is there."""
+    """Call a service that is present."""
     until_offered(graph, name, type_name)
     return graph.call(name, type_name, request, timeout_s)
 
@@ -87,7 +87,7 @@ def test_an_exception_in_a_service_is_reported_to_the_caller(
 
 def test_a_call_to_a_service_without_a_server_fails_immediately(graph: Ros2) -> None:
     with pytest.raises(RosUnreachable, match="no node serves it"):
-        graph.call("/nobody", ADD, {}, LONG_S)
+        graph.call("/missing", ADD, {}, LONG_S)
 
 
 def test_a_service_of_another_type_is_not_that_service(graph: Ros2, peer: Process) -> None:
