@@ -69,7 +69,7 @@ class Program:
         self.process.stdin.flush()
 
     def freeze(self) -> None:
-        """Stops the program, and waits until each of its threads stands still: the signal reaches them one by one."""
+        """Stops the program, and waits until each of its threads has stopped: the signal reaches them one by one."""
         self.process.send_signal(signal.SIGSTOP)
         tasks = Path(f"/proc/{self.process.pid}/task")
         wait_until(lambda: all(" T " in (task / "stat").read_text() for task in tasks.iterdir()))
@@ -169,7 +169,7 @@ class Gate:
 
 @pytest.fixture
 def gate() -> Iterator[Gate]:
-    """Closed until the test opens it; open at its end, so that nobody stays inside."""
+    """Closed until the test opens it; open at its end, so that no thread stays inside."""
     waiting = Gate()
     yield waiting
     waiting.open.set()

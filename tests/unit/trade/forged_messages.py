@@ -19,7 +19,7 @@ from trade._protocol.messages import (
 from trade._protocol.schema import schema_message
 
 FUTURE = 99
-"""A version of the protocol that nobody speaks."""
+"""A version of the protocol that does not exist."""
 TEXT, NUMBER = schema_message({"type": "string"}, {}), schema_message({"type": "integer"}, {})
 FORGED = Address("mallory", "ghost", "e1")
 PROVIDER = ProviderInfo(

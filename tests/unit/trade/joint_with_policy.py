@@ -1,4 +1,4 @@
-"""A joint behind a policy, in a system in memory: who may do what to it is in a file that a test may write anew."""
+"""A joint behind a policy, in a system in memory: who may do what to it is in a file that a test may rewrite."""
 
 from collections.abc import Iterator
 from pathlib import Path

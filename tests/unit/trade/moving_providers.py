@@ -20,7 +20,7 @@ from trade import Resource, permit, service
 
 events = []
 before = {}
-"""What is done before a method of any object goes on, by its name."""
+"""What is done before a method of any object continues, by its name."""
 
 def now(name, *words):
     events.append(" ".join((name, *map(str, words))))

@@ -56,7 +56,7 @@ def test_closed_grace_periods_report_no_absence(told: "queue.SimpleQueue[str]") 
 
 
 def test_a_return_during_the_absence_report_is_handled_after_the_report() -> None:
-    """What is told of him last is that he is there; else he would be forgotten while he lives."""
+    """The last report says that the container is present; else it would be forgotten while it lives."""
     telling, told = threading.Event(), threading.Event()
     order: list[str] = []
 

@@ -83,11 +83,11 @@ def test_S09_containers_that_may_offer_nothing_keep_no_estop_from_being_complete
     """One sign of life, of an identity without a role, had every e-stop and each clearing end as incomplete."""
     chief, driver = member("chief"), memory.container("of-drv", identity="drv")
     raw = MemoryTransport(memory.network, "raw")
-    _signs = [raw.appear(alive_key(Address("nobody", f"x{number}", "e"))) for number in range(3 * 64)]
+    _signs = [raw.appear(alive_key(Address("stranger", f"x{number}", "e"))) for number in range(3 * 64)]
     assert eventually(lambda: len(chief.addresses()) > 60)
     report = chief.estop(limit_s=30)
     assert report.complete, report
-    assert set(report.apart) < {f"nobody/x{number}" for number in range(3 * 64)}
+    assert set(report.apart) < {f"stranger/x{number}" for number in range(3 * 64)}
     assert len(report.apart) == 64
     assert len(driver.addresses()) < 2 * 64
     assert chief.estop_clear([report.id], limit_s=30).complete
@@ -111,7 +111,7 @@ def test_without_a_policy_a_service_asks_for_no_role(memory: MemorySystem) -> No
 
 
 def test_S07_a_stop_needs_no_role_but_one_must_not_be_revoked(member: Member, neck: Neck) -> None:
-    find(member("nobody"), "stop")()
+    find(member("stranger"), "stop")()
     assert neck.stops == 1
     with pytest.raises(AccessDenied, match="thief is revoked"):
         find(member("thief"), "stop")()
@@ -154,10 +154,10 @@ def test_locking_needs_the_right_over_the_group(member: Member, neck: Neck) -> N
 
 def test_a_lookup_without_read_permission_names_the_missing_permission(policy: Path) -> None:
     access = Authorizer(policy, certified=True)
-    hidden = access.hidden("nobody", "rosie.neck")
-    assert hidden.startswith("nobody may not read rosie.neck: ")
+    hidden = access.hidden("stranger", "rosie.neck")
+    assert hidden.startswith("stranger may not read rosie.neck: ")
     assert access.hidden("planner", "rosie.neck") == ""
-    assert Authorizer(policy).hidden("nobody", "rosie.neck") == ""  # without certificates it is told all the same
+    assert Authorizer(policy).hidden("stranger", "rosie.neck") == ""  # without certificates nothing is hidden
     assert hidden in str(no_such_service(where(group="rosie.neck"), [], 0.1, hidden=hidden))
 
 
@@ -206,7 +206,7 @@ def test_every_function_of_the_middleware_is_in_the_table_of_what_they_need() ->
 
 @pytest.fixture
 def careless(memory: MemorySystem, neck: Neck) -> Container:
-    """A container of ``dash`` that has no policy, and so asks nobody before it calls."""
+    """A container of ``dash`` that has no policy, and so checks no rule before it calls."""
     container = memory.container("careless", identity="dash")
     memory.settle()
     return container

@@ -1,4 +1,4 @@
-"""A live provider changes groups, metadata, health, services; handles hold and everybody learns the newest."""
+"""A live provider changes groups, metadata, health, services; handles hold and all containers learn the newest."""
 
 import queue
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Arguments are validated before any code of the provider runs; here and there are told apart by nothing."""
+"""Arguments are validated before any code of the provider runs; local and remote calls do not differ."""
 
 import datetime as dt
 import decimal

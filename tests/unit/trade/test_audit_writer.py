@@ -302,7 +302,7 @@ def test_a_clock_that_is_set_is_written_down(write: Write, path: Path, eventuall
     times = [10**18, 0]
     writer = write(clocks=lambda: (times[0], times[1]))
     assert eventually(lambda: writer.written == 1)
-    times[:] = [10**18 + 5 * 10**9, 5 * 10**9]  # both went on
+    times[:] = [10**18 + 5 * 10**9, 5 * 10**9]  # both advanced
     writer.tell(event("before"))
     assert eventually(lambda: writer.written == 2)
     times[0] -= 3600 * 10**9

@@ -109,7 +109,7 @@ def test_cancelling_reaches_what_a_service_waits_for(here: Container, outer: Out
     run.result(20)
     assert leaf.stopped.is_set()
     came, looked, refused = outer.outcomes
-    assert (came, looked, leaf.begun) == (None, 1, 1)  # reading goes on, and nothing is commanded any more
+    assert (came, looked, leaf.begun) == (None, 1, 1)  # reading continues, and nothing is commanded any more
     assert isinstance(refused, Cancelled)
 
 

@@ -1,4 +1,4 @@
-"""What a call may cost, counted instead of timed: messages, lookups, things built anew, allocations."""
+"""What a call may cost, counted instead of timed: messages, lookups, things built again, allocations."""
 
 import contextlib
 import gc
@@ -239,7 +239,7 @@ def test_the_registry_is_not_asked_by_later_calls(
     asked = counted(monkeypatch, Registry, "get", "select", "wait_for", "is_alive", "containers", "removed")
     handle, call = offer(Arm())(name), CALL[name]
     call(handle)
-    assert asked  # to find it, and to see that it is there
+    assert asked  # to find it, and to see that it exists
     asked.clear()
     for _ in range(CALLS):
         call(handle)

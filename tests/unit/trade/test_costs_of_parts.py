@@ -190,7 +190,7 @@ with memory_system() as system:
 def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
     if shutil.which("strace") is None:
         pytest.fail("there is no strace") if os.environ.get("CI") == "true" else pytest.skip("there is no strace")
-    told = tmp_path / "told"
+    told = tmp_path / "trace"
     command = ["strace", "-o", str(told), sys.executable, "-c", LOCAL_CALLS]  # of its main thread only
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     if "ptrace" in done.stderr:
@@ -335,7 +335,7 @@ def test_find_takes_the_same_steps_among_ten_services_and_among_two_thousand(her
 
 
 MOST_BYTES_OF_A_JOIN = 64 * 1024
-"""For each container that is there: what either tells the other of the middleware's own functions."""
+"""For each present container: what both announce to each other of the middleware's own functions."""
 MOST_BYTES_OF_A_BEAT = 256
 MOST_BYTES_OF_A_LEAVE = 256
 
@@ -385,7 +385,7 @@ def test_an_audit_record_sends_nothing_and_is_written_many_rows_at_a_time(
     add = AuditStore.add
 
     def slowly(store: AuditStore, rows: Sequence[AuditRow]) -> object:
-        """The disk is as slow as it can be: whoever calls waits for none of it."""
+        """The disk is as slow as it can be: no caller waits for it."""
         assert go_on.wait(60)
         wrote.append(len(rows))
         return add(store, rows)

@@ -118,7 +118,7 @@ def test_S09_every_driver_stops_latches_and_confirms(system: MemorySystem) -> No
 
 
 def test_S09_estops_are_services_of_every_container(system: MemorySystem) -> None:
-    """So that whoever only speaks the wire, or is no program of ours, can give one."""
+    """So that a program that only speaks the wire protocol can give one."""
     [axis] = drivers(system, "one")
     caller = system.container("caller")
 
@@ -237,7 +237,7 @@ def test_S09_a_driver_restarted_while_one_is_open_stays_latched(tmp_path: Path) 
     with memory_system(state_dir=tmp_path) as system:
         drivers(system, "one")
         report = system.container("one").estop("spill", limit_s=GENEROUS_S)
-    with memory_system(state_dir=tmp_path) as system:  # everybody was gone
+    with memory_system(state_dir=tmp_path) as system:  # all containers were gone
         drivers(system, "one")
         with pytest.raises(Stopped, match="spill"):
             call(system.container("one"), "move_to", "one", 0.1)
@@ -345,7 +345,7 @@ def test_S09_two_at_once_are_cleared_one_by_one(system: MemorySystem) -> None:
 
 
 def ordered(system: MemorySystem, identity: str, number: int) -> list[str]:
-    """Orders to stop, of an identity that is nobody's container; their ids."""
+    """Orders to stop, of an identity without a container; their ids."""
     puts = MemoryTransport(system.network, f"raw-{identity}").publish(f"estop/{identity}")
     ids = [f"{identity}-{count}" for count in range(number)]
     for name in ids:
@@ -388,15 +388,15 @@ def test_S09_one_identity_holds_a_bounded_number_and_each_of_its_orders_stops_an
         more = threading.active_count() - threads
         assert eventually(lambda: confirmed >= set(ids))
         assert more < 12
-        kept = [*ids[: MOST_OF_ONE - 1], ids[-1]]  # the first ones, and the one that nobody can have looked at
+        kept = [*ids[: MOST_OF_ONE - 1], ids[-1]]  # the first ones, and the one that no reader can have seen
         assert {estop.id for estop in one.estops()} == set(kept)
         assert eventually(lambda: sorted(path.stem for path in tmp_path.rglob("*.json")) == sorted(kept))
         stopped = axis.stopped
-        report = caller.estop("of somebody else", limit_s=GENEROUS_S)
+        report = caller.estop("of another client", limit_s=GENEROUS_S)
         assert report.complete
         assert axis.stopped >= stopped
         assert caller.estop_clear(kept, limit_s=GENEROUS_S).complete
-        with pytest.raises(Stopped, match="of somebody else"):
+        with pytest.raises(Stopped, match="of another client"):
             call(caller, "move_to", "one", 0.1)
         assert caller.estop_clear([report.id], limit_s=GENEROUS_S).complete
         assert call(caller, "move_to", "one", 0.1) == 0.1
@@ -429,7 +429,7 @@ def test_S09_a_second_e_stop_while_the_first_one_is_open_calls_the_stops_again(s
     ids.append(caller.estop(limit_s=GENEROUS_S).id)
     assert axis.stopped == 2
     assert caller.estop_clear(ids, limit_s=GENEROUS_S).complete
-    assert caller.estop(limit_s=GENEROUS_S).complete  # at once, and what had no latch in between is stopped anew
+    assert caller.estop(limit_s=GENEROUS_S).complete  # at once, and what had no latch in between is stopped again
     assert axis.stopped == 3
 
 

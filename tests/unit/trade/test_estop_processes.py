@@ -1,4 +1,4 @@
-"""S09 on real processes: frozen ones are missing, stop when they wake, and keep nobody waiting."""
+"""S09 on real processes: frozen ones are missing, stop when they wake, and keep no caller waiting."""
 
 import threading
 import time

@@ -150,7 +150,7 @@ def test_an_error_that_cannot_be_sent_whole_still_arrives(
 ) -> None:
     back = raised(here, there, error)
     assert (type(back), back.args) == arrives
-    assert here.find(where(name="clock", container="there"))() > 0  # and whoever ran it goes on
+    assert here.find(where(name="clock", container="there"))() > 0  # and the thread that ran it continues
 
 
 def test_a_service_that_raises_system_exit_does_not_use_up_threads(here: Container, there: Container) -> None:

@@ -351,7 +351,7 @@ def test_a_copy_of_a_handle_is_the_handle(here: Container) -> None:
 def test_a_failing_done_callback_does_not_block_the_other_callbacks(
     here: Container, caplog: pytest.LogCaptureFixture
 ) -> None:
-    [add] = [handle for handle in here.register(Counter(), "told") if handle.name == "add"]
+    [add] = [handle for handle in here.register(Counter(), "counted") if handle.name == "add"]
     run = add.start(5)
     assert run.result(20) == 5
     told: list[int] = []

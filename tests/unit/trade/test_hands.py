@@ -103,7 +103,7 @@ def test_who_waits_too_long_ends_and_others_come(
 
 
 def test_work_that_comes_as_one_gives_up_waiting_is_done(monkeypatch: pytest.MonkeyPatch, hands: ThreadPool) -> None:
-    """It has been taken from those that wait, and is not told yet, when its patience ends."""
+    """It has been taken from those that wait, and has no work yet, when its patience ends."""
     monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.001)
     for _ in range(300):
         done_by(hands)

@@ -83,7 +83,7 @@ def watch(here: Container, observer: Observer) -> Callable[[str], Handle]:
     return lambda name: here.find(where(name=name, group="eye"))
 
 
-# --- what a hook is told
+# --- what a hook receives
 
 
 def test_a_before_hook_receives_the_service_and_its_arguments(

@@ -107,7 +107,7 @@ LOOKED_AT = [
     (where(uses="r3"), 200),
     (where(name="s1") | where(name="s2"), 200),
     (where(name="s1") & ~where(group="r3"), 100),
-    (where(name="nobody"), 0),
+    (where(name="missing"), 0),
     (where(group="r7") & ~where.local, 200),
     (where(name="s*"), 10_000),
     (~where(name="s1"), 10_000),

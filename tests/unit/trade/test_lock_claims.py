@@ -123,7 +123,7 @@ def test_S13_what_a_lock_selects_and_does_not_hold_is_not_commanded_under_it(rob
             command(lock, handle)
         assert joint.written == []
         assert command(lock, robot.find("a")) == 0.9  # what it holds
-        assert robot.find("c", "where_is_it")() == 0.0  # reading and stopping are everybody's
+        assert robot.find("c", "where_is_it")() == 0.0  # every client may read and stop
         robot.find("c", "stop")()
         with robot.me.lock([handle]):
             assert handle(0.4) == 0.4  # another one around holds it

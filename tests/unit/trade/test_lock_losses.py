@@ -161,7 +161,8 @@ def test_S14_a_device_that_could_not_be_stopped_cannot_be_locked_until_resume(ro
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
     with pytest.raises(NotStopped, match=r"could not be stopped at .* so no client can lock it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
-    assert [(info.resources, info.holder.owner) for info in robot.other.locks()] == [(("a",), "nobody")]
+    [info] = robot.other.locks()
+    assert (info.resources, info.holder.owner) == (("a",), "nobody")  # plain: nobody
     robot["a"].resource.moving = False
     assert robot.other.resume(WHOLE) == ["a"]
     with robot.other.lock(WHOLE, wait_s=20):
@@ -183,7 +184,7 @@ def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot
 
 def test_resuming_waits_for_what_it_names_and_says_what_looks_like_it(robot: Robot) -> None:
     late = Joint("late")
-    late.resource.latch = Latch("somebody", "stopped")
+    late.resource.latch = Latch("another", "stopped")
     timer = threading.Timer(0.1, lambda: robot.system.container("late").register(late, "hall.late"))
     timer.start()
     assert robot.me.resume(where(group="hall"), wait_s=20) == ["late"]
@@ -207,7 +208,7 @@ def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: R
     assert robot["a"].written == []
 
 
-# --- what its owner is told
+# --- notifications of its owner
 
 
 def test_each_refusal_is_an_error_of_its_own(robot: Robot) -> None:

@@ -375,7 +375,7 @@ def walker(robot: Robot) -> Callable[[str], Handle]:
 def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
-    """By default a lock waits as long as a call lasts: who has it, and what for, is told all the same."""
+    """By default a lock waits as long as a call lasts: its owner and purpose are reported all the same."""
     refused = pytest.raises(LockedByOther, match="is locked by tester/other for 'dance'")
     with robot.other.lock(WHOLE, purpose="dance"), refused:
         walker("walk")()

@@ -31,7 +31,7 @@ def test_who_waits_is_served_in_order_of_arrival(table: Table) -> None:
     waiting = [table.ask(names, f"s{index}") for index, names in enumerate(["a", "ab", "b", "a"])]
     table.table.release(token.number, "tester")
     first = waiting[0].result(60).token
-    assert [asking.done() for asking in waiting[1:]] == [False] * 3  # b is free, but the second one stands before it
+    assert [asking.done() for asking in waiting[1:]] == [False] * 3  # b is free, but the second one comes before it
     assert first is not None
     table.table.release(first.number, "tester")
     second = waiting[1].result(60).token
@@ -97,7 +97,7 @@ def test_since_is_the_time_of_the_grant_not_of_the_question(table: Table, monkey
 
 @pytest.mark.parametrize("use", ["renew", "call", "gate"])
 def test_S12_what_outlived_its_lease_is_over_even_before_anybody_looked(table: Table, use: str) -> None:
-    """A provider that was frozen wakes: whoever is first must not find a lock that holds."""
+    """A provider that was frozen wakes: the first access must not find a lock that holds."""
     token = table.take("a", lease_s=2.0)
     permitted = table.call("a", [token])
     table.now = 2.0
@@ -198,7 +198,7 @@ def test_S14_a_client_waiting_for_an_unstoppable_device_is_refused_at_once_until
 
 def test_S14_who_waits_for_rest_does_not_get_what_could_not_be_stopped_meanwhile(table: Table) -> None:
     resource = table.resources["a"]
-    resource.moving = True  # for somebody without a lock, who is gone then
+    resource.moving = True  # for a client without a lock, which is gone then
     asking = table.ask("a", "other")
     wait_until(lambda: resource.pending is not None, "it is being emptied")
     resource.stop_ended("no answer")
@@ -237,7 +237,7 @@ def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_an
     with pytest.raises(NotStopped, match="Check it, then run `trade resume a`"):
         table.acquire("a")
     [info] = table.table.withheld()
-    assert (info.resources, info.holder.owner) == (("a",), "nobody")
+    assert (info.resources, info.holder.owner) == (("a",), "nobody")  # plain: nobody
     assert "no answer" in info.holder.purpose
     table.call("a").close()  # calls without a lock are not refused
     resource.resume()
@@ -299,12 +299,12 @@ def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(tab
     asking = table.ask("a", "asking", calls=[1])
     with pytest.raises(LockedByOther):
         table.call("a", call_id=3)
-    other.gate()  # what was admitted goes on
+    other.gate()  # what was admitted continues
     assert not asking.done()
     other.close()
     asking.result(60)
     with pytest.raises(LockedByOther):
-        own.gate()  # its call goes on, but without the lock
+        own.gate()  # its call continues, but without the lock
 
 
 def test_S13_a_motion_that_a_call_left_running_is_waited_for(table: Table) -> None:

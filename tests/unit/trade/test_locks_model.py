@@ -24,7 +24,7 @@ class Model(RuleBasedStateMachine):
         self.real = Table()
         self.numbers = itertools.count(1)
         self.free_from: dict[str, str] = dict.fromkeys(NAMES, "")
-        """Resource -> why nobody gets it: who has it, who empties it, or ``!`` for one that stops."""
+        """Resource -> why no client gets it: its owner, who empties it, or ``!`` for one that stops."""
         self.unsafe: set[str] = set()
         self.moving: set[str] = set()
         self.queue: list[tuple[tuple[int, int], str, frozenset[str]]] = []
@@ -164,7 +164,7 @@ class Model(RuleBasedStateMachine):
     def stop_ends(self, problem: str) -> None:
         resource, done = self.real.stopping.pop(0)
         self.moving.discard(resource.name)
-        if problem:  # it is said before it rests: whoever waits for that would have it otherwise, or not, as it happens
+        if problem:  # it is said before it rests: else it is a matter of timing whether a waiting client gets it
             self.unsafe.add(resource.name)
             done(resource, problem)
         resource.moving = False

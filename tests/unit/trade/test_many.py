@@ -99,7 +99,7 @@ def test_hundreds_are_called_and_nothing_at_all_is_fine(here: Container) -> None
     get = here.register(Lamp(4), "hall")[1]
     assert get.name == "get_level"
     assert [outcome.result for outcome in here.call_all([get] * 600)] == [4] * 600
-    assert here.call_all(where(name="nobody")) == here.call_all([]) == []
+    assert here.call_all(where(name="missing")) == here.call_all([]) == []
 
 
 def test_a_sequence_stops_at_the_first_error(here: Container, offer: Callable[..., Any]) -> None:

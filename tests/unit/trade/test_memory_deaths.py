@@ -1,4 +1,4 @@
-"""A whole system in one process: whoever dies at whatever message, nobody hangs; after a storm all know the same."""
+"""A whole system in one process: a death at any message lets no other hang; after a storm all know the same."""
 
 import concurrent.futures
 import random
@@ -147,7 +147,7 @@ def test_a_fault_of_a_container_that_was_never_started_is_an_error() -> None:
 
 
 class Storm:
-    """Containers that register, deregister, die and return while links break and mend, all drawn from one seed."""
+    """Containers that register, deregister, die and return while links break and return, all drawn from one seed."""
 
     def __init__(self, system: MemorySystem, seed: int, *, faults: bool) -> None:
         self._system = system

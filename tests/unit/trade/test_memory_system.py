@@ -1,4 +1,4 @@
-"""A whole system in one process: it converges whatever the network does, and nobody hangs whoever dies."""
+"""A whole system in one process: it converges whatever the network does, and a death lets no other hang."""
 
 import contextlib
 import random
@@ -229,7 +229,7 @@ def test_a_call_over_a_link_that_lets_one_way_pass_ends_with_the_lease(
         system.partition(speaker, deaf, one_way=True)
         run = handle.start(0.1)
         if deaf == "caller":
-            assert eventually(lambda: lamp.values == [0.0, 0.1])  # it was done; nobody will know
+            assert eventually(lambda: lamp.values == [0.0, 0.1])  # it was done; no caller will know
         system.advance(2)
         assert isinstance(run.exception(20), ContainerLost)
         assert labels(caller) == []
@@ -315,7 +315,7 @@ def test_what_is_lost_with_a_whole_storm_is_one_question() -> None:
 
 @contextlib.contextmanager
 def held(container: Container) -> Iterator[None]:
-    """While this lasts a container asks nobody: whatever it misses comes together."""
+    """While this lasts a container sends no query: whatever it misses comes together."""
     asker, unlocked = container._parts.watch._asker, threading.Event()
     asker._beat, asker._next_beat = lambda: unlocked.wait(20), 0.0
     with asker._changed:

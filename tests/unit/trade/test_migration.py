@@ -1,4 +1,4 @@
-"""A provider goes on in another container, with its state, and is never alive twice."""
+"""A provider continues in another container, with its state, and is never alive twice."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""What does not migrate goes on where it is, with what it had, and leaves nothing where it was to go."""
+"""A provider that does not migrate continues where it is, with its state, and leaves nothing at the target."""
 
 import threading
 import time

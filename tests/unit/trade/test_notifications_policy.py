@@ -76,7 +76,7 @@ def only(keeper: Container) -> NotificationInfo:
     return info
 
 
-@pytest.mark.parametrize("careless", [False, True], ids=["asks its policy", "asks nobody"])
+@pytest.mark.parametrize("careless", [False, True], ids=["asks its policy", "asks no policy"])
 def test_who_may_not_instrument_gets_no_notification_elsewhere(
     keeper: Container, policy: Path, base: Base, start_program: Any, careless: bool
 ) -> None:

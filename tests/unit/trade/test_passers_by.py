@@ -81,7 +81,7 @@ def test_of_a_session_of_the_transport_that_says_nothing_nothing_is_kept(
 
 
 def growth(staying: Any, pass_by: Callable[[], None]) -> list[float]:
-    """By how many bytes who stays grows with each that passes by, in each batch after the first one."""
+    """By how many bytes a running container grows with each short-lived one, in each batch after the first one."""
 
     def in_use_after(count: int) -> int:
         for _ in range(count):

@@ -56,7 +56,7 @@ DECISIONS = [
     ("drv-1", "register", "rosie.arm", True),
     ("drv-1", "call", "rosie.arm", False),
     ("drv", "register", "rosie.arm", False),
-    ("nobody", "read", "rosie", False),
+    ("stranger", "read", "rosie", False),
     ("mallory", "read", "rosie", False),
 ]
 
@@ -71,12 +71,12 @@ def test_a_decision_names_the_rule(policy: Policy) -> None:
     assert policy.decide("planner", "read", "x").rule == "role viewer: read *"
     assert policy.decide("planner", "call", "x").rule == "no rule of role operator allows call in x"
     assert policy.decide("drv-1", "call", "x").rule == "no rule of roles driver, viewer allows call in x"
-    assert policy.decide("nobody", "read", "x").rule == "no rule gives nobody a role"
+    assert policy.decide("stranger", "read", "x").rule == "no rule gives stranger a role"
     assert policy.decide("mallory", "read", "x").rule == "mallory is revoked"
 
 
 def test_rights_of_everyone_do_not_include_revoked_identities(policy: Policy) -> None:
-    assert policy.authenticated("nobody").allowed
+    assert policy.authenticated("stranger").allowed
     assert not policy.authenticated("mallory").allowed
 
 

@@ -31,7 +31,7 @@ def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
     (tmp_path / "revoked.toml").write_text('revoked = ["thief"]')
     rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
     wait_until(lambda: "nothing is different" in caplog.text, "the list is named now")
-    move = find(memory.container("asking", identity="planner"), "move")  # it has no policy, and asks nobody
+    move = find(memory.container("asking", identity="planner"), "move")  # it has no policy, and checks no rule
     assert move(0.1) == 0.1
     (tmp_path / "revoked.toml").write_text('revoked = ["thief", "planner"]')
     wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
@@ -50,7 +50,7 @@ def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
 def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
     watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever copies it as another user and gives the right to read it afterwards changes nothing else of it."""
+    """A copy by another user with a later right to read changes nothing else of the file."""
     monkeypatch.setattr("trade._container.policy_reload._AGAIN_NS", 10**15)
     listed, may = tmp_path / "revoked.toml", Path.read_text
     listed.write_text("revoked = []")

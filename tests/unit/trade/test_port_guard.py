@@ -1,4 +1,4 @@
-"""While too many strangers are at the port of a transport, the kernel lets nobody else in."""
+"""While too many strangers are at the port of a transport, the kernel lets no other connection in."""
 
 import logging
 import socket

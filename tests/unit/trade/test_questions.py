@@ -24,7 +24,7 @@ class Head:
 
 
 class News:
-    """What has happened since somebody asked before."""
+    """What has happened since the last question."""
 
     def __init__(self) -> None:
         self.told: queue.SimpleQueue[str] = queue.SimpleQueue()

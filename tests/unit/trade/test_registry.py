@@ -1,4 +1,4 @@
-"""The registry: announcements, answers and signs of life in any order, each change told once and in order."""
+"""The registry: announcements, answers and signs of life in any order, each change reported once and in order."""
 
 import threading
 
@@ -46,7 +46,7 @@ def told(registry: Registry) -> Told:
 
 
 def answer(registry: Registry, revision: int, **offered: ProviderInfo) -> None:
-    """The other container tells all that it offered at a revision."""
+    """The other container reports all that it offered at a revision."""
     [state] = [state for state in registry.containers() if state.address == OTHER]
     registry.settle(state, revision, {name: ("rosie", entry) for name, entry in offered.items()})
 

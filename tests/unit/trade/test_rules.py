@@ -114,12 +114,12 @@ def test_a_condition_compares_a_field_of_an_answer(desk: Desk, engine: Engine) -
     ("condition", "said"),
     [
         ('{ name = "note" }', "does not only read, so it is no condition"),
-        ('{ name = "nobody" }', "NoSuchService"),
+        ('{ name = "missing" }', "NoSuchService"),
         ('{ name = "strain" }', "needs above, below or is: it answers {'cpu': 0.1}"),
         ('{ name = "strain" }, field = "memory", above = 1', "the answer has none"),
         ('{ name = "is_wanted" }, above = 1', "which is no number"),
     ],
-    ids=["actuates", "nobody", "no comparison", "no such field", "no number"],
+    ids=["actuates", "missing", "no comparison", "no such field", "no number"],
 )
 def test_a_condition_that_cannot_be_evaluated_does_not_hold_and_is_reported_once(
     desk: Desk, engine: Engine, condition: str, said: str, caplog: pytest.LogCaptureFixture
@@ -175,7 +175,7 @@ def test_the_service_that_changed_is_called_itself(there: Container, engine: Eng
     assert oven.switched.wait(20)
 
 
-# --- telling
+# --- reports
 
 
 def test_every_firing_is_audited_in_a_file_and_as_a_service(there: Container, desk: Desk, engine: Engine) -> None:
@@ -212,7 +212,7 @@ def test_a_dry_run_says_on_each_occasion_what_it_would_call_and_calls_nothing(
         [rule.r]
         when = { joined = { name = "switch" } }
         do = [
-          { call = { name = "nobody" } },
+          { call = { name = "missing" } },
           { call = { name = "tell" }, args = ["$service"] },
           { wait_for = { name = "switch" } },
         ]

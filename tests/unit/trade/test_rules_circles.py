@@ -23,7 +23,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Toggle:
-    """Offers a lamp and withdraws it again, as it is told."""
+    """Offers a lamp and withdraws it again, on request."""
 
     def __init__(self, container: Container) -> None:
         self._container = container

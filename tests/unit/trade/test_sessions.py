@@ -1,4 +1,4 @@
-"""Clients within a container (S03): each moves for himself, and takes nobody else down with him."""
+"""Clients within a container (S03): each moves for itself, and takes no other down with it."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -188,7 +188,7 @@ def test_what_cannot_be_stopped_is_not_withdrawn_from_elsewhere(robot: Robot) ->
     with pytest.raises(Exception, match="stop failed"):
         _system_of(robot.me, home, "deregister")(robot.find("a", "go_on"))
     assert robot.me.services(where(group="robot.a"))
-    home.deregister(joint)  # whoever registered it has the last word
+    home.deregister(joint)  # its registering container has the last word
     robot.system.settle()
     assert not robot.me.services(where(group="robot.a"))
 

@@ -34,7 +34,7 @@ class Point(Struct):
 
 
 class Odd(Exception):
-    """An error that nobody else would know."""
+    """An error that no other program would know."""
 
 
 class Brain:
@@ -204,7 +204,7 @@ def test_services_that_come_and_go_at_home_come_and_go_in_the_other_system(two: 
     two.robot.register(legs, "rosie.legs")
     move = two.anna.find(where(name="move", group="rosie.legs"), wait_s=20)
     two.robot.set_health(legs, "hot")
-    wait_until(lambda: move.health == "hot", "its health is told")
+    wait_until(lambda: move.health == "hot", "its health is announced")
     assert move(0.1) == 0.1
     two.robot.deregister(legs)
     wait_until(lambda: not move.alive, "it is withdrawn")
@@ -222,8 +222,8 @@ def test_another_list_withdraws_what_it_has_not_and_disturbs_nothing_else(two: T
         assert two.brain.entered.wait(20)
         two.find("go_on", two.bob)(1.0)
         two.border.share(exported=["rosie.mind", "cellar"], imported=[])
-        assert two.joint.stopped.wait(20)  # nobody abroad could stop it any more
-        wait_until(lambda: not move.alive, "its end is told")
+        assert two.joint.stopped.wait(20)  # no client in the other system could stop it any more
+        wait_until(lambda: not move.alive, "its end is announced")
         assert middle.alive
         cellar = two.anna.find(where(name="move", group="cellar"), wait_s=20)
         assert cellar(0.3) == 0.3
@@ -253,13 +253,13 @@ def test_S03_what_a_foreign_client_moves_stops_with_him_alone(two: Two) -> None:
 def test_S03_a_client_that_was_gone_when_his_call_came_moves_nothing(two: Two) -> None:
     go = two.find("go_on")
     page = two.anna.open_session("page")
-    two.clinic.settle()  # its sign of life was seen: one that comes later would say that it is there
+    two.clinic.settle()  # its sign of life was seen: one that comes later would say that it is present
     two.theirs._parts.session_ended(page.name)
     with page.use(), pytest.raises(SessionEnded):
         go(1.0)
     two.find("who")
     with page.use(), pytest.raises(SessionEnded):
-        two.find("middle")(Point(0, 0), Point(2, 4))  # what reads opens no session for nobody either
+        two.find("middle")(Point(0, 0), Point(2, 4))  # a reading call opens no session for an unknown client either
     assert not two.joint.resource.moving
 
 
@@ -350,7 +350,7 @@ def test_a_client_waiting_in_another_system_gets_the_lock_when_it_is_released_at
     lock.release()
 
 
-@pytest.mark.parametrize("how", ["broken at home", "broken abroad", "owner dies", "border dies"])
+@pytest.mark.parametrize("how", ["broken at home", "broken there", "owner dies", "border dies"])
 def test_a_lock_that_is_lost_on_one_side_is_lost_on_both_and_what_it_moves_stops(two: Two, how: str) -> None:
     lost = threading.Event()
     lock = two.anna.lock(where(group="rosie.head"), on_lost=lambda _: lost.set()).acquire()
@@ -358,7 +358,7 @@ def test_a_lock_that_is_lost_on_one_side_is_lost_on_both_and_what_it_moves_stops
         two.find("go_on")(1.0)
     if how == "broken at home":
         two.planner.break_lock(where(group="rosie.head"), "mine")
-    elif how == "broken abroad":
+    elif how == "broken there":
         two.bob.break_lock(where(group="rosie.head"), "mine")
     elif how == "owner dies":
         two.clinic.kill(two.anna)

@@ -45,7 +45,7 @@ class Planner:
 
 @pytest.fixture
 def only(here: Container, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Only]:
-    """Runs one of the rules, as it stands in the file but for how long it waits."""
+    """Runs one of the rules, as in the file but for how long it waits."""
     monkeypatch.setattr(rules_module, "LOOK_S", 0.02)
     begun: list[Rules] = []
 

@@ -1,4 +1,4 @@
-"""What everybody can read about a service before calling it."""
+"""What any client can read about a service before calling it."""
 
 import datetime as dt
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Robot:
     def move(self, joint: str, angle_rad: Annotated[float, Meta(ge=-1, le=1)], *, speed: float = 0.5) -> bool:
         """Move a joint.
 
-        Blocks until it is there.
+        Blocks until it arrives.
         """
         return True
 
@@ -86,7 +86,7 @@ def test_the_signature_reads_like_python(robot: dict[str, Handle], name: str) ->
 
 
 def test_the_docstring_is_shown(robot: dict[str, Handle]) -> None:
-    assert robot["move"].doc == "Move a joint.\n\nBlocks until it is there."
+    assert robot["move"].doc == "Move a joint.\n\nBlocks until it arrives."
 
 
 def test_arguments_and_result_are_described_as_json_schema(robot: dict[str, Handle]) -> None:

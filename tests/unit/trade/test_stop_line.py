@@ -57,7 +57,7 @@ def driver(start_container: StartContainer, lamp: Lamp) -> Container:
 
 
 def lines(container: Container) -> StopLines:
-    """Those that somebody of the same system has who has no link to it."""
+    """Those of a client of the same system that has no link to it."""
     return StopLines(Settings.read(system=container.settings.system, container="panel", identity="anna"))
 
 

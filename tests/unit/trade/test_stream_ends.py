@@ -84,7 +84,7 @@ def test_after_a_partition_the_samples_are_back_by_themselves(memory: MemorySyst
         asked = apart.battery.asked
         with pytest.raises(TimeoutError):
             stream.next(0.1)
-        assert apart.battery.asked <= asked + 1  # nobody listens any more, as far as the source can tell
+        assert apart.battery.asked <= asked + 1  # no client listens any more, as far as the source can tell
         memory.heal()
         memory.settle()
         assert stream.next(PATIENCE_S).value == 100

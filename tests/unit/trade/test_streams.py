@@ -1,4 +1,4 @@
-"""``trade.stream``: services sampled while somebody listens, once for all who do."""
+"""``trade.stream``: services sampled while a client listens, once for all listeners."""
 
 import itertools
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ def test_a_service_without_listeners_is_not_polled(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ) as stream:
         some(stream, 2)
     with two.here.stream(where(name="count", group="lab"), hz=FAST_HZ, keep=1000) as clock:
-        some(clock, 3)  # it was told by now that the first one has ended
+        some(clock, 3)  # by now it knows that the first one has ended
         asked = two.battery.asked
         some(clock, 20)
     assert two.battery.asked == asked
@@ -93,7 +93,7 @@ def test_after_a_pause_no_more_are_put_than_before() -> None:
 
 
 def alone(source: Handle) -> Stream:
-    """A stream that hears what the test tells it."""
+    """A stream that receives what the test sends."""
     return Stream(
         *("s", source, 100.0, lambda _: 0), on_change=False, if_=None, keep=9, opened_by=None, ended=lambda _: None
     )

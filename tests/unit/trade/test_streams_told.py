@@ -1,4 +1,4 @@
-"""What the log is told of a service that fails while it is listened to."""
+"""What the log has of a service that fails while it is listened to."""
 
 import itertools
 import logging

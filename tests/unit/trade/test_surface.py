@@ -1,4 +1,4 @@
-"""The public surface: what ``trade`` exports is there, documented, and asks nothing special of the system."""
+"""The public surface: what ``trade`` exports exists, is documented, and asks nothing special of the system."""
 
 import inspect
 import pydoc
@@ -89,7 +89,7 @@ import sys
 for name in ("termios", "fcntl", "tty", "pty", "pwd", "grp", "resource", "msvcrt", "winreg", "serial", "can"):
     sys.modules[name] = None  # importing it fails, as where there is none
 import os
-os.environ["USER"] = "somebody"
+os.environ["USER"] = "tester"
 import trade
 """,
     )

@@ -46,7 +46,7 @@ def strangers(tmp_path: Path) -> Papers:
 
 
 def links(container: Container) -> list[tuple[str, str]]:
-    """Where its links lead, and who is there."""
+    """Where its links lead, and which containers it sees."""
     assert isinstance(container._parts.transport, ZenohTransport)
     found = container._parts.transport._session.info.links()
     return sorted((str(link.dst).partition("/")[0], str(link.auth_identifier)) for link in found)
@@ -77,7 +77,7 @@ def test_containers_with_certificates_find_each_other_and_prove_who_they_are(
 
 
 def test_containers_that_hear_of_each_other_link_to_each_other(start_container: Any, papers: Papers) -> None:
-    """The one in the middle is the only one that the others are told of."""
+    """The one in the middle is the only one that the others know."""
     middle = tls_endpoint()
     start_container("c0", tls=papers.of("middle"), listen=[middle])
     one, other = (start_container(f"c-{name}", tls=papers.of(name), connect=[middle]) for name in ("one", "other"))
@@ -161,7 +161,7 @@ def impostor(papers: Papers, strangers: Papers, tmp_path: Path, key_of: str) -> 
     """Calls itself arm and trusts the right authority."""
     folder = shutil.copytree(strangers.of("arm"), tmp_path / "impostor")
     shutil.copy(papers.of("arm") / "ca.pem", folder)
-    if key_of == "nobody":  # the certificate of the real arm is no secret
+    if key_of == "stranger":  # the certificate of the real arm is no secret
         shutil.copy(papers.of("arm") / "cert.pem", folder)
     return folder
 
@@ -170,7 +170,7 @@ def impostor(papers: Papers, strangers: Papers, tmp_path: Path, key_of: str) -> 
     ("key_of", "said"),
     [
         ("another", r"cert\.pem: was not issued by the authority in ca\.pem beside it"),
-        ("nobody", r"key\.pem: is not the key of cert\.pem beside it"),
+        ("stranger", r"key\.pem: is not the key of cert\.pem beside it"),
     ],
 )
 def test_the_right_name_with_a_wrong_key_is_refused_before_anything_opens(
@@ -249,7 +249,7 @@ def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewe
     wait_until(lambda: not planner.services(where(name="echo")), "what it offered is gone")
     assert links(planner) == [("tls", "tool")]
     assert links(tool) == [("tls", "planner")]
-    papers.of("arm")  # it dials the others, as it came last: with what stands there now
+    papers.of("arm")  # it dials the others, as it came last: with the current files
     assert echo(planner)(4) == 4
 
 
@@ -272,7 +272,7 @@ def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
         for name, hours in (("arm", 22), ("leg", 23)):
             start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
         papers.of("arm")
-        wait_until(lambda: said_of_the_end(caplog, "arm") == 1, "it is told")
+        wait_until(lambda: said_of_the_end(caplog, "arm") == 1, "it is logged")
     assert said_of_the_end(caplog, "leg") == 0
     assert "start this container again before" in caplog.text
 
@@ -489,7 +489,7 @@ def test_S21_with_certificates_and_a_policy_a_network_may_be_listened_on_and_rea
 
 @pytest.mark.parametrize("listen", ["tls/10.0.0.6:7450", "tls/leg.example:7450"])
 def test_a_container_does_not_listen_where_its_certificate_is_not_for(papers: Papers, listen: str) -> None:
-    """Everybody who dials it there would refuse it, and nobody would know why."""
+    """All that dial it there would refuse it, and none would know why."""
     folder = papers.of("arm", addresses=["10.0.0.5"], hosts=["arm.example"])
     with pytest.raises(ConfigurationError, match=r"not for .*trade pki issue arm --address"):
         read(tls=folder, system="lab", listen=[listen], policy=Path("policy.toml"))

@@ -20,7 +20,7 @@ Eventually = Callable[[Callable[[], bool]], bool]
 
 
 class Arm:
-    """Its word is never told."""
+    """Its word is never traced."""
 
     def __init__(self) -> None:
         self.resources = (Resource("rosie.arm"),)

@@ -351,7 +351,7 @@ def test_a_tap_may_kill_the_receiver_before_a_message_arrives(room: Room) -> Non
 def test_messages_are_counted_by_kind_and_only_those_that_go_somewhere(room: Room) -> None:
     before = room.network.sent.copy()
     room.say("a", "b")
-    room.say("nobody listens", key="elsewhere")
+    room.say("unheard", key="elsewhere")
     room.say("stop", urgent=True)
     room.other.wake("room/a", b"")
     assert room.network.sent - before == {Kind.PUT: 2, Kind.URGENT: 1}

@@ -99,7 +99,7 @@ class TestZenoh(TransportConformance):
                 each.result(60)
             late = transport.subscribe("estop/**")
             late.close()
-            transport.settle()  # of what is closed nothing is heard anew
+            transport.settle()  # a closed subscription receives nothing again
             with pytest.raises(ChannelClosed):
                 late.receive()
 

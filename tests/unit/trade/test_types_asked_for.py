@@ -1,4 +1,4 @@
-"""``where(args=..., returns=...)``: types compared as JSON Schema, so that nobody's code is needed."""
+"""``where(args=..., returns=...)``: types compared as JSON Schema, so that no foreign code is needed."""
 
 import datetime as dt
 import enum

@@ -74,7 +74,7 @@ class Stranger:
         self._sign = self._transport.appear(alive_key(self.address))
 
     def _offer(self, domain: str, provider: str, **more: Any) -> None:
-        """Told in words that this version has not: services by name."""
+        """Announced in terms that this version does not have: services by name."""
         key = registry_key(domain, self.address, provider)
         self._entries[key] = encode_message({"v": OTHER, "services": {"move": 1}, **more})
         self._transport.announce(key, self._entries[key])
@@ -150,7 +150,7 @@ def move(container: Container, group: str = "one") -> str:
     return container.call(where(name="move", group=group))
 
 
-# --- what an operator is told
+# --- what an operator sees
 
 
 def test_a_container_of_another_version_is_shown_with_it_and_offers_nothing(
@@ -179,7 +179,7 @@ def test_of_who_has_said_nothing_yet_the_version_is_not_known(memory: MemorySyst
     transport.appear(alive_key(silent))
     assert eventually(lambda: any(info.name == "silent" for info in here.containers()))
     assert {info.name: info.protocol for info in here.containers()} == {"here": PROTOCOL, "silent": 0}
-    assert here._parts.estop._others() == []  # nobody is told that it speaks another one
+    assert here._parts.estop._others() == []  # none is reported as speaking another one
     transport.close()
 
 
@@ -248,7 +248,7 @@ def test_an_order_to_clear_is_heeded_in_its_own_version_only(
         ("abc", ["abc"]),
         ("abc", {"id": "abc", "by": "tester/x/e"}),
     ],
-    ids=["another's name", "another request", "a path", "nobody's", "another shape"],
+    ids=["another's name", "another request", "a path", "no client's", "another shape"],
 )
 def test_what_is_no_order_in_any_version_stops_nothing(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually, fields: tuple[Any, ...]
@@ -306,7 +306,7 @@ def test_a_clearing_names_containers_of_another_version_that_still_have_it_open(
     assert eventually(lambda: caller.estops() == [])
 
 
-# --- what is told of open ones
+# --- reports of open ones
 
 
 def test_S09_who_joins_takes_over_what_containers_of_another_version_have_open(

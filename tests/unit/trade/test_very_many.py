@@ -10,7 +10,7 @@ from trade._discovery.announcer import Announcer
 from trade._protocol.keys import Address
 from trade._protocol.messages import ProviderInfo, ServiceInfo
 
-HOST = Address("somebody", "host", "e1")
+HOST = Address("other", "host", "e1")
 
 
 def entry(revision: int, services: int) -> ProviderInfo:

@@ -215,7 +215,7 @@ def test_a_malformed_call_is_dropped_counted_and_never_run(
 
 
 BAD_KEYS = {
-    "everybody": "call/tester/*/*/*/robot/{provider}",
+    "every container": "call/tester/*/*/*/robot/{provider}",
     "every boot": "call/tester/{identity}/{container}/*/robot/{provider}",
     "every kind": "*/tester/{address}/robot/{provider}",
     "any caller": "call/*/{address}/robot/{provider}",
@@ -372,7 +372,7 @@ def test_a_malformed_registry_entry_is_dropped_and_counted(
 def test_an_entry_under_a_pattern_never_makes_a_service(
     here: Container, echo: Echo, open_raw: Any, eventually: Any
 ) -> None:
-    """Calling it would put the call to everybody."""
+    """Calling it would send the call to all containers."""
     raw = open_raw(here)
     raw.publish("registry/robot/*/*/*/P-1").put(encode_message(PROVIDER))
     assert eventually(lambda: here.dropped_messages == 1)
@@ -450,7 +450,7 @@ def test_an_answer_on_behalf_of_another_container_is_ignored(
     }
     Teller(raw, "registry/**", standing)
     _sign = raw.appear(alive_key(FORGED))
-    late = start_container("late")  # asks everybody
+    late = start_container("late")  # asks all containers
     assert late.dropped_messages == 1
     assert late.find(where(name="echo", group="robot"), wait_s=20)(3) == 3
     [forged] = late.services(where(group="forged")) or [late.find(where(group="forged"), wait_s=20)]

@@ -1,6 +1,6 @@
 """Messages of every kind in bytes and what they mean: docs/wire-vectors.json, for containers in other languages.
 
-Run as a program it writes the file anew: after a change of the protocol that is meant.
+Run as a program it writes the file again: after a change of the protocol that is meant.
 """
 
 import json
@@ -142,14 +142,14 @@ DROPPED: Final[dict[str, tuple[str, bytes]]] = {
     "an order of version 0": ("EstopOrder", msgpack.encode(_field(_ORDER, 0, 0))),
     "an order to clear of version 2": ("EstopOrder", msgpack.encode([2, "c1ea12ed", None, [_ESTOP.id]])),
     "an order of version 2 that is no e-stop": ("EstopOrder", msgpack.encode([2, _ESTOP.id, ["smoke"]])),
-    "an order of version 2 of somebody else": (
+    "an order of version 2 of another client": (
         "EstopOrder",
         msgpack.encode([2, "5c0ffee5", ["5c0ffee5", "bob/page/77aa00bb11cc"]]),
     ),
     "a confirmation without a request": ("EstopConfirmed", msgpack.encode([2])),
     "an order under another name than its e-stop's": ("EstopOrder", msgpack.encode(_field(_ORDER, 1, "another"))),
     "an order that is no chunk": ("EstopOrder", msgpack.encode([1, "a/b", None, ["x"]])),
-    "an order of somebody else": (
+    "an order of another client": (
         "EstopOrder",
         msgpack.encode(EstopOrder(PROTOCOL, "5c0ffee5", Estop("5c0ffee5", "bob/page/77aa00bb11cc", "smoke", AT))),
     ),
@@ -177,7 +177,7 @@ def document() -> dict[str, Any]:
 
 
 def text() -> str:
-    """The file as it stands."""
+    """The current file."""
     return json.dumps(document(), indent=1, ensure_ascii=False) + "\n"
 
 
