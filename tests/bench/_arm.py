@@ -67,8 +67,8 @@ def run(rounds: int, seconds: float) -> None:
 
 def _driven(sim: SimProcess, seconds: float) -> tuple[float, float]:
     robot = load(_ROBOT)
-    nobody = {"register": lambda *_: None, "deregister": lambda *_: None}
-    with attach(robot, ports=sim.ports, **nobody) as attached:
+    unannounced = {"register": lambda *_: None, "deregister": lambda *_: None}
+    with attach(robot, ports=sim.ports, **unannounced) as attached:
         arm = attached.arm("right")
         arm.move_to_pose("home")
         mark, spent = time.monotonic(), time.process_time()

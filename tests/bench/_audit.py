@@ -95,11 +95,11 @@ def _measure_rate(folder: str, seconds: float) -> tuple[float, int, float]:
 
     writer = AuditWriter(Path(folder) / "rate.sqlite", "bench", "", Keep(90, 10_000_000))
     event = Event(time.time_ns(), 1, "call", "rosie.arm.reach", "", "anna", "anna/mind/1", 7, 3, "ok", "", 5)
-    cpu_s, began, told = time.process_time(), time.monotonic(), 0
+    cpu_s, began, reported = time.process_time(), time.monotonic(), 0
     while (gone_s := time.monotonic() - began) < seconds:
-        for _ in range(told, int(gone_s * _RATE)):
+        for _ in range(reported, int(gone_s * _RATE)):
             writer.tell(event)
-            told += 1
+            reported += 1
         time.sleep(0.005)
     while writer.waiting and time.monotonic() - began < 10 * seconds:
         time.sleep(0.001)

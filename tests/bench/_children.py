@@ -102,9 +102,9 @@ def _elsewhere(python: str, main, *args: object) -> Iterator[Connection]:
 
 def begin(pipe: int) -> None:
     """What such a process does first: hear what it is for, on a pipe of this number."""
-    told = Connection(pipe)
-    main, args = told.recv()
-    main(told, *args)
+    reported = Connection(pipe)
+    main, args = reported.recv()
+    main(reported, *args)
 
 
 @contextmanager

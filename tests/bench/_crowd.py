@@ -145,7 +145,7 @@ def _take_part(pipe: Connection, name: str) -> None:
         if name != "late":
             fill(container, name)
         pipe.send(os.getpid())
-        while (count := _told(pipe)) is not None:
+        while (count := _reported(pipe)) is not None:
             _wait(lambda count=count: len(container.addresses()) == count and _complete(container.containers()))
             pipe.send("known")
 
@@ -154,7 +154,7 @@ def _complete(infos: Sequence[object]) -> bool:
     return all(info.services > 0 for info in infos)  # type: ignore[attr-defined]
 
 
-def _told(pipe: Connection) -> int | None:
+def _reported(pipe: Connection) -> int | None:
     try:
         return pipe.recv()
     except EOFError:  # the run is over

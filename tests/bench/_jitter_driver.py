@@ -80,8 +80,8 @@ def busy_with(robot: Robot, attached: AttachedRobot) -> Callable[[float], object
     return follow
 
 
-def _follow(mover: Arm | JointGroup, joints: list[str], stands: list[float], seconds: float) -> None:
+def _follow(mover: Arm | JointGroup, joints: list[str], start_rad: list[float], seconds: float) -> None:
     """There and back, no faster than any of them may."""
     way_rad = min(_WAY_RAD, _ACCEL_RAD_S2 * seconds**2 / 24)
-    there = [angle + way_rad for angle in stands]
-    mover.follow(_through(joints, (0.0, stands), (seconds / 2, there), (seconds, stands)), _WIDE)
+    there = [angle + way_rad for angle in start_rad]
+    mover.follow(_through(joints, (0.0, start_rad), (seconds / 2, there), (seconds, start_rad)), _WIDE)

@@ -167,17 +167,17 @@ class Run(Struct):
 
     def amended(self, newer: "Run") -> "Run":
         """This run with all that the newer one measured, or could not, in the place of what is here of its parts."""
-        anew = tuple(dict.fromkeys((*newer.parts(), *(one.part for one in newer.skipped))))
-        order = {part: at for at, part in enumerate(dict.fromkeys((*self.parts(), *anew)))}
+        measured = tuple(dict.fromkeys((*newer.parts(), *(one.part for one in newer.skipped))))
+        order = {part: at for at, part in enumerate(dict.fromkeys((*self.parts(), *measured)))}
 
         def of(kind: str) -> list[Any]:
-            old = [one for one in getattr(self, kind) if one.part not in anew]
+            old = [one for one in getattr(self, kind) if one.part not in measured]
             return sorted([*old, *getattr(newer, kind)], key=lambda one: order.get(one.part, len(order)))
 
-        told = Again(anew, newer.commit, newer.began, tuple(newer.arguments), newer.others_cores)
-        kept = [one for one in self.again if not set(one.parts) <= set(anew)]
+        reported = Again(measured, newer.commit, newer.began, tuple(newer.arguments), newer.others_cores)
+        kept = [one for one in self.again if not set(one.parts) <= set(measured)]
         lists = {kind: of(kind) for kind in ("points", "targets", "skipped")}
-        return structs.replace(self, again=[*kept, told], **lists)
+        return structs.replace(self, again=[*kept, reported], **lists)
 
     @property
     def quiet(self) -> bool:

@@ -30,8 +30,8 @@ def mark() -> tuple[int, int, int]:
 def forget_since(marked: tuple[int, int, int]) -> None:
     """What was reported since then is reported once more, or not at all."""
     run = this_run()
-    for told, count in zip((run.points, run.targets, run.skipped), marked, strict=True):
-        del told[count:]
+    for reported, count in zip((run.points, run.targets, run.skipped), marked, strict=True):
+        del reported[count:]
 
 
 def keep_point(

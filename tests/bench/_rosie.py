@@ -108,9 +108,9 @@ def _spent_s(processes: Sequence[psutil.Process]) -> float:
     return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
-def _there_and_back(joints: Sequence[str], stands: Sequence[float], seconds: float) -> Trajectory:
-    there = [angle + _WAY_RAD for angle in stands]
-    return _through(joints, (0.0, stands), (seconds / 2, there), (seconds, stands))
+def _there_and_back(joints: Sequence[str], start_rad: Sequence[float], seconds: float) -> Trajectory:
+    there = [angle + _WAY_RAD for angle in start_rad]
+    return _through(joints, (0.0, start_rad), (seconds / 2, there), (seconds, start_rad))
 
 
 def _through(joints: Sequence[str], *points: tuple[float, Sequence[float]]) -> Trajectory:

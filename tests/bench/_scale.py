@@ -87,12 +87,12 @@ def _print(seen: Sequence[Seen]) -> None:
     rows: dict[str, Callable[[Seen], str]] = {
         "  of them whole": lambda one: str(one.whole),
         "services known": lambda one: str(one.services),
-        "one joins": lambda one: _told(one.join),
-        "one leaves": lambda one: _told(one.leave),
-        "one object registered": lambda one: _told(one.register),
-        "beat of one": lambda one: _told(one.beat),
-        "e-stop, cleared again": lambda one: _told(one.estop),
-        "lock, call, unlock": lambda one: _told(one.lock),
+        "one joins": lambda one: _reported(one.join),
+        "one leaves": lambda one: _reported(one.leave),
+        "one object registered": lambda one: _reported(one.register),
+        "beat of one": lambda one: _reported(one.beat),
+        "e-stop, cleared again": lambda one: _reported(one.estop),
+        "lock, call, unlock": lambda one: _reported(one.lock),
         "Python, KiB a service": lambda one: f"{one.kib_a_service:.2f}",
         "threads of a container": lambda one: f"{one.threads:.1f}",
         "find, us": lambda one: f"{one.find_us:.0f}",
@@ -103,7 +103,7 @@ def _print(seen: Sequence[Seen]) -> None:
     print(f"a container that offers nothing announces {seen[0].own_kib:.1f} KiB about itself")
 
 
-def _told(cost: Cost | None) -> str:
+def _reported(cost: Cost | None) -> str:
     return "" if cost is None else f"{cost.messages} / {cost.bytes / 1024:.1f}"
 
 

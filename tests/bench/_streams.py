@@ -57,17 +57,17 @@ def _round(source: Connection, listeners: list[Connection], seconds: float) -> t
         listener.send("listen")
         hear(listener)
     before, began = _cpu_ns(source), time.perf_counter_ns()
-    _told(listeners, "count")
+    _reported(listeners, "count")
     time.sleep(seconds)
-    heard = _told(listeners, "counted")
+    heard = _reported(listeners, "counted")
     used, took = _cpu_ns(source) - before, time.perf_counter_ns() - began
-    _told(listeners, "close")
+    _reported(listeners, "close")
     if not all(heard):
         raise RuntimeError(f"a listener heard no sample: {heard}")
     return used / took, heard
 
 
-def _told(listeners: list[Connection], word: str) -> list[int]:
+def _reported(listeners: list[Connection], word: str) -> list[int]:
     for listener in listeners:
         listener.send(word)
     return [hear(listener) for listener in listeners]

@@ -48,8 +48,8 @@ def test_a_cycle_is_seen_once_on_its_wire(bus: Bus, tmp_path: Path) -> None:
         pytest.skip(f"{missing[0]} is not installed")
     robot, file = parse(bus.text, "jitter.toml"), tmp_path / "jitter.toml"
     file.write_text(bus.text)
-    nobody = {"register": lambda *_: None, "deregister": lambda *_: None}
-    with SimProcess(file) as sim, attach(robot, ports=sim.ports, **nobody) as attached:
+    unannounced = {"register": lambda *_: None, "deregister": lambda *_: None}
+    with SimProcess(file) as sim, attach(robot, ports=sim.ports, **unannounced) as attached:
         busy = busy_with(robot, attached)
         before, missed, began = (
             measured(attached, "bus_cycles"),

@@ -136,7 +136,7 @@ def test_the_command_writes_the_page_and_names_missed_targets_without_a_reason(
 
 
 def test_parts_measured_again_replace_the_earlier_ones_and_the_page_says_so() -> None:
-    anew = a_run(
+    newer_run = a_run(
         commit="fedcba",
         arguments=["can", "servo"],
         others_cores=0.5,
@@ -144,10 +144,10 @@ def test_parts_measured_again_replace_the_earlier_ones_and_the_page_says_so() ->
         targets=[Target("can", "late at 500 Hz, 1 TPDO, %", "below 1", Spread.of([0.25]), True)],
         skipped=[Skipped("servo", "servo", "it failed")],
     )
-    both = a_run().amended(anew)
+    both = a_run().amended(newer_run)
     assert list(both.parts()) == list(a_run().parts())
     assert [one for one in both.points if one.part != "can"] == [one for one in a_run().points if one.part != "can"]
-    assert [one for one in both.points if one.part == "can"] == anew.points
+    assert [one for one in both.points if one.part == "can"] == newer_run.points
     assert [one.met for one in both.targets] == [True, False, False, True]
     assert Skipped("servo", "servo", "it failed") in both.skipped
     text = files(both, {})["performance.md"]
@@ -157,4 +157,4 @@ def test_parts_measured_again_replace_the_earlier_ones_and_the_page_says_so() ->
     )
     assert [one.parts for one in once_more.again] == [("can", "servo"), ("servo",)]
     assert [one.reason for one in once_more.skipped if one.part == "servo"] == ["x"]
-    assert [one.parts for one in both.amended(anew).again] == [("can", "servo")]
+    assert [one.parts for one in both.amended(newer_run).again] == [("can", "servo")]

@@ -16,7 +16,7 @@ from trade import Container
 def gate() -> Iterator[Gate]:
     made = Gate()
     yield made
-    made.let_go()
+    made.release()
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

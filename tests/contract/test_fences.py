@@ -37,7 +37,7 @@ def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire
         run = move.start(*shared.far[1:])
         wait_until(lambda: shared.exchange._inbox, "the move is admitted")
         assert operator.locking.break_lock(device, "it is mine")
-        gate.let_go()
+        gate.release()
         with pytest.raises((LockLost, MotionStopped)):
             run.result()
         with pytest.raises(LockLost):
@@ -209,7 +209,7 @@ def test_S08_a_stop_reaches_what_is_held_up_in_the_queue(
     wait_until(lambda: shared.exchange._inbox, "the move is admitted")
     stop = shared.started(operator, ("stop",))
     wait_until(lambda: shared.exchange._stops, "the stop is admitted")
-    gate.let_go()
+    gate.release()
     stop.result()
     with pytest.raises(MotionStopped):
         run.result()
@@ -266,7 +266,7 @@ def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(rig: 
         rig.bench.attach()
     assert str(rig.bench.sim.port) in str(refused.value)
     assert not rig.heard(mark)
-    gate.let_go()
+    gate.release()
     moving = rig.set_off()
     with pytest.raises(ConfigurationError, match="another driver owns this port"):
         rig.bench.attach()

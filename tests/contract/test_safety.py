@@ -49,7 +49,7 @@ def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_written(ri
     late = [Outcome(command, deadline_s=0.05) for command in rig.queued()]
     with call(0.1) as expires_ns:
         sleep_past(expires_ns)
-    gate.let_go()
+    gate.release()
     for command in late:
         assert isinstance(command.wait().error, DeadlineExceeded)
     assert not rig.commanded(mark)
@@ -64,7 +64,7 @@ def test_S01_a_move_of_an_enabled_joint_that_expires_meanwhile_is_never_written(
     late = [Outcome(command, deadline_s=0.05) for command in rig.queued_when_ready()]
     with call(0.1) as expires_ns:
         sleep_past(expires_ns)
-    gate.let_go()
+    gate.release()
     for command in late:
         assert isinstance(command.wait().error, DeadlineExceeded)
     assert not rig.ordered(mark)
@@ -79,7 +79,7 @@ def test_S01_a_plain_call_waits_one_second_for_its_turn_at_most(rig: SafetyRig, 
     late = Outcome(rig.move)
     with call(1.05) as expires_ns:
         sleep_past(expires_ns)
-    gate.let_go()
+    gate.release()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not rig.commanded(mark)
 
@@ -194,7 +194,7 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(rig: SafetyRig,
     wait_until(lambda: len(rig.exchange._inbox) == 3, "they wait")
     stop = Outcome(rig.device.stop)
     wait_until(lambda: rig.exchange._stops, "the stop is queued")
-    gate.let_go()
+    gate.release()
     assert stop.wait().error is None
     assert all(one.wait().error is not None for one in (moving, *waiting))
     rig.rests()
@@ -211,7 +211,7 @@ def test_S08_a_command_admitted_before_a_stop_is_dropped_after_it(rig: SafetyRig
     wait_until(lambda: rig.exchange._inbox, "the move is admitted")
     stopping = Outcome(rig.device.stop)
     wait_until(lambda: rig.exchange._stops, "the stop is admitted")
-    gate.let_go()
+    gate.release()
     assert isinstance(moving.wait().error, MotionStopped)
     assert stopping.wait().error is None
     assert not rig.sent_away(mark)

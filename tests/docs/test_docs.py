@@ -101,16 +101,16 @@ def test_the_command_for_the_simulator_strikes_it() -> None:
 def test_the_page_on_the_simulators_has_each_fault_with_its_fields(word: str) -> None:
     page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
     [cells] = re.findall(rf"^\| (?:`\w+`, )?`{word}`(?:, `\w+`)? \|(.*?)\| ", page, re.MULTILINE)
-    told = dict(re.findall(r"`(\w+)`(?: \((.*?)\))?", cells))
+    reported = dict(re.findall(r"`(\w+)`(?: \((.*?)\))?", cells))
     kind = KINDS[word]
     common = AnswerFault.__struct_fields__ if issubclass(kind, AnswerFault) else ("bus",)
-    assert told.keys() == set(kind.__struct_fields__) - set(common)
+    assert reported.keys() == set(kind.__struct_fields__) - set(common)
     given = msgspec.inspect.type_info(kind)
     assert isinstance(given, msgspec.inspect.StructType)
     for field in given.fields:
-        if field.name in told:
+        if field.name in reported:
             assert field.required == (f"**`{field.name}`**" in cells)
-            default = told[field.name].strip("`").replace(" ", "")
+            default = reported[field.name].strip("`").replace(" ", "")
             assert default == ("" if field.required or field.default is None else json_text(field.default))
 
 

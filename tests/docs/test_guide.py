@@ -142,15 +142,15 @@ class Listener:
     """What it receives."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.reported: list[Any] = []
 
     @service
     def consult(self, knowledge: Handle) -> None:
-        self.told.append(knowledge.name)
+        self.reported.append(knowledge.name)
 
     @service
     def dock(self, speed: float = 0.5) -> None:
-        self.told.append(speed)
+        self.reported.append(speed)
 
     @service(effect="read")
     def is_low(self) -> bool:
@@ -174,14 +174,14 @@ def test_notifications_arrive_for_services_health_and_time(play: Play, printed: 
     play.offer("mind", listener, "mind")
     play.offer("robot", eye, "rosie.head")
     play.run_next(consult=trade.find(where(name="consult")))
-    wait_until(lambda: listener.told == ["get_kb_name"])
+    wait_until(lambda: listener.reported == ["get_kb_name"])
     play.container("robot").set_health(eye, "degraded")
     wait_until(lambda: "is degraded" in printed.text)
     play.container("robot").close()
     wait_until(lambda: "gone:" in printed.text)
-    listener.told.clear()
+    listener.reported.clear()
     play.run()
-    wait_until(lambda: 0.5 in listener.told)  # once; the others come later than this ends
+    wait_until(lambda: 0.5 in listener.reported)  # once; the others come later than this ends
     occasions = [info.occasion for info in trade.notifications()]
     assert [next(one for one in occasions if one.startswith(word)) for word in ("every", "after", "at")]
 
@@ -221,9 +221,9 @@ def test_listen(play: Play, printed: Said) -> None:
     play.offer("mind", listener, "mind")
     play.run(battery=trade.find(where(name="battery")), dock=trade.find(where(name="dock")))
     assert "moving=False" in printed.lines[-1]
-    wait_until(lambda: listener.told == [15, 15])  # of the stream, and of the existing one
+    wait_until(lambda: listener.reported == [15, 15])  # of the stream, and of the existing one
     play.offer("mind-2", Listener(), "mind")
-    wait_until(lambda: listener.told == [15, 15, 15])
+    wait_until(lambda: listener.reported == [15, 15, 15])
 
 
 class MovingHead(Head, Joints):

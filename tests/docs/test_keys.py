@@ -45,9 +45,9 @@ def shown() -> dict[str, dict[str, tuple[str, str]]]:
 def keys(record: type[Struct]) -> Iterator[tuple[str, tuple[str, str]]]:
     """The record that is read: what it does not have from every bus."""
     common = dict(_fields(Bus)) if record is not Bus and issubclass(record, Bus) else {}
-    for key, told in _fields(record):
-        if key != "name" and common.get(key) != told:
-            yield key, told
+    for key, reported in _fields(record):
+        if key != "name" and common.get(key) != reported:
+            yield key, reported
 
 
 def _fields(record: type[Struct]) -> Iterator[tuple[str, tuple[str, str]]]:

@@ -37,8 +37,8 @@ def test_each_threat_is_tried_by_tests_that_exist(row: list[str]) -> None:
 
 
 def test_no_threat_that_was_asked_about_is_left_out() -> None:
-    told = "\n".join(f"{row[0]} {row[1]}" for row in ROWS)
-    assert not [threat for threat in ASKED if threat not in told]
+    reported = "\n".join(f"{row[0]} {row[1]}" for row in ROWS)
+    assert not [threat for threat in ASKED if threat not in reported]
     assert len({row[0] for row in ROWS}) == len(ROWS)
     assert [row[0] for row in ROWS] == list(LISTED)
 

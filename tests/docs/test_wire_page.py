@@ -47,8 +47,8 @@ def left_out(field: structs.FieldInfo) -> str:
 
 @pytest.mark.parametrize("kind", [ProviderInfo, ServiceInfo])
 def test_fields_have_the_types_and_defaults_of_the_page(kind: type[Struct]) -> None:
-    told = [row[:3] for row in rows(f"**{kind.__name__}** map:")]
-    assert told == [[f"`{one.encode_name}`", said(one.type), left_out(one)] for one in structs.fields(kind)]
+    reported = [row[:3] for row in rows(f"**{kind.__name__}** map:")]
+    assert reported == [[f"`{one.encode_name}`", said(one.type), left_out(one)] for one in structs.fields(kind)]
 
 
 def test_what_a_service_leaves_out_is_understood_as_the_page_says() -> None:
@@ -56,21 +56,23 @@ def test_what_a_service_leaves_out_is_understood_as_the_page_says() -> None:
     [service] = decode_provider(data).services
     assert (service.effect, service.cancel, service.uses) == ("actuate", None, ())
     for cancel in (None, "halt"):
-        told = {**PROVIDER, "services": [{"name": "turn", "signature": "turn()", "cancel": cancel}]}
-        assert decode_provider(msgspec.msgpack.encode(told)).services[0].cancel == cancel
+        reported = {**PROVIDER, "services": [{"name": "turn", "signature": "turn()", "cancel": cancel}]}
+        assert decode_provider(msgspec.msgpack.encode(reported)).services[0].cancel == cancel
 
 
 @pytest.mark.parametrize("named", ["TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"])
 def test_the_runtime_folder_is_where_the_page_says(named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = {row[0].strip("`"): row[1] for row in rows("The runtime folder is")}
-    assert set(told) == {"TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"}
+    reported = {row[0].strip("`"): row[1] for row in rows("The runtime folder is")}
+    assert set(reported) == {"TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"}
     monkeypatch.delenv("TRADE_RUNTIME_DIR", raising=False)
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     if named != "neither":
         monkeypatch.setenv(named, str(tmp_path))
     folder = runtime_folder()
-    expected = told[named].split("`")[1].replace(f"${named}", str(tmp_path)).replace("<uid>", f"{folder.stat().st_uid}")
+    expected = (
+        reported[named].split("`")[1].replace(f"${named}", str(tmp_path)).replace("<uid>", f"{folder.stat().st_uid}")
+    )
     assert folder == tmp_path / expected
     user, password = user_secret()
     assert (user, password) == ("host", (folder / "@secret").read_text(encoding="ascii").strip())

@@ -16,9 +16,9 @@ def pythons(uv: str) -> dict[str, Path]:
     """The newest of each minor version, by that version: ``{"3.12": Path("/usr/bin/python3.12")}``."""
     found: dict[str, tuple[tuple[int, ...], Path]] = {}
     for candidate in dict.fromkeys(_candidates(uv)):
-        if (told := _asked(candidate)) is None:
+        if (reported := _asked(candidate)) is None:
             continue
-        version, path = told
+        version, path = reported
         minor = ".".join(map(str, version[:2]))
         if minor in MINORS:
             found[minor] = max(found.get(minor, (version, path)), (version, path), key=lambda one: one[0])
@@ -43,8 +43,8 @@ def _candidates(uv: str) -> Iterator[Path]:
 def _asked(python: Path) -> tuple[tuple[int, ...], Path] | None:
     """Version and path of a CPython; None of anything else. A shim (pyenv) names the one behind it, or fails."""
     try:
-        told = subprocess.run([python, "-c", _TELL], capture_output=True, text=True, timeout=30, check=True)
+        reported = subprocess.run([python, "-c", _TELL], capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    name, version, path = told.stdout.strip().split(" ", 2)
+    name, version, path = reported.stdout.strip().split(" ", 2)
     return (tuple(map(int, version.split("."))), Path(path)) if name == "cpython" else None

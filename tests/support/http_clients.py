@@ -97,10 +97,10 @@ class Client:
     def ask(self, method: str, path: str, body: Any = None, **headers: str) -> Answer:
         made = self.begin(method, path, body, **headers)
         try:
-            told = made.getresponse()
-            data = told.read()
-            found = {name.lower(): text for name, text in told.getheaders()}
-            return Answer(told.status, found, json.loads(data) if "json" in found.get("content-type", "") else data)
+            reported = made.getresponse()
+            data = reported.read()
+            found = {name.lower(): text for name, text in reported.getheaders()}
+            return Answer(reported.status, found, json.loads(data) if "json" in found.get("content-type", "") else data)
         finally:
             made.close()
 
@@ -159,9 +159,9 @@ def ask(socket: ClientConnection, **message: Any) -> Any:
     """Say something and wait for what it comes to; whatever else is said meanwhile is left out."""
     say(socket, **message)
     while True:
-        told = heard(socket)
-        if told.get("id") == message["id"] and ("result" in told or "problem" in told):
-            return told
+        reported = heard(socket)
+        if reported.get("id") == message["id"] and ("result" in reported or "problem" in reported):
+            return reported
 
 
 def govern(robot: Robot, folder: Path, text: str) -> None:

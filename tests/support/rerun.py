@@ -129,7 +129,7 @@ def _afresh(item: pytest.Item) -> bool:
     return True
 
 
-class Told:
+class RerunSummary:
     """The summary, in the process that the user sees."""
 
     def __init__(self) -> None:
@@ -166,6 +166,6 @@ class Told:
 def pytest_configure(config: pytest.Config) -> None:
     """Called for a module that is named as a plugin."""
     if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(Told())
+        config.pluginmanager.register(RerunSummary())
     if hasattr(config, "workerinput") or not getattr(config.option, "numprocesses", None):
         config.pluginmanager.register(Again())

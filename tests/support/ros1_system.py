@@ -36,11 +36,11 @@ def need_ros1() -> None:
 
 
 class Peer:
-    """A rospy node that takes commands as lines; what it reports is in `told`."""
+    """A rospy node that takes commands as lines; what it reports is in `reported`."""
 
     def __init__(self, stand: "Stand", name: str) -> None:
         self.name = f"/{name}"
-        self.told: list[dict[str, Any]] = []
+        self.reported: list[dict[str, Any]] = []
         self._process = subprocess.Popen(
             [PYTHON, str(_PEER), name],
             env=stand.environment,
@@ -63,11 +63,11 @@ class Peer:
         self._process.stdin.flush()
 
     def all(self, event: str) -> list[Any]:
-        return [told["what"] for told in list(self.told) if told["event"] == event]
+        return [reported["what"] for reported in list(self.reported) if reported["event"] == event]
 
     def wait_for(self, event: str, true: Callable[[Any], object] = lambda _: True) -> Any:
         wait_until(
-            lambda: any(true(what) for what in self.all(event)), f"{self.name} reported {event}: {self.told[-5:]}"
+            lambda: any(true(what) for what in self.all(event)), f"{self.name} reported {event}: {self.reported[-5:]}"
         )
         return next(what for what in self.all(event) if true(what))
 
@@ -89,7 +89,7 @@ class Peer:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith("{"):
-                self.told.append(json.loads(line))
+                self.reported.append(json.loads(line))
 
 
 class Stand:

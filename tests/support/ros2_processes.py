@@ -30,7 +30,7 @@ class Process:
     """A module of `tests.support` as a program; it ends with the test, at the latest."""
 
     def __init__(self, module: str, *arguments: object) -> None:
-        self.told: list[dict[str, Any]] = []
+        self.reported: list[dict[str, Any]] = []
         self._process = subprocess.Popen(
             [sys.executable, "-m", f"tests.support.{module}", *map(str, arguments)],
             cwd=ROOT,
@@ -48,14 +48,14 @@ class Process:
         self._process.stdin.write(json.dumps({"do": do, **arguments}) + "\n")
         self._process.stdin.flush()
 
-    def hear(self, what: str, **told: object) -> dict[str, Any]:
+    def hear(self, what: str, **reported: object) -> dict[str, Any]:
         """Wait until it reports something; returns the report."""
-        wait_until(lambda: self.has(what, **told), f"it reports {what} {told}; it reported {self.told}")
-        return self.has(what, **told)[0]
+        wait_until(lambda: self.has(what, **reported), f"it reports {what} {reported}; it reported {self.reported}")
+        return self.has(what, **reported)[0]
 
-    def has(self, what: str, **told: object) -> list[dict[str, Any]]:
-        wanted = {"what": what, **told}.items()
-        return [each for each in list(self.told) if wanted <= each.items()]
+    def has(self, what: str, **reported: object) -> list[dict[str, Any]]:
+        wanted = {"what": what, **reported}.items()
+        return [each for each in list(self.reported) if wanted <= each.items()]
 
     def kill(self) -> None:
         """As ``kill -9`` does. Idempotent."""
@@ -73,7 +73,7 @@ class Process:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith("{"):
-                self.told.append(json.loads(line))
+                self.reported.append(json.loads(line))
             self._ready.set()
 
 

@@ -64,10 +64,10 @@ def _run(tmp_path: Path, body: str, times: int = 1, options: tuple[str, ...] = (
     ],
 )
 def test_a_test_that_is_late_once_reruns_and_is_reported(tmp_path: Path, said: str) -> None:
-    code, told = _run(tmp_path, f"assert not first, 'its driver {said}'")
-    assert code == 0, told
-    assert "ran twice: 1" in told
-    assert f"test_late0.py::test_it: it said: {said}" in told
+    code, reported = _run(tmp_path, f"assert not first, 'its driver {said}'")
+    assert code == 0, reported
+    assert "ran twice: 1" in reported
+    assert f"test_late0.py::test_it: it said: {said}" in reported
 
 
 def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Path) -> None:

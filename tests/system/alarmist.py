@@ -60,9 +60,12 @@ def resume(container: Container) -> None:
 
 
 def main(name: str, address: str) -> None:
-    told = json.loads(sys.stdin.readline())
+    reported = json.loads(sys.stdin.readline())
     settings = Settings.read(
-        system=f"{os.environ['TRADE_SYSTEM']}-0", container=name, listen=[f"tls/{address}"], connect=[told["connect"]]
+        system=f"{os.environ['TRADE_SYSTEM']}-0",
+        container=name,
+        listen=[f"tls/{address}"],
+        connect=[reported["connect"]],
     )
     with Container(settings) as container:
         for line in sys.stdin:

@@ -25,13 +25,13 @@ _DEADLINE_S = 60.0
 
 
 class Behaviour:
-    def __init__(self, container: Container, name: str, told: dict[str, Any]) -> None:
+    def __init__(self, container: Container, name: str, reported: dict[str, Any]) -> None:
         self._container = container
         self._name = name
-        self._robots: list[str] = told["robots"]
-        self._slot = int(told["slot"])
-        self._speed_rad_s = float(told["speed_rad_s"])
-        self._log = Log(told["folder"], name)
+        self._robots: list[str] = reported["robots"]
+        self._slot = int(reported["slot"])
+        self._speed_rad_s = float(reported["speed_rad_s"])
+        self._log = Log(reported["folder"], name)
         self._over = threading.Event()
         self._count = 0
         self._rounds = 0
@@ -149,15 +149,15 @@ class Behaviour:
 
 
 def main(name: str, address: str) -> None:
-    told = json.loads(sys.stdin.readline())
+    reported = json.loads(sys.stdin.readline())
     settings = Settings.read(
         system=f"{os.environ['TRADE_SYSTEM']}-0",
         container=name,
         listen=[f"tls/{address}"],
-        connect=[told["connect"]],
+        connect=[reported["connect"]],
     )
     with Container(settings) as container:
-        behaviour = Behaviour(container, name, told)
+        behaviour = Behaviour(container, name, reported)
         for line in sys.stdin:
             print(json.dumps({"answer": getattr(behaviour, line.strip())()}), flush=True)
         behaviour.end()

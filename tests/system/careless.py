@@ -59,7 +59,7 @@ class Careless(ABC):
 
     Args:
         name: of its process, in its notes.
-        told: ``slot`` of those that exist, ``seed``, and the ``folder`` of its notes.
+        reported: ``slot`` of those that exist, ``seed``, and the ``folder`` of its notes.
     """
 
     later_s = 0.0
@@ -67,11 +67,11 @@ class Careless(ABC):
     feels_its_locks = True
     """Whether it can tell when it has a lock; who cannot had it when it asked for what was then done under it."""
 
-    def __init__(self, name: str, told: dict[str, Any]) -> None:
+    def __init__(self, name: str, reported: dict[str, Any]) -> None:
         self._name = name
-        self._slot = int(told["slot"])
-        self.random = random.Random(told["seed"])
-        self._log = Log(told["folder"], name)
+        self._slot = int(reported["slot"])
+        self.random = random.Random(reported["seed"])
+        self._log = Log(reported["folder"], name)
         self.ended = threading.Event()
         self._count = 0
         self._asked: tuple[str, Sequence[str]] = ("", ())

@@ -27,6 +27,6 @@ with Container(Settings.read(container="holder")) as holder:
             holder.after(0.05, after.set)
             for goal_rad in (0.1, -0.1):
                 move(goal_rad)
-            told = {"after": after.wait(60), "held": lock.held, "lost": lost, **seen}
+            reported = {"after": after.wait(60), "held": lock.held, "lost": lost, **seen}
             year = datetime.now(timezone.utc).year
-            print(json.dumps({"wall_s": time.time(), "year": year, **told}), flush=True)
+            print(json.dumps({"wall_s": time.time(), "year": year, **reported}), flush=True)

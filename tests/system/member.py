@@ -296,7 +296,7 @@ class Member:
         assert self._lock is not None
         return self._lock.held
 
-    def let_go(self) -> None:
+    def unlock(self) -> None:
         assert self._lock is not None
         self._lock.release()
         self._lock = None

@@ -64,9 +64,9 @@ class Outsider(Careless):
 
 
 class Page(Outsider):
-    def __init__(self, name: str, told: dict[str, Any]) -> None:
-        super().__init__(name, told)
-        self._url, self._token = told["url"], told["token"]
+    def __init__(self, name: str, reported: dict[str, Any]) -> None:
+        super().__init__(name, reported)
+        self._url, self._token = reported["url"], reported["token"]
         self._socket: ClientConnection | None = None
         self._leaving = ExitStack()
         self._ids = itertools.count()
@@ -133,11 +133,11 @@ class Page(Outsider):
         try:
             self._socket.send(json.dumps({"do": what, "id": number, **more}))
             while True:
-                told = json.loads(self._socket.recv(timeout=max(0.0, until - now())))
-                if told.get("id") == number and "problem" in told:
-                    raise Refused(told["problem"]["title"], told["problem"].get("detail", ""))
-                if told.get("id") == number and "result" in told:
-                    return told["result"]
+                reported = json.loads(self._socket.recv(timeout=max(0.0, until - now())))
+                if reported.get("id") == number and "problem" in reported:
+                    raise Refused(reported["problem"]["title"], reported["problem"].get("detail", ""))
+                if reported.get("id") == number and "result" in reported:
+                    return reported["result"]
         except (OSError, WebSocketException) as gone:  # a TimeoutError, too
             self._leave()
             raise Refused("NoConnection", str(gone)) from gone
@@ -156,14 +156,14 @@ class Page(Outsider):
 
 
 class Agent(Outsider):
-    def __init__(self, name: str, told: dict[str, Any]) -> None:
-        super().__init__(name, told)
+    def __init__(self, name: str, reported: dict[str, Any]) -> None:
+        super().__init__(name, reported)
         self._server = subprocess.Popen(
             [sys.executable, "-m", "trade_gateway", "mcp", "--name", name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "TRADE_SYSTEM": f"{os.environ['TRADE_SYSTEM']}-0", "TRADE_CONNECT": told["connect"]},
+            env={**os.environ, "TRADE_SYSTEM": f"{os.environ['TRADE_SYSTEM']}-0", "TRADE_CONNECT": reported["connect"]},
         )
         self._ids = itertools.count(1)
         self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
@@ -190,13 +190,13 @@ class Agent(Outsider):
         self._say(id=number, method=method, params=params)
         while True:
             try:
-                told = self._said.get(timeout=max(0.0, until - now()))
+                reported = self._said.get(timeout=max(0.0, until - now()))
             except queue.Empty:
                 raise Refused("NoAnswer", f"to {method}") from None
-            if told is None:
+            if reported is None:
                 raise Refused("NoServer", "it has ended")
-            if told.get("id") == number:
-                return told["result"]
+            if reported.get("id") == number:
+                return reported["result"]
 
     def _say(self, **message: Any) -> None:
         assert self._server.stdin is not None
@@ -221,9 +221,9 @@ _CLIENT = {"name": "siege", "version": "0"}
 
 
 def main(name: str) -> None:
-    told = json.loads(sys.stdin.readline())
-    kind = {"page": Page, "agent": Agent}[told["by"]]
-    kind(name, told).serve()
+    reported = json.loads(sys.stdin.readline())
+    kind = {"page": Page, "agent": Agent}[reported["by"]]
+    kind(name, reported).serve()
 
 
 if __name__ == "__main__":

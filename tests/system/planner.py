@@ -24,8 +24,8 @@ def _refusals() -> Generator[None]:
 
 
 class Planner(Careless):
-    def __init__(self, container: Container, name: str, told: dict[str, Any]) -> None:
-        super().__init__(name, told)
+    def __init__(self, container: Container, name: str, reported: dict[str, Any]) -> None:
+        super().__init__(name, reported)
         self._container = container
 
     def joints(self, robot: str) -> list[str]:
@@ -64,15 +64,15 @@ class Planner(Careless):
 
 
 def main(name: str, address: str) -> None:
-    told = json.loads(sys.stdin.readline())
+    reported = json.loads(sys.stdin.readline())
     settings = Settings.read(
         system=f"{os.environ['TRADE_SYSTEM']}-0",
         container=name,
         listen=[f"tls/{address}"],
-        connect=[told["connect"]],
+        connect=[reported["connect"]],
     )
     with Container(settings) as container:
-        Planner(container, name, told).serve()
+        Planner(container, name, reported).serve()
 
 
 if __name__ == "__main__":

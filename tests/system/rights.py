@@ -195,7 +195,7 @@ def _tried(stage: Stage, action: Action, who: str, *, honest: bool) -> bool:
     """Whether it comes to pass; of an honest container, whether it lets it out."""
     actor = stage.container(f"{'honest' if honest else 'careless'}-{who}", who, honest=honest)
     try:
-        with _told_of_sending(actor) as sent:
+        with _recorded_calls(actor) as sent:
             return action.attempt(stage, actor) or honest
     except AccessDenied:
         stage.memory.settle()
@@ -206,15 +206,15 @@ def _tried(stage: Stage, action: Action, who: str, *, honest: bool) -> bool:
 
 
 @contextmanager
-def _told_of_sending(actor: Container) -> Iterator[list[str]]:
+def _recorded_calls(actor: Container) -> Iterator[list[str]]:
     """Names of the services that its calls go out to."""
     sent: list[str] = []
     caller: Any = actor._parts.caller
     ask, start = caller.ask, caller.start
 
-    def noted(send: Callable[..., Any], call: Call, *told: Any) -> Any:
+    def noted(send: Callable[..., Any], call: Call, *reported: Any) -> Any:
         sent.append(call.service)
-        return send(call, *told)
+        return send(call, *reported)
 
     caller.ask, caller.start = partial(noted, ask), partial(noted, start)
     yield sent

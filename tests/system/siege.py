@@ -262,7 +262,7 @@ class Stand:
         host = "right2" if kind == "planner" and slot % 2 == 0 else "right"
         name = f"{kind}{slot}-{self._turns[slot]}"
         member = self.site.launched(host, name, identity=f"{kind}{slot}", script=_SCRIPTS[kind], policy=self._policy)
-        told = {
+        reported = {
             "slot": slot,
             "seed": self._dice.randrange(2**32),
             "folder": str(self.records),
@@ -271,7 +271,7 @@ class Stand:
             "url": f"http://{_HALL}",
             "token": self._token,
         }
-        member.tell(json.dumps(told))
+        member.tell(json.dumps(reported))
         return name, member
 
     def _alarmist(self, name: str) -> Member:
@@ -524,8 +524,8 @@ class Stand:
             check=False,
             timeout=60,
         )
-        told = json.loads(said.stdout) if said.returncode == 0 else {"through": False, "said": said.stderr}
-        return Rescue(t=began, whom=whom, until=time.monotonic(), through=told["through"], said=told["said"])
+        reported = json.loads(said.stdout) if said.returncode == 0 else {"through": False, "said": said.stderr}
+        return Rescue(t=began, whom=whom, until=time.monotonic(), through=reported["through"], said=reported["said"])
 
     # --- after it
 

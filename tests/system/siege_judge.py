@@ -271,7 +271,7 @@ def _motions(
         span = owned[bisect_right(since, motion.t) - 1] if since and since[0] <= motion.t else None
         if span is not None and whole(span.hold) != order.hold and motion.t < span.until:
             found.append(f"{at} for {order.hold} while {span.hold} had it")
-        found += _goes_on(at, motion, order, resource, faults)
+        found += _continues(at, motion, order, resource, faults)
     return found, len(done)
 
 
@@ -282,7 +282,7 @@ def _broken_into(motion: Motion, order: Order, last: Motion, its: Order) -> bool
     return under_way and not free and _who(its.number) != _who(order.number)
 
 
-def _goes_on(at: str, motion: Motion, order: Order, resource: str, faults: Sequence[Fault]) -> list[str]:
+def _continues(at: str, motion: Motion, order: Order, resource: str, faults: Sequence[Fault]) -> list[str]:
     """Whether it continued although the client that ordered it, or the driver, was gone for long enough."""
     found: list[str] = []
     if order.valid_s and motion.rests - motion.t > order.valid_s + WATCHED_S:

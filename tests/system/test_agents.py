@@ -109,8 +109,8 @@ def test_the_twin_is_brought_to_where_a_part_of_each_kind_is(system: str, part: 
         robot.register(Part(), group)
         tried = twin.call(robot.find(where(name="state", group=group)), [], 10.0, there)
     assert tried.began_where_the_robot_is, tried
-    for real, tells in zip(_several(there), _several(tried.before), strict=True):
-        assert {name: tells[name] for name in real} == {
+    for real, dry in zip(_several(there), _several(tried.before), strict=True):
+        assert {name: dry[name] for name in real} == {
             name: pytest.approx(value, abs=0.02 if "rad" in name else 0.001) for name, value in real.items()
         }
 

@@ -14,7 +14,7 @@ BEHAVIOURS = Path(__file__).parents[2] / "examples" / "who_has_the_head.py"
 HEAD = where(group="rosie.head")
 
 
-def told(program: Program, until: str) -> str:
+def reported(program: Program, until: str) -> str:
     """The line of a behaviour that has these words."""
     while until not in (line := program.line()):
         assert line, f"it ended without saying {until!r}"
@@ -28,17 +28,17 @@ def test_navigation_asks_for_the_head_and_gets_it(
     onlooker = start_container("onlooker")
     onlooker.find(HEAD & where(name="move_to"), wait_s=60)
     finding = run(BEHAVIOURS, "find-target")
-    told(finding, "I have the head")
+    reported(finding, "I have the head")
     [lock] = onlooker.locks()
     assert (lock.holder.container, lock.holder.purpose) == ("find-target", "finding a target")
     assert set(lock.resources) == {"rosie.neck.pan", "rosie.neck.tilt"}
 
     navigating = run(BEHAVIOURS, "navigate")
-    assert "find-target has the head, for 'finding a target'" in told(navigating, "has the head")
-    assert "navigate asks for the head: there is something ahead of me" in told(finding, "asks for the head")
-    told(finding, "I have let go")
+    assert "find-target has the head, for 'finding a target'" in reported(navigating, "has the head")
+    assert "navigate asks for the head: there is something ahead of me" in reported(finding, "asks for the head")
+    reported(finding, "I have let go")
     began = time.monotonic()
-    told(navigating, "I have the head")
+    reported(navigating, "I have the head")
     assert finding.wait() == 0, finding.errors
     [lock] = onlooker.locks()
     assert (lock.holder.container, lock.holder.purpose) == ("navigate", "navigation")

@@ -97,7 +97,7 @@ def test_who_may_only_read_takes_no_lock_away_and_resumes_nothing(attack: Attack
     planner.ask("ended")
     attack.chief.ask("break_lock", ARM)
     wait_until(lambda: not planner.ask("still_held"), "its owner is notified")
-    planner.ask("let_go")
+    planner.ask("unlock")
     attack.chief.ask("call", "halt", ARM, "arm")
     assert attack.dash.refused("resume", ARM).startswith("AccessDenied")
     attack.chief.ask("resume", ARM)
@@ -238,7 +238,7 @@ def test_a_lock_is_not_used_by_who_knows_its_number(attack: Attack, as_planner: 
     attack.settle(as_planner, "planner")
     attack.say(as_planner, attack.key("planner"), attack.call(as_planner, "planner", "move", 6, behalf=behalf))
     wait_until(lambda: attack.moved() == [*before, 6], "who holds it does")
-    attack.planner.ask("let_go")
+    attack.planner.ask("unlock")
     attack.intruder.ask("close", porter)
 
 
@@ -290,8 +290,8 @@ def test_an_entry_is_of_who_may_offer_it(attack: Attack, as_dash: str, as_arm: s
     assert attack.planner.ask("seen", "rosie.trap") == []
     assert attack.planner.ask("seen", ARM) == [real]
     ghost = f"arm/{as_arm}/e1"
-    told = [f"registry/rosie.trap/{ghost}/Trap", entry(1), f"registry/trade/{ghost}/tally", tally_of(1)]
-    attack.intruder.ask("answer", as_arm, f"registry/*/{ghost}/*", *told)
+    reported = [f"registry/rosie.trap/{ghost}/Trap", entry(1), f"registry/trade/{ghost}/tally", tally_of(1)]
+    attack.intruder.ask("answer", as_arm, f"registry/*/{ghost}/*", *reported)
     attack.intruder.ask("token", as_arm, f"alive/{ghost}")
     wait_until(lambda: attack.planner.ask("seen", "rosie.trap") == [ghost], "the driver's is seen")
     assert attack.planner.ask("seen", ARM) == [real]
@@ -325,7 +325,7 @@ def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it
     assert ["planner", "planner"] in names and ["porter", "planner"] in names
     attack.planner.ask("hold", ARM)
     assert twin.refused("move", ARM, "1").startswith("LockedByOther")
-    attack.planner.ask("let_go")
+    attack.planner.ask("unlock")
     twin.close()
     attack.site.members.remove(twin)
 
@@ -399,7 +399,7 @@ def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others
     attack.say(thief, attack.key("thief"), attack.call(thief, "thief", "move", 2))
     attack.planner.ask("ended")
     assert attack.planner.ask("still_held")
-    attack.planner.ask("let_go")
+    attack.planner.ask("unlock")
     attack.planner.ask("move", ARM, "1")
     assert attack.moved() == [*before, 1, 0]
 

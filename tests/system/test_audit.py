@@ -38,7 +38,7 @@ administer = ["rosie"]
         return rosie_up()
 
 
-def told(trade_command: Command, folder: Path, *words: str) -> list[dict[str, Any]]:
+def reported(trade_command: Command, folder: Path, *words: str) -> list[dict[str, Any]]:
     done = trade_command("audit", folder, "--json", *words)
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -64,10 +64,10 @@ def test_who_called_locked_stopped_and_was_refused_and_why(
         moves[0](0.1)
 
     def complete() -> bool:
-        return len(told(trade_command, folder, "--kind", "refused")) == 4
+        return len(reported(trade_command, folder, "--kind", "refused")) == 4
 
     wait_until(complete)
-    refused = told(trade_command, folder, "--kind", "refused", "--container", "rosie")
+    refused = reported(trade_command, folder, "--kind", "refused", "--container", "rosie")
     assert [(row["what"], row["outcome"]) for row in refused] == [
         ("rosie.neck.pan.move_to", "LockedByOther"),
         ("rosie.neck.pan.move_to", "InvalidArgument"),
@@ -78,12 +78,12 @@ def test_who_called_locked_stopped_and_was_refused_and_why(
     assert "looking" in refused[0]["why"]
     assert "instrument" in refused[2]["why"]
     assert "the door" in refused[3]["why"]
-    [called] = told(trade_command, folder, "--service", "*.move_to", "--kind", "call")
+    [called] = reported(trade_command, folder, "--service", "*.move_to", "--kind", "call")
     assert (called["session"], called["outcome"]) == (str(anna.address), "ok")
-    locks = told(trade_command, folder, "--kind", "lock")
+    locks = reported(trade_command, folder, "--kind", "lock")
     assert [row["what"] for row in locks] == ["locked", "unlocked"]
     assert "rosie.neck.pan" in locks[0]["about"]
-    [estop] = told(trade_command, folder, "--service", "e-stop")
+    [estop] = reported(trade_command, folder, "--service", "e-stop")
     assert (estop["session"], estop["why"]) == (str(berta.address), "the door")
 
 
@@ -97,7 +97,7 @@ def test_a_killed_robot_leaves_a_verifiable_audit_record_that_the_next_boot_cont
 ) -> None:
     folder = tmp_path / "audit"
     start_container("anna").find(where(name="stop", group="rosie.neck.pan"), wait_s=30)()
-    wait_until(lambda: bool(told(trade_command, folder, "--kind", "stop")))
+    wait_until(lambda: bool(reported(trade_command, folder, "--kind", "stop")))
     rosie.program.signal(signal.SIGKILL)
     rosie.program.wait()
     assert trade_command("audit", "verify", folder).returncode == 0
@@ -105,6 +105,6 @@ def test_a_killed_robot_leaves_a_verifiable_audit_record_that_the_next_boot_cont
     again = rosie_up()
     again.program.signal(signal.SIGTERM)
     assert again.program.wait() == 0
-    rows = told(trade_command, folder, "--container", "rosie", "--kind", "audit")
+    rows = reported(trade_command, folder, "--container", "rosie", "--kind", "audit")
     assert [row["what"] for row in rows] == ["began", "began", "ended"]
     assert trade_command("audit", "verify").returncode == 0

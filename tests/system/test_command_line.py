@@ -146,9 +146,9 @@ def test_faults_that_latch_and_heal_are_reported_with_their_remedy(rosie_up, tra
     assert trade_command("call", "rosie.neck.pan.enable").returncode == 0
     with SimControl(rosie.ready["control"]) as control:
         control.brown_out([1])
-    told = rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan" and "enable" in line["fault"])
-    assert told["fault"].endswith("When you have looked: trade call rosie.neck.pan.enable")
-    assert told["at"].startswith("2")
+    reported = rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan" and "enable" in line["fault"])
+    assert reported["fault"].endswith("When you have looked: trade call rosie.neck.pan.enable")
+    assert reported["at"].startswith("2")
     assert trade_command("call", "rosie.neck.pan.enable").returncode == 0
     assert rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan")["fault"] == ""
 
@@ -157,8 +157,8 @@ def test_S19_silence_is_reported_once_with_its_time_and_joints_not_seen_at_rest_
     rosie = rosie_up()
     with SimControl(rosie.ready["control"]) as control:
         control.mute([1, 2])
-    told = {rosie.program.wait_for(lambda line: "did not answer" in line["fault"])["joint"] for _ in range(2)}
-    assert told == {"rosie.neck.pan", "rosie.neck.tilt"}
+    reported = {rosie.program.wait_for(lambda line: "did not answer" in line["fault"])["joint"] for _ in range(2)}
+    assert reported == {"rosie.neck.pan", "rosie.neck.tilt"}
     rosie.program.signal(signal.SIGINT)
     rosie.program.wait()
     said = [line for line in rosie.program.errors if "rosie.neck.pan" in line]
@@ -203,8 +203,8 @@ def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(ru
     program, *words = line.split(": ")[1].partition(" FAULT")[0].split()
     assert program == "trade-hil-sim"
     command = [sys.executable, "-m", "trade_hil_sim", *words, "state"]
-    told = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
-    assert [device["joint"] for device in json.loads(told)["devices"]] == ["neck.pan", "neck.tilt"]
+    reported = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
+    assert [device["joint"] for device in json.loads(reported)["devices"]] == ["neck.pan", "neck.tilt"]
     assert up.line() == "Ctrl-C leaves\n"
     assert re.fullmatch(r"\d\d:\d\d:\d\d no joint has a fault\n", up.line())
 

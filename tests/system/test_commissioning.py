@@ -199,10 +199,10 @@ def bench(system: str, tmp_path: Path) -> Iterator[Bench]:
 @pytest.mark.timeout(300)  # it asks every id at every rate
 def test_new_devices_become_a_robot(bench: Bench) -> None:
     """With WRITE_TABLES=1 in the environment the page's transcript is written again."""
-    told = "\n" + "".join(bench.type(step) for step in STEPS)
+    reported = "\n" + "".join(bench.type(step) for step in STEPS)
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     shown, end, after = rest.partition(MARKS[1])
     if os.environ.get("WRITE_TABLES"):
-        PAGE.write_text(before + mark + told + end + after, encoding="utf-8")
+        PAGE.write_text(before + mark + reported + end + after, encoding="utf-8")
         return
-    assert told == shown
+    assert reported == shown

@@ -42,7 +42,7 @@ Run = Callable[..., Program]
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
-def told(demo: Program, until: str) -> str:
+def reported(demo: Program, until: str) -> str:
     """What it says, up to these words."""
     story = ""
     while until not in story:
@@ -69,7 +69,7 @@ def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     if reason := why_not():
         pytest.skip(reason)
     demo = run(DEMO)
-    story = told(demo, "confirms every line above")
+    story = reported(demo, "confirms every line above")
     assert demo.wait() == 0, demo.errors
     assert "The networks are network namespaces" in story
     assert "has the legs, for 'walk'" in story
@@ -85,7 +85,7 @@ def test_rosie_walks_through_gateways_on_loopback_addresses_and_all_of_it_is_rec
 ) -> None:
     file = tmp_path / "demo.mcap"
     demo = run(DEMO, "--loopback", "--record", file)
-    story = told(demo, "confirms every line above")
+    story = reported(demo, "confirms every line above")
     assert demo.wait() == 0, demo.errors
     assert "loopback addresses of this host, as you said --loopback" in story
     assert "has the legs, for 'walk'" in story
@@ -142,16 +142,16 @@ def by_drives(log: Path, since: float) -> list[Track]:
     tracks: list[Track] = []
     for joint in load(ROSIE).joints_on("legs"):
         assert joint.counts_per_rev
-        told = frames(read_log(log), "tpdo1", device_id=joint.id, since=since)
+        reported = frames(read_log(log), "tpdo1", device_id=joint.id, since=since)
         rad_per_count = math.tau / (joint.counts_per_rev * joint.gear)
-        counts = [int.from_bytes(frame.data[2:6], "little", signed=True) for frame in told]
-        tracks.append(Track([frame.t - since for frame in told], [count * rad_per_count for count in counts]))
+        counts = [int.from_bytes(frame.data[2:6], "little", signed=True) for frame in reported]
+        tracks.append(Track([frame.t - since for frame in reported], [count * rad_per_count for count in counts]))
     return tracks
 
 
 def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:
     demo = run(DEMO, "--mute")
-    story = told(demo, "no longer answer")
+    story = reported(demo, "no longer answer")
     assert demo.wait() == 1
     said = "".join(demo.errors)
     assert "the demo failed" in said
@@ -161,7 +161,7 @@ def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:
 
 def test_a_demo_that_stays_shows_a_page_ends_with_ctrl_c_and_leaves_nothing(run: Run) -> None:
     demo = run(DEMO, "--stay")
-    story = told(demo, "the head turns while you do")
+    story = reported(demo, "the head turns while you do")
     [url], [token] = re.findall(r"in a browser: (\S+)", story), re.findall(r"token: (\S+)", story)
     anna = Client(url, token)
     assert anna.ask("GET", "/").status == 200
@@ -176,7 +176,7 @@ def test_a_demo_that_stays_shows_a_page_ends_with_ctrl_c_and_leaves_nothing(run:
 
 def test_a_demo_that_is_ended_in_the_middle_leaves_nothing(run: Run) -> None:
     demo = run(DEMO, "--stay")
-    story = told(demo, "Two behaviours want the same head")
+    story = reported(demo, "Two behaviours want the same head")
     demo.signal(signal.SIGTERM)
     assert demo.wait() == 130, demo.errors
     assert why_not() or left_of(story) == []

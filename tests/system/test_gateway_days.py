@@ -100,13 +100,13 @@ def everything_is_lost_at_once(bench: Bench, planner: Member) -> None:
 def it_works_again(bench: Bench, planner: Member) -> None:
     """With a lock of its own, and nothing of before continues or comes late."""
     goals = len(events(bench.sim.entries(), "motion_started", device_id=1))
-    planner.ask("let_go")
+    planner.ask("unlock")
     planner.ask("hold_when_there", PAN)
     assert len(events(bench.sim.entries(), "motion_started", device_id=1)) == goals
     planner.ask("started", "move_to", PAN, "0.0", "2.0")
     planner.ask("ended")
     assert abs(bench.rests("neck.pan")[-1]) < 0.05
-    planner.ask("let_go")
+    planner.ask("unlock")
 
 
 def test_S12_a_gateway_that_is_killed_ends_lock_and_motion_and_the_next_one_serves(

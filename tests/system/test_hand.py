@@ -38,6 +38,6 @@ def test_the_example_comes_up_is_activated_by_hand_and_grips(
             state = hand("close")()
             assert (state.holding, control.gripper("left.hand").holding) == ("outside", True)
             assert state.width_m == pytest.approx(0.04, abs=0.003)
-    told = trade_command("call", "rosie.left.hand.state", "--json")
-    assert told.returncode == 0, told.stderr
-    assert '"holding"' in told.stdout
+    reported = trade_command("call", "rosie.left.hand.state", "--json")
+    assert reported.returncode == 0, reported.stderr
+    assert '"holding"' in reported.stdout

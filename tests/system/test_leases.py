@@ -12,7 +12,7 @@ from trade import Container
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.supervisor import ChildServices
 
-STANDS_IN = '[container.a]\nstands_in_for = "rover"\nlease_s = 2.0\nsave_every_s = 1\n'
+STANDBY = '[container.a]\nstands_in_for = "rover"\nlease_s = 2.0\nsave_every_s = 1\n'
 LEASED = '[container.a]\nlease_from = "base"\nsave_every_s = 1\nrestarts = 1\n'
 
 
@@ -53,7 +53,7 @@ def pair(system: str, tmp_path: Path, start_container: Callable[..., Container])
 def test_P71_what_a_lost_gateway_had_is_where_it_is_stood_in_for_with_its_state_and_goes_back_by_hand(
     pair: Pair,
 ) -> None:
-    pair.base.go_by(STANDS_IN + COUNTER)
+    pair.base.go_by(STANDBY + COUNTER)
     pair.rover.go_by(LEASED + COUNTER)
     pair.rover.become("a", "up")
     wait_until(lambda: pair.base.become("a", "elsewhere").why == "rover has it", "rover has asked")
@@ -75,7 +75,7 @@ def test_P71_what_a_lost_gateway_had_is_where_it_is_stood_in_for_with_its_state_
 
 
 def test_what_is_given_up_where_it_is_leased_is_tried_where_it_is_stood_in_for(pair: Pair) -> None:
-    pair.base.go_by(STANDS_IN + COUNTER)
+    pair.base.go_by(STANDBY + COUNTER)
     pair.rover.go_by(LEASED + 'providers = [{ class = "tiny:Dies", groups = ["hall"] }]\n')
     pair.rover.become("a", "given up")
     pair.base.become("a", "up")
@@ -88,14 +88,14 @@ def test_what_is_given_up_where_it_is_leased_is_tried_where_it_is_stood_in_for(p
 def test_S20_what_drives_something_of_its_host_is_leased_only_if_its_class_is_relocatable(
     pair: Pair, class_: str, state: str
 ) -> None:
-    pair.base.go_by(STANDS_IN + COUNTER)
+    pair.base.go_by(STANDBY + COUNTER)
     pair.rover.go_by(LEASED + f'providers = [{{ class = "tiny:{class_}", groups = ["hall"] }}]\n')
     found = pair.rover.become("a", state)
     assert ("it drives wheel of this host" in found.why) == (state == "given up")
 
 
 def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
-    pair.base.go_by(STANDS_IN + COUNTER)
+    pair.base.go_by(STANDBY + COUNTER)
     pair.base.become("a", "elsewhere")
     there = pair.base.supervisor.stand_in("a")
     wait_until(lambda: there.lease(None, "rover", "").turn, "what it had before is known to have ended")

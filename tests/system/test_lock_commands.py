@@ -113,8 +113,8 @@ def test_a_program_that_holds_a_lock_moves_and_other_callers_are_refused(locked,
     with pytest.raises(LockedByOther, match="look around"):
         move()
     assert move("tilt") == pytest.approx(0.05, abs=0.02)
-    [told] = json.loads(trade_command("locks", "--json").stdout)
-    assert (told["resources"], told["purpose"]) == (["rosie.neck.pan"], "look around")
+    [reported] = json.loads(trade_command("locks", "--json").stdout)
+    assert (reported["resources"], reported["purpose"]) == (["rosie.neck.pan"], "look around")
     assert "look around" in trade_command("locks").stdout
     program.end()
     assert program.process.returncode == 7
@@ -125,9 +125,9 @@ def test_a_program_that_holds_a_lock_moves_and_other_callers_are_refused(locked,
 def test_a_lock_by_names_is_of_all_of_them(locked, trade_command: Command) -> None:
     program = locked(WAITS, "--name", "move_*", "--name", "enable")
     assert program.line() == "waiting"
-    [told] = json.loads(trade_command("locks", "--json").stdout)
-    assert told["resources"] == ["rosie.neck.pan", "rosie.neck.tilt"]
-    assert told["purpose"].startswith(sys.executable)
+    [reported] = json.loads(trade_command("locks", "--json").stdout)
+    assert reported["resources"] == ["rosie.neck.pan", "rosie.neck.tilt"]
+    assert reported["purpose"].startswith(sys.executable)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -331,11 +331,11 @@ def test_S09_an_estop_reaches_the_containers_found_and_names_the_silent_endpoint
 
 
 def test_S09_an_estop_that_misses_a_container_or_finds_none_fails(rosie_up, trade_command: Command) -> None:
-    nobody = trade_command("estop", "--limit", "0.2")
-    assert nobody.returncode == 1
-    assert "no container was found" in nobody.stdout
-    assert "NOT RECEIVED by any known container: use the switch that cuts the power" in nobody.stdout
-    assert "is open" not in nobody.stdout
+    stopped = trade_command("estop", "--limit", "0.2")
+    assert stopped.returncode == 1
+    assert "no container was found" in stopped.stdout
+    assert "NOT RECEIVED by any known container: use the switch that cuts the power" in stopped.stdout
+    assert "is open" not in stopped.stdout
     rosie = rosie_up()
     rosie.program.signal(signal.SIGSTOP)
     try:

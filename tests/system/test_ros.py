@@ -92,8 +92,8 @@ class Ros1Node:
         before = len(self._peer.all("called"))
         self._peer.do("call", service, "std_srvs/SetBool", {"data": value})
         wait_until(lambda: len(self._peer.all("called")) > before, f"{service} answers")
-        told = self._peer.all("called")[-1]
-        return told["success"], told["message"]
+        reported = self._peer.all("called")[-1]
+        return reported["success"], reported["message"]
 
     def kill(self) -> None:
         self._peer.end()
@@ -123,8 +123,8 @@ class Ros2Node:
         before = len(self._process.has("set"))
         self._process.ask("set_bool", service=service, data=value)
         wait_until(lambda: len(self._process.has("set")) > before, f"{service} answers")
-        told = self._process.has("set")[-1]
-        return told["success"], told["message"]
+        reported = self._process.has("set")[-1]
+        return reported["success"], reported["message"]
 
     def kill(self) -> None:
         self._process.kill()
@@ -197,7 +197,7 @@ class Bridged:
     def stopped(self, since: float) -> None:
         self.bench.stopped_short(since, HALFWAY_RAD)
 
-    def told_nothing(self, since: float) -> bool:
+    def got_no_goal(self, since: float) -> bool:
         return not writes(self.bench.sim.entries(), device_id=1, register="goal_position", since=since)
 
 
@@ -289,7 +289,7 @@ def test_a_local_lock_holds_against_ros_and_a_ros_lock_against_local_callers(bri
         success, said = node.set_bool("/rosie/neck/pan/lock", True)
         assert not success
         assert "mine" in said
-        assert bridged.told_nothing(locked_at)
+        assert bridged.got_no_goal(locked_at)
     bridged.begun(locked_at)
     killed_at = time.monotonic()
     node.kill()
@@ -312,10 +312,10 @@ def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: 
     def says(value: float) -> Callable[[], bool]:
         def now() -> bool:
             try:
-                told: Any = voltage()
+                reported: Any = voltage()
             except errors.TradeError:
                 return False
-            return told.data == value
+            return reported.data == value
 
         return now
 

@@ -48,15 +48,15 @@ def _answers(state: Handle) -> bool:
 
 def test_S04_a_move_that_meets_its_deadline_is_reported_as_stopped(bench: Bench, look: Handle) -> None:
     look([0.0, 0.0])
-    told: list[type[Exception]] = []
+    reported: list[type[Exception]] = []
     for goal in (1.2, -1.2, 1.2, -1.2, 1.2):  # a busy computer may be late now and then
         with pytest.raises((MotionStopped, OutcomeUnknown)) as ended:
             look.with_(deadline_s=1.0)([goal, 0.0], speed_rad_s=0.1)
-        told.append(ended.type)
+        reported.append(ended.type)
         if ended.type is MotionStopped:
             assert "its call reached its deadline" in str(ended.value)
             break
-    assert told[-1] is MotionStopped
+    assert reported[-1] is MotionStopped
     wait_until(lambda: not bench.moving())
     assert abs(bench.rests("neck.pan")[-1]) < 1.0
 

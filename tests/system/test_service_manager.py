@@ -71,15 +71,15 @@ class Service:
         """Those that run a program of their own by now."""
         return [one for one in psutil.Process(self.process.pid).children() if "mind" in one.cmdline()]
 
-    def tells(self) -> dict[str, str]:
+    def notification(self) -> dict[str, str]:
         lines = self._manager.recv(4096).decode().splitlines()
         return {name: value for name, _, value in (line.partition("=") for line in lines)}
 
     def next_but_alive(self) -> dict[str, str]:
         """Its next notification, besides that it is alive."""
-        while (told := self.tells()) == {"WATCHDOG": "1"}:
+        while (reported := self.notification()) == {"WATCHDOG": "1"}:
             pass
-        return told
+        return reported
 
     def leaves(self) -> None:
         self.process.send_signal(signal.SIGTERM)
@@ -96,10 +96,10 @@ def test_a_gateway_notifies_the_service_manager_reloads_its_file_and_shuts_down(
 ) -> None:
     service = Service(manager, "gateway", str(file))
     try:
-        first = service.tells()
+        first = service.notification()
         assert first["READY"] == "1"
         assert f"is up in system {system}" in first["STATUS"]
-        assert [service.tells() for _ in range(2)] == [{"WATCHDOG": "1"}] * 2
+        assert [service.notification() for _ in range(2)] == [{"WATCHDOG": "1"}] * 2
         file.write_text(file.read_text().replace("system =", "sytem ="))
         assert service.next_but_alive()["RELOADING"] == "1"
         assert "continuing as before" in service.next_but_alive()["STATUS"]
@@ -115,7 +115,7 @@ def test_what_a_gateway_looks_after_does_not_speak_for_it(manager: socket.socket
     file.write_text(f"{file.read_text()}\n[container.mind]\nproviders = []\n")
     service = Service(manager, "gateway", str(file))
     try:
-        assert service.tells()["READY"] == "1"
+        assert service.notification()["READY"] == "1"
         wait_until(service.children, "its container is up")
         [mind] = service.children()
         asked = {"NOTIFY_SOCKET", "WATCHDOG_USEC"}
@@ -130,8 +130,8 @@ def test_what_a_gateway_looks_after_does_not_speak_for_it(manager: socket.socket
 def test_a_robot_notifies_the_service_manager_and_shuts_down(manager: socket.socket, system: str) -> None:
     service = Service(manager, "up", str(ROOT / "examples" / "head.toml"), "--sim")
     try:
-        assert service.tells()["READY"] == "1"
-        assert service.tells() == {"WATCHDOG": "1"}
+        assert service.notification()["READY"] == "1"
+        assert service.notification() == {"WATCHDOG": "1"}
         service.leaves()
     finally:
         service.end()
@@ -149,7 +149,7 @@ def test_S19_a_service_that_is_stopped_leaves_its_robot_as_the_robot_file_says(
     file.write_text(f'system = "{system}"\n[container.head]\nrobot = "{robot}"\n')
     service = Service(manager, "gateway", str(file))
     try:
-        assert service.tells()["READY"] == "1"
+        assert service.notification()["READY"] == "1"
         pan = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=60)
         pan.with_(deadline_s=120).start(1.0, 0.05)
         wait_until(lambda: events(sim.entries(), "motion_started", device_id=1))

@@ -81,7 +81,7 @@ def begun(t: float, counts: int, since: int = 2048) -> Entry:
     )
 
 
-def told(t: float, counts: int, at: int, speed: int = 83) -> Entry:
+def reported(t: float, counts: int, at: int, speed: int = 83) -> Entry:
     """A goal, with its profile: acceleration, velocity, position."""
     return Entry(
         t=t,
@@ -143,19 +143,27 @@ STOP = 104
         ((*OF_BOTH, *DORA), MOVED, ""),  # that it had the one robot says nothing of the other
         ((*OF_BOTH, *EARLIER, Seen(t=3, hold="b:1")), MOVED, "two owners"),
         (GOOD, [*MOVED, begun(6, 2490, 2500), rest(6.1)], ""),  # it settles
-        (GOOD, [begun(3, 2500), told(4, 2310, 2300, STOP), rest(5)], ""),  # stopped on the way
-        (GOOD, [begun(3, 2500), told(4, 2150, 2300, STOP), rest(5)], ""),  # by who knew only where it had been
-        (GOOD, [begun(3, 2500), told(4, 2150, 2300), rest(5)], "no client ordered that"),
-        (GOOD, [begun(3, 2500), told(4, 2500, 2300), rest(5)], "is done again"),
-        (GOOD, [begun(3, 2500), told(7.5, 2500, 2300), rest(8)], "after its deadline"),
+        (GOOD, [begun(3, 2500), reported(4, 2310, 2300, STOP), rest(5)], ""),  # stopped on the way
+        (GOOD, [begun(3, 2500), reported(4, 2150, 2300, STOP), rest(5)], ""),  # by who knew only where it had been
+        (GOOD, [begun(3, 2500), reported(4, 2150, 2300), rest(5)], "no client ordered that"),
+        (GOOD, [begun(3, 2500), reported(4, 2500, 2300), rest(5)], "is done again"),
+        (GOOD, [begun(3, 2500), reported(7.5, 2500, 2300), rest(8)], "after its deadline"),
         (GOOD, [*MOVED, begun(6, 3000, 2500), rest(7)], "no client ordered that"),
         (GOOD, [*MOVED, begun(5.5, 2100, 2500), begun(6, 2500, 2100), rest(7)], "is done again"),
         (GOOD, [begun(7.5, 2500), rest(7.9)], "after its deadline"),
         ((*GOOD, *LATER), [begun(11, 2500), rest(12)], "while b:1 had it"),
-        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), told(11, 2700, 2300), rest(12)], "while it moves for a:1"),
-        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), told(11, 2700, 2480), rest(12)], ""),  # it had all but arrived
-        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), told(8, 2405, 2400, STOP), told(11, 2700, 2405), rest(12)], ""),
-        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), told(8, 2405, 2400, STOP), rest(9), begun(11, 2700), rest(12)], ""),
+        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), reported(11, 2700, 2300), rest(12)], "while it moves for a:1"),
+        ((*GOOD, *LATER, *NEXT), [begun(3, 2500), reported(11, 2700, 2480), rest(12)], ""),  # it had all but arrived
+        (
+            (*GOOD, *LATER, *NEXT),
+            [begun(3, 2500), reported(8, 2405, 2400, STOP), reported(11, 2700, 2405), rest(12)],
+            "",
+        ),
+        (
+            (*GOOD, *LATER, *NEXT),
+            [begun(3, 2500), reported(8, 2405, 2400, STOP), rest(9), begun(11, 2700), rest(12)],
+            "",
+        ),
         ((*GOOD, *EARLIER), MOVED, "two owners"),
         ((*HOLD, ORDER), MOVED, "after its deadline"),
         ((*HOLD, ORDER, Fault(t=3.5, what="kill client", whom="a", until=1e12)), MOVED, ""),
@@ -191,8 +199,14 @@ def test_the_judge_knows_what_is_wrong(records: tuple[Any, ...], entries: list[E
 
 
 def test_motions_are_derived_from_commands_and_device_events() -> None:
-    entries = [told(0.5, 2100, 2048), begun(1, 2500), told(2, 2300, 2290, STOP), told(2.1, 1500, 2301), rest(3)]
-    [one, two] = motions_of([*entries, told(4, 2000, 1500)])["pan"]  # its torque is off, or whatever: it stayed
+    entries = [
+        reported(0.5, 2100, 2048),
+        begun(1, 2500),
+        reported(2, 2300, 2290, STOP),
+        reported(2.1, 1500, 2301),
+        rest(3),
+    ]
+    [one, two] = motions_of([*entries, reported(4, 2000, 1500)])["pan"]  # its torque is off, or whatever: it stayed
     assert one == (1, 2500, 2048, 2.1, True, False)
     assert two == (2.1, 1500, 2301, 3, False, True)
     assert two.far == 801
@@ -218,13 +232,13 @@ def drive_says(t: float, name: str, at: int) -> Entry:
 
 def test_who_comes_to_rest_before_it_has_read_its_next_goal_sets_off_once_for_that() -> None:
     """Its log has the bytes as they came, and on a busy host the servo reads them some milliseconds later."""
-    before = [begun(2, 2500), told(3, 2310, 2300, STOP), told(3.1, 2700, 2309), rest(3.102)]
+    before = [begun(2, 2500), reported(3, 2310, 2300, STOP), reported(3.1, 2700, 2309), rest(3.102)]
     [one, two] = motions_of([*before, begun(3.104, 2700, 2310), rest(5)])["pan"]
     assert (one.stopped, one.rests) == (True, 3.1)
     assert (two.t, two.counts, two.at, two.rests) == (3.1, 2700, 2309, 5)
-    again = motions_of([*before, begun(3.104, 2700, 2310), told(4, 2700, 2500), rest(5)])["pan"]
+    again = motions_of([*before, begun(3.104, 2700, 2310), reported(4, 2700, 2500), rest(5)])["pan"]
     assert [motion.t for motion in again] == [2, 3.1, 4]
-    again = motions_of([*before, told(3.103, 2700, 2310), begun(3.104, 2700, 2310), rest(5)])["pan"]
+    again = motions_of([*before, reported(3.103, 2700, 2310), begun(3.104, 2700, 2310), rest(5)])["pan"]
     assert [motion.t for motion in again] == [2, 3.1, 3.104]
     again = motions_of([*before, begun(3.104, 2700, 2310), rest(5), begun(6, 2700, 2310)])["pan"]
     assert [motion.t for motion in again] == [2, 3.1, 6]  # once is enough

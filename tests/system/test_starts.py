@@ -80,9 +80,9 @@ def test_a_container_that_does_not_join_the_system_is_reported_with_its_process(
 
 
 def refused(sshd: Sshd, *command: str) -> CannotStart:
-    with pytest.raises(CannotStart) as told:
+    with pytest.raises(CannotStart) as reported:
         trade.system.start_container("robot", "eyes", command=command or HERE, ssh_config=sshd.config)
-    return told.value
+    return reported.value
 
 
 def test_a_host_whose_key_is_not_known_is_not_talked_to_and_stays_unknown(sshd: Sshd) -> None:

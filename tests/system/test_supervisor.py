@@ -84,7 +84,7 @@ class Keeping:
     def __init__(self, folder: Path, member: Container, grace_s: float) -> None:
         self.file = folder / "gateway.toml"
         self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.supervisor = Supervisor(lambda: member, self.news.put, folder / "kept", grace_s=grace_s)
         (folder / "tiny.py").write_text(MODULE)
         self.system = member.settings.system
@@ -113,8 +113,8 @@ class Keeping:
 
     def texts(self) -> list[str]:
         while not self.news.empty():
-            self.told.append(self.news.get().text)
-        return self.told
+            self.reported.append(self.news.get().text)
+        return self.reported
 
 
 @pytest.fixture

@@ -35,13 +35,13 @@ class Deployment:
     def say(self, verb: str, *words: str | Path) -> tuple[list[dict], subprocess.CompletedProcess[str]]:
         ssh = self._ssh if verb == "up" else ()
         ended = self._command("system", verb, self.file, *ssh, *words, "--json")
-        told = [json.loads(line) for line in ended.stdout.splitlines()]
-        return told[0] if verb == "status" else told, ended
+        reported = [json.loads(line) for line in ended.stdout.splitlines()]
+        return reported[0] if verb == "status" else reported, ended
 
     def states(self, verb: str, *words: str | Path) -> dict[str, str]:
-        told, ended = self.say(verb, *words)
+        reported, ended = self.say(verb, *words)
         assert ended.returncode == 0 or verb == "status", ended.stderr
-        return {one["container"]: one["state"] for one in told}
+        return {one["container"]: one["state"] for one in reported}
 
     def change(self, before: str, after: str) -> None:
         text = self.file.read_text()
@@ -84,9 +84,9 @@ def home(system: str, tmp_path: Path, sshd: Sshd, trade_command: Command) -> Ite
 
 
 def test_a_system_comes_up_over_its_hosts_in_order_is_left_as_it_is_and_goes_down(home: Deployment) -> None:
-    told, ended = home.say("up")
+    reported, ended = home.say("up")
     assert ended.returncode == 0, ended.stderr
-    assert [(one["container"], one["state"]) for one in told] == [
+    assert [(one["container"], one["state"]) for one in reported] == [
         ("rosie", "started"),
         ("eyes", "started"),
         ("lamps", "started"),
@@ -97,7 +97,7 @@ def test_a_system_comes_up_over_its_hosts_in_order_is_left_as_it_is_and_goes_dow
 
     again, _ = home.say("up")
     assert [one["state"] for one in again] == ["was up"] * 3
-    assert [one["pid"] for one in again] == [one["pid"] for one in told]
+    assert [one["pid"] for one in again] == [one["pid"] for one in reported]
 
     trade.find(where(name="terminate_container", container="eyes"))("it is dark")
     wait_until(lambda: home.states("status") == {"rosie": "up", "eyes": "down", "lamps": "up"})
@@ -120,11 +120,11 @@ def test_what_one_container_lacks_is_made_when_it_is_brought_up_again(home: Depl
 
 def test_what_fails_says_why_and_what_was_begun_is_taken_down_again(home: Deployment) -> None:
     home.change("args = [0.5]", 'args = ["bright", 1]')
-    told, ended = home.say("up")
+    reported, ended = home.say("up")
     assert ended.returncode == 1
     assert "CannotInstantiate" in ended.stderr
     assert "TypeError" in ended.stderr
-    states = [(one["container"], one["state"]) for one in told]
+    states = [(one["container"], one["state"]) for one in reported]
     assert states[2:] == [("lamps", "ended"), ("eyes", "ended"), ("rosie", "ended")]
     assert set(home.states("status").values()) == {"down"}
     wait_until(home.gone)
@@ -133,8 +133,8 @@ def test_what_fails_says_why_and_what_was_begun_is_taken_down_again(home: Deploy
 def test_a_container_that_does_not_start_is_reported_with_the_end_of_its_log(home: Deployment) -> None:
     home.change("sim = true\n", 'after = ["lamps"]\n')
     home.change('after = ["rosie"]\n', "")
-    told, ended = home.say("up", "--keep")
-    assert [one["container"] for one in told] == ["eyes", "lamps"]
+    reported, ended = home.say("up", "--keep")
+    assert [one["container"] for one in reported] == ["eyes", "lamps"]
     assert "rosie was not started" in ended.stderr
     assert "/dev/serial/by-id" in ended.stderr  # what it said of its port
     assert home.states("status") == {"eyes": "up", "lamps": "up", "rosie": "down"}
@@ -167,16 +167,16 @@ def test_a_host_with_a_missing_requirement_is_reported_before_anything_starts(
     home: Deployment, before: str, after: str, said: str
 ) -> None:
     home.change(before, after)
-    told, ended = home.say("up")
-    assert (told, ended.returncode) == ([], 1)
+    reported, ended = home.say("up")
+    assert (reported, ended.returncode) == ([], 1)
     assert said in ended.stderr
     assert said in home.say("up", "--check")[1].stderr
 
 
 def test_a_host_whose_key_is_not_known_gets_nothing_started(home: Deployment, sshd: Sshd) -> None:
     sshd.known_hosts.write_text("")
-    told, ended = home.say("up")
-    assert (told, ended.returncode) == ([], 1)
+    reported, ended = home.say("up")
+    assert (reported, ended.returncode) == ([], 1)
     assert "unknown host key" in ended.stderr
     assert sshd.known_hosts.read_text() == ""
 
@@ -186,9 +186,9 @@ def test_who_is_up_elsewhere_but_not_seen_is_ended_there(home: Deployment) -> No
     estranged.write_text(f'#!/bin/sh\nTRADE_CREDENTIALS=other:secret exec "{TRADE}" "$@"\n')
     estranged.chmod(0o755)
     home.change(str(TRADE), str(estranged))
-    told, ended = home.say("up", "--wait", "1")
+    reported, ended = home.say("up", "--wait", "1")
     assert "not seen" in ended.stderr
-    assert [(one["container"], one["state"]) for one in told[1:]] == [("eyes", "ended"), ("rosie", "ended")]
+    assert [(one["container"], one["state"]) for one in reported[1:]] == [("eyes", "ended"), ("rosie", "ended")]
     wait_until(home.gone)
 
 
@@ -225,7 +225,7 @@ def test_who_interrupts_has_what_was_begun_taken_down_again(
     up = run(*words)
     assert up.json()["container"] == "rosie"
     up.signal(number)
-    up.wait_for(lambda told: (told["container"], told["state"]) == ("rosie", "ended"))
+    up.wait_for(lambda reported: (reported["container"], reported["state"]) == ("rosie", "ended"))
     assert up.wait() != 0
     wait_until(home.gone)
 

@@ -82,7 +82,7 @@ class Pair:
     def position_rad(self, joint: str) -> float:
         return self.sim.control.device(joint).position_rad
 
-    def stands(self, joint: str, position_rad: float) -> bool:
+    def rests_at(self, joint: str, position_rad: float) -> bool:
         return abs(self.position_rad(joint) - position_rad) < TOLERANCE_RAD and self.at_rest()
 
     def at_rest(self) -> bool:
@@ -114,7 +114,7 @@ def test_the_follower_goes_to_the_leader_slowly_then_where_it_goes_and_no_quicke
     approach = [seen.speed_rad_s for seen in said(entries, 1) if seen.t <= arrived]
     assert 0.8 * SLOWLY_RAD_S < max(approach) <= SLOWLY_RAD_S + RAD
     pair.place(1, 0.0)
-    wait_while_up(program, lambda: pair.stands("follower.shoulder.pan", 0.0))
+    wait_while_up(program, lambda: pair.rests_at("follower.shoulder.pan", 0.0))
 
     began = time.monotonic()
     assert pair.hand().wait() == 0
@@ -130,7 +130,7 @@ def test_the_follower_goes_to_the_leader_slowly_then_where_it_goes_and_no_quicke
 
     began = time.monotonic()
     pair.place(5, 1.5)  # all at once: quicker than the follower may
-    wait_while_up(program, lambda: pair.stands("follower.wrist.roll", 1.5))
+    wait_while_up(program, lambda: pair.rests_at("follower.wrist.roll", 1.5))
     entries = pair.sim.entries()
     quickest = max(abs(seen.speed_rad_s) for seen in said(entries, 5, began))
     assert quickest > 0.8 * FOLLOWER_RAD_S
@@ -138,7 +138,7 @@ def test_the_follower_goes_to_the_leader_slowly_then_where_it_goes_and_no_quicke
     assert max(goal_speeds(entries)) <= FOLLOWER_RAD_S + RAD
 
     pair.place(6, JAW_RAD - 0.5)  # beyond the follower's range
-    wait_while_up(program, lambda: pair.stands("follower.jaw", JAW_RAD))
+    wait_while_up(program, lambda: pair.rests_at("follower.jaw", JAW_RAD))
     assert min(seen.position_rad for seen in said(pair.sim.entries(), 6)) >= JAW_RAD - RAD
 
 

@@ -92,13 +92,13 @@ def terminal(
 
 def test_the_transcript_is_what_happens(terminal: Terminal) -> None:
     """With WRITE_TABLES=1 in the environment it is written again."""
-    told = "\n" + "".join(terminal.type(step) for step in STEPS)
+    reported = "\n" + "".join(terminal.type(step) for step in STEPS)
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     shown, end, after = rest.partition(MARKS[1])
     if os.environ.get("WRITE_TABLES"):
-        PAGE.write_text(before + mark + told + end + after, encoding="utf-8")
+        PAGE.write_text(before + mark + reported + end + after, encoding="utf-8")
         return
-    assert told == shown
+    assert reported == shown
 
 
 def test_what_differs_from_run_to_run_is_put_in_words_and_the_rest_stays() -> None:

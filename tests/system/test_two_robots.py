@@ -73,8 +73,8 @@ def test_S14_a_lock_over_two_robots_is_all_or_nothing_while_a_driver_dies_again_
 
 
 def _lose_them_while_moving(rosie: Bench, dora: Bench, planner: Container, after_s: float) -> None:
-    told: list[LockLost] = []
-    lock = planner.lock(BOTH, wait_s=20, on_lost=told.append).acquire()
+    reported: list[LockLost] = []
+    lock = planner.lock(BOTH, wait_s=20, on_lost=reported.append).acquire()
     with lock.use():
         moving = planner.find(where(name="move_to", group="rosie.neck.pan")).with_(deadline_s=120)
         before = len(events(rosie.sim.entries(), "motion_started", device_id=1))
@@ -84,7 +84,7 @@ def _lose_them_while_moving(rosie: Bench, dora: Bench, planner: Container, after
         threading.Event().wait(after_s)
         dora.driver.signal(signal.SIGKILL)
         dora.driver.wait()
-        wait_until(lambda: bool(told))
+        wait_until(lambda: bool(reported))
         wait_until(lambda: bool(rosie.rests("neck.pan", began)))
         assert abs(rosie.rests("neck.pan", began)[0]) < 1.2
         assert run.exception(60) is not None

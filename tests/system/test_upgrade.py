@@ -77,8 +77,8 @@ class Stand:
             host, f"{name}-{self._turns}", identity=name, script=_BEHAVIOUR, through=self._through(version)
         )
         slot = list(_HOSTS).index(name)
-        told = {"slot": slot, "folder": str(self.records), "robots": robots, "speed_rad_s": speed_rad_s}
-        made.tell(json.dumps({**told, "connect": GATEWAY["private" if host == "left" else "public"]}))
+        reported = {"slot": slot, "folder": str(self.records), "robots": robots, "speed_rad_s": speed_rad_s}
+        made.tell(json.dumps({**reported, "connect": GATEWAY["private" if host == "left" else "public"]}))
         self.behaviours[name] = made
 
     def _through(self, version: int) -> list[str]:
@@ -131,21 +131,21 @@ class Stand:
 
         On a busy host one may not have answered yet; then that is said, and it is asked again.
         """
-        told: dict[str, int] = {}
+        reported: dict[str, int] = {}
 
         def all_known() -> bool:
             ended = self.command(host, version, "containers", "--json")
             assert ended.returncode == 0, ended.stderr
-            told.update((info["identity"], info["protocol"]) for info in json.loads(ended.stdout))
-            return 0 not in told.values()
+            reported.update((info["identity"], info["protocol"]) for info in json.loads(ended.stdout))
+            return 0 not in reported.values()
 
         wait_until(all_known, f"{host} knows the version of each container")
-        return told
+        return reported
 
     def sees(self, name: str) -> list[str]:
         return self.behaviours[name].ask("sees")
 
-    def goes_on(self, *names: str) -> None:
+    def continues(self, *names: str) -> None:
         """Each of these continues to move."""
         for name in names:
             self._moves_on(name)
@@ -205,7 +205,7 @@ def test_a_system_changes_version_and_back_while_unaffected_parts_keep_running(s
     stand.behave("near", NOW, ["dora"])
     stand.behave("wide", NOW, ["rosie", "dora"])
     stand.behave("far", NOW, ["dora"])
-    stand.goes_on("near", "wide", "far")
+    stand.continues("near", "wide", "far")
     for before, after in [(NOW, NEXT), (NEXT, NOW)]:
         began = time.monotonic()
         steps: list[Callable[[], None]] = [
@@ -214,13 +214,13 @@ def test_a_system_changes_version_and_back_while_unaffected_parts_keep_running(s
         ]
         for step in steps if first == "gateway" else reversed(steps):
             step()
-            stand.goes_on("near", "far")
+            stand.continues("near", "far")
         stand.behave("later", after, ["rosie"])
-        stand.goes_on("later", "near", "far")
+        stand.continues("later", "near", "far")
         assert (stand.sees("near"), stand.sees("far"), stand.sees("later")) == (["dora"], ["dora"], ["rosie"])
-        told = stand.versions("left", before)
-        assert {told[who] for who in ("door", "rosie", "later")} == {after}
-        assert {told[who] for who in ("dora", "near", "far", "wide")} == {before}
+        reported = stand.versions("left", before)
+        assert {reported[who] for who in ("door", "rosie", "later")} == {after}
+        assert {reported[who] for who in ("dora", "near", "far", "wide")} == {before}
         assert stand.versions("right", after)["dora"] == before
         assert "PROTOCOL" in stand.command("left", before, "containers").stdout
         mixed_until = time.monotonic()  # from then on what near uses goes, too
@@ -229,7 +229,7 @@ def test_a_system_changes_version_and_back_while_unaffected_parts_keep_running(s
         stand.behaviours.pop("later").close()
         for name, robots in {"near": ["dora"], "wide": ["rosie", "dora"], "far": ["dora"]}.items():
             stand.behave(name, after, robots)
-        stand.goes_on("near", "wide", "far")
+        stand.continues("near", "wide", "far")
         assert set(stand.versions("right", after).values()) == {after}
     wrong = {name: behaviour.ask("works") for name, behaviour in stand.behaviours.items()}
     assert not any(wrong.values()), wrong
@@ -252,14 +252,14 @@ def test_S09_an_e_stop_stops_robots_of_both_versions_through_a_gateway_of_either
     for version, other in [(NOW, NEXT), (NEXT, NOW)]:
         for robot in stand.drivers:
             wait_until(lambda robot=robot: stand.moving(robot), f"{robot} moves")
-        report = _told(stand.command("right", version, "estop", "--reason", "smoke", "--json"), 0)
+        report = _reported(stand.command("right", version, "estop", "--reason", "smoke", "--json"), 0)
         assert not stand.moving("rosie")
         assert not stand.moving("dora")
         assert {who.partition("/")[0] for who in report["confirmed"]} >= {"rosie", "dora"}
         robots = {"rosie": NOW, "dora": NEXT}
-        told = {who.partition("/")[0]: number for who, number in report["versions"].items()}
-        assert {who: told.get(who, version) for who in robots} == robots
-        half = _told(stand.command("right2", version, "estop", "--clear", "--json"), 1)
+        reported = {who.partition("/")[0]: number for who, number in report["versions"].items()}
+        assert {who: reported.get(who, version) for who in robots} == robots
+        half = _reported(stand.command("right2", version, "estop", "--clear", "--json"), 1)
         assert {who.partition("/")[0] for who in half["missing"]} >= {who for who in robots if robots[who] == other}
         assert stand.behaviours["far"].ask("estops") == stand.behaviours["further"].ask("estops") == [report["id"]]
         wait_until(lambda: stand.cleared("far", "further"), "nothing is open any more")
@@ -267,8 +267,8 @@ def test_S09_an_e_stop_stops_robots_of_both_versions_through_a_gateway_of_either
 
 def test_S09_an_e_stop_stays_open_in_a_driver_that_goes_to_another_version(stand: Stand) -> None:
     stand.behave("near", NOW, ["rosie"])
-    stand.goes_on("near")
-    report = _told(stand.command("left", NOW, "estop", "--json"), 0)
+    stand.continues("near")
+    report = _reported(stand.command("left", NOW, "estop", "--json"), 0)
     stand.behaviours.pop("near").close()
     stand.change_gateway(NEXT)
     for version in (NEXT, NOW, NEXT):  # each has what the one before wrote down
@@ -279,12 +279,12 @@ def test_S09_an_e_stop_stays_open_in_a_driver_that_goes_to_another_version(stand
         assert stand.behaviours["near"].ask("estops") == [report["id"]]
     began = [entry for entry in stand.drivers["rosie"].sim.entries() if entry.name == "motion_started"]
     assert stand.behaviours["near"].ask("moved") == 0
-    _told(stand.command("left", NOW, "estop", "--clear", "--json"), 1)
+    _reported(stand.command("left", NOW, "estop", "--clear", "--json"), 1)
     wait_until(lambda: stand.cleared("near"), "nothing is open any more")
-    stand.goes_on("near")
+    stand.continues("near")
     assert len([e for e in stand.drivers["rosie"].sim.entries() if e.name == "motion_started"]) > len(began)
 
 
-def _told(ended: "subprocess.CompletedProcess[str]", code: int) -> dict[str, Any]:
+def _reported(ended: "subprocess.CompletedProcess[str]", code: int) -> dict[str, Any]:
     assert ended.returncode == code, f"{ended.stdout}\n{ended.stderr}"
     return json.loads(ended.stdout)

@@ -72,10 +72,10 @@ def test_watch_prints_only_the_requested_group_and_sums_up_a_burst_in_one_line(
     hall.register(Lamp(), "hall.column")
     for number in range(4):
         hall.register(Lamp(), f"hall.row.{number}")
-    told = watching.line()
-    assert " hall " in told
-    assert " came " in told
-    assert "hall.column" not in told
+    reported = watching.line()
+    assert " hall " in reported
+    assert " came " in reported
+    assert "hall.column" not in reported
 
 
 def test_how_busy_it_is_who_is_silent_and_what_is_wrong(
@@ -92,13 +92,13 @@ def test_how_busy_it_is_who_is_silent_and_what_is_wrong(
         assert looking.json()["silent"] == []
         frozen.signal(signal.SIGSTOP)
         try:
-            told = looking.wait_for(lambda shown: shown["silent"] == ["frozen"])
+            reported = looking.wait_for(lambda shown: shown["silent"] == ["frozen"])
         finally:
             frozen.signal(signal.SIGCONT)
         text = trade_command("top", "--count", "1", "--every", "1").stdout
-    assert {"hall", "me"} <= {info["container"] for info in told["containers"]}
-    assert told["silent"] == ["frozen"]
-    assert told["unwell"] == [{"group": "hall.other", "container": "hall", "health": "its wire is loose"}]
-    [locked] = told["locks"]
+    assert {"hall", "me"} <= {info["container"] for info in reported["containers"]}
+    assert reported["silent"] == ["frozen"]
+    assert reported["unwell"] == [{"group": "hall.other", "container": "hall", "health": "its wire is loose"}]
+    [locked] = reported["locks"]
     assert (locked["purpose"], locked["waiting"]) == ("reading", [])
     assert all(words in text for words in ("CPU %", "NOT WELL", "its wire is loose", "LOCKED", "reading"))

@@ -68,6 +68,6 @@ def test_a_joint_of_one_robot_fails_and_the_camera_of_another_takes_a_picture(
     listed = trade_command("faults")
     assert listed.stdout.splitlines()[0].split()[:5] == ["ID", "DEVICE", "FAULT", "STATE", "COUNT"]
     assert fault["id"] in listed.stdout
-    nobody = trade_command("faults", "show", "dora-none")
-    assert nobody.returncode == 1
-    assert "there is no fault 'dora-none'; `trade faults` lists all faults" in nobody.stderr
+    unknown = trade_command("faults", "show", "dora-none")
+    assert unknown.returncode == 1
+    assert "there is no fault 'dora-none'; `trade faults` lists all faults" in unknown.stderr

@@ -204,11 +204,11 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
         """Wait until there is an object on a host that is alive after that moment."""
         found: list[Life] = []
 
-        def is_there() -> bool:
+        def is_known() -> bool:
             found[:] = [life for life in self.lives() if life.host == host and life.last > since]
             return bool(found)
 
-        self._wait(is_there, f"it is on {host}")
+        self._wait(is_known, f"it is on {host}")
         return found[-1]
 
     def begins_with(self, life: Life, known: int) -> None:

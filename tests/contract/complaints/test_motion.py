@@ -38,8 +38,8 @@ def test_overload_latched_until_a_power_cycle(body: Body) -> None:
     wait_until(lambda: motor.state().fault, "state() reports it")
     assert outcome(lambda: motor.move_to(0.1)).startswith("DeviceFault")
     body.strike(Heal())
-    told = outcome(motor.enable)
-    assert not told, f"enable() ended with {told}"
+    reported = outcome(motor.enable)
+    assert not reported, f"enable() ended with {reported}"
     assert abs(motor.move_to(0.0)) < 0.03
 
 

@@ -39,9 +39,9 @@ def test_all_fifteen_complaints_name_a_linked_source() -> None:
 
 
 def test_each_complaint_has_tests_of_its_name_and_each_test_is_a_complaints() -> None:
-    told = {name: row[0] for row in PROVEN for name in names(row[1])}
-    assert set(told) == set(shown())
-    for test, words in told.items():
+    reported = {name: row[0] for row in PROVEN for name in names(row[1])}
+    assert set(reported) == set(shown())
+    for test, words in reported.items():
         assert test.startswith("test_" + re.sub(r"\W+", "_", words.lower().replace("wi-fi", "wifi")))
 
 

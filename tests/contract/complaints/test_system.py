@@ -96,13 +96,13 @@ def test_access_rule_surprises(folder: Path) -> None:
         for who, group in [(who, group) for who in ("planner", "thief") for group in GROUPS]:
             grant = homes[who].services(where(name="grant", group=group))
             [call] = [one for one in grant if one.label == f"{group}.grant"]
-            told = outcome(call)
+            reported = outcome(call)
             meant = "" if (who, group) in ALLOWED else "AccessDenied"
-            assert told.partition(":")[0] == meant, f"a rule over rosie is one over {group}"
+            assert reported.partition(":")[0] == meant, f"a rule over rosie is one over {group}"
             checked = runner.invoke(app, ["policy", "check", who, "call", group, "--policy", str(policy)])
             verdict, _, rule = checked.stdout.strip().partition(": ")
-            assert verdict == ("denied" if told else "allowed"), "trade policy check says otherwise"
-            assert not told or rule in told
+            assert verdict == ("denied" if reported else "allowed"), "trade policy check says otherwise"
+            assert not reported or rule in reported
 
 
 class Spare:

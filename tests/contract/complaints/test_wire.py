@@ -50,9 +50,9 @@ def test_an_empty_reply_taken_for_success(body: Body) -> None:
     enabling = Call(motor.enable)
 
     def ended() -> bool:
-        told: list[float] = []
-        outcome(lambda: told.append(motor.state().position_rad))
-        assert all(abs(angle - 0.5) < 0.01 for angle in told), f"{told[0]:.2f} rad, where the joint never was"
+        reported: list[float] = []
+        outcome(lambda: reported.append(motor.state().position_rad))
+        assert all(abs(angle - 0.5) < 0.01 for angle in reported), f"{reported[0]:.2f} rad, where the joint never was"
         return enabling.ended is not None
 
     wait_until(ended, "enable() has ended")

@@ -92,7 +92,7 @@ class UrRig(SafetyRig):
 
     def judge_ended(self) -> None:
         rested = written_now()
-        self.bench.stands()
+        self.bench.comes_to_rest()
         ended = [*instructions(self.bench.log, "stop_j"), *instructions(self.bench.log, "servo_stop")]
         assert ended
         wait_until(lambda: answers(self.device, rested + 0.5), "time has passed")
@@ -139,7 +139,7 @@ class UrRig(SafetyRig):
 
     def last_resort(self, lost: float) -> None:
         """The controller's RTDE watchdog ends the program, and the arm stops."""
-        self.bench.stands()
+        self.bench.comes_to_rest()
         wait_until(lambda: self.events("program_stopped", lost), "its program has ended")
         assert not self.bench.moves(self.events("program_stopped", lost)[0].t)
 

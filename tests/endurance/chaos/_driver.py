@@ -63,11 +63,11 @@ def main(pipe: Connection, name: str, seed: int, folder: Path, joints: int) -> N
         ended = threading.Event()
         threading.Thread(target=_beat, args=(log, epoch, ended), daemon=True).start()
         pipe.send("ready")
-        _until_told(pipe)
+        _until_asked(pipe)
         ended.set()
 
 
-def _until_told(pipe: Connection) -> None:
+def _until_asked(pipe: Connection) -> None:
     try:
         pipe.recv()
     except (EOFError, OSError):

@@ -153,8 +153,8 @@ class _Connection:
     def settimeout(self, timeout_s: float) -> None: ...
 
     def recv(self, most: int) -> bytes:
-        told, self._data = self._data[: min(most, 7)], self._data[min(most, 7) :]
-        return told
+        reported, self._data = self._data[: min(most, 7)], self._data[min(most, 7) :]
+        return reported
 
 
 def _dashboard_line(data: bytes) -> str:

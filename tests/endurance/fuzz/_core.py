@@ -160,7 +160,7 @@ TARGETS: Final = [
     Target("wire-sample", decode_sample, (Malformed,), encode_message),
     Target("wire-estop-order", lambda data: decode_estop_order(data, "anna"), (Malformed,), encode_message),
     Target("wire-estop-confirmed", decode_estop_confirmed, (Malformed,), encode_message),
-    Target("wire-open-estops", decode_open_estops, (Malformed,), lambda told: encode_message({"estops": told})),
+    Target("wire-open-estops", decode_open_estops, (Malformed,), lambda reported: encode_message({"estops": reported})),
     Target("wire-error", _error, UNREADABLE, encode_message),
     Target("wire-arguments", _arguments, (InvalidArgument, Malformed)),
     Target("wire-key", _text(place_of), (Malformed,)),

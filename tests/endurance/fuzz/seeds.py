@@ -86,8 +86,8 @@ def _wire() -> Iterator[tuple[str, bytes]]:
         if vector["kind"] in _OF_KIND:
             yield _OF_KIND[vector["kind"]], bytes.fromhex(vector["hex"])
     yield "wire-sample", encode_message(StreamSample(PROTOCOL, 1, 1.5, 2, False, EMPTY))
-    told = [["e1", "anna/desk/e1", "smoke", 1.5, {"zone": 2}], ["e2", "bob/page/e2"]]
-    yield "wire-open-estops", encode_message({"v": PROTOCOL + 1, "services": None, "estops": told})
+    reported = [["e1", "anna/desk/e1", "smoke", 1.5, {"zone": 2}], ["e2", "bob/page/e2"]]
+    yield "wire-open-estops", encode_message({"v": PROTOCOL + 1, "services": None, "estops": reported})
     later = [PROTOCOL + 1, "e1", ["e1", "anna/desk/e1", {"text": "smoke"}, None, 7], "more"]
     yield "wire-estop-order", encode_message(later)
     for error in (

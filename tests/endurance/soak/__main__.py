@@ -55,7 +55,7 @@ class Soak:
         self.run = Run()
         self._began = time.monotonic()
         self._ended = threading.Event()
-        self._told = 0.0
+        self._reported = 0.0
         self._known = set[str]()
         """What went wrong, and was reported."""
 
@@ -114,15 +114,15 @@ class Soak:
             silent = 0
             while not self._ended.is_set():
                 try:
-                    told = json.loads(socket.recv(timeout=1))
+                    reported = json.loads(socket.recv(timeout=1))
                 except TimeoutError:
                     silent += 1
                     continue
                 except ConnectionClosed as closed:
                     self.run.complaints.append(f"the page was cut off at {self.now():.0f} s: {closed}")
                     return
-                if "problem" in told:
-                    self.run.complaints.append(f"the page was sent {told} at {self.now():.0f} s")
+                if "problem" in reported:
+                    self.run.complaints.append(f"the page was sent {reported} at {self.now():.0f} s")
                     return
             if silent > 0.1 * self.now():
                 self.run.complaints.append(f"the page heard nothing for {silent} s")
@@ -166,9 +166,9 @@ class Soak:
                         )
 
     def _tell(self, seconds: float) -> None:
-        if time.monotonic() - self._told < 60:
+        if time.monotonic() - self._reported < 60:
             return
-        self._told = time.monotonic()
+        self._reported = time.monotonic()
         last = {said.planner: said for said in self.run.said}
         errors = {f"{name}: {error}": count for name, said in last.items() for error, count in said.errors.items()}
         print(f"{self.now() / 60:.0f} of {seconds / 60:.0f} min, {sum(errors.values())} errors", flush=True)

@@ -18,7 +18,7 @@ _SILENT_S: Final = 120.0
 """A planner that completed no round in so long is stuck."""
 _QUARTERS: Final = 4
 _SILENT: Final = ("DeviceSilent: ", "MotionStopped: ")
-_LET_GO: Final = ("watchdog", "for too long", "it was away", "lost its activation", "is not activated")
+_RELAXED: Final = ("watchdog", "for too long", "it was away", "lost its activation", "is not activated")
 """A driver that was held up holds what moves, and says so; a device that missed it may have stopped by itself."""
 
 
@@ -94,7 +94,7 @@ def _errors(planner: str, last: Said, patience: float) -> Iterator[str]:
 
 def _lost(error: str) -> bool:
     """Whether it says that a device was silent for a moment, or what came of that."""
-    return error.startswith(_SILENT) or (error.startswith("DeviceFault: ") and any(word in error for word in _LET_GO))
+    return error.startswith(_SILENT) or (error.startswith("DeviceFault: ") and any(word in error for word in _RELAXED))
 
 
 def _by_planner(said: Sequence[Said]) -> Mapping[str, list[Said]]:

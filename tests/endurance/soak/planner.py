@@ -169,11 +169,11 @@ class Planner:
 
     def _say(self) -> None:
         asked_us = sorted(self._asked_us)
-        told: dict[str, Any] = {"counts": dict(self._counts), "errors": dict(self._errors)}
+        reported: dict[str, Any] = {"counts": dict(self._counts), "errors": dict(self._errors)}
         if asked_us:
-            told["p50_us"] = statistics.median(asked_us)
-            told["p99_us"] = asked_us[math.ceil(0.99 * len(asked_us)) - 1]
-        print(json.dumps(told), flush=True)
+            reported["p50_us"] = statistics.median(asked_us)
+            reported["p99_us"] = asked_us[math.ceil(0.99 * len(asked_us)) - 1]
+        print(json.dumps(reported), flush=True)
         self._asked_us.clear()
         self._said = time.monotonic()
 

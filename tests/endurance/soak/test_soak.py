@@ -31,7 +31,7 @@ def said(until: int = SECONDS, errors: dict[str, int] | None = None) -> list[Sai
     ]
 
 
-LET_GO = "DeviceFault: rosie.legs.left.hip on can0: error 8130h, it has not heard this driver for too long; remove ..."
+RELAXED = "DeviceFault: rosie.legs.left.hip on can0: error 8130h, it has not heard this driver for too long; remove ..."
 FAULT = "DeviceFault: rosie.tail.tip on can0: overload; remove the cause, then call enable()"
 GOOD = Run(seconds=SECONDS, samples=samples(), said=said(), passers=3)
 
@@ -58,7 +58,7 @@ GOOD = Run(seconds=SECONDS, samples=samples(), said=said(), passers=3)
             "x (3 times)",
         ),
         (Run(seconds=SECONDS, samples=samples(), said=said(errors={"Timeout: x": 1}), patience=0.05), "Timeout: x"),
-        (Run(seconds=SECONDS, samples=samples(), said=said(errors={LET_GO: 1}), patience=0.05), ""),
+        (Run(seconds=SECONDS, samples=samples(), said=said(errors={RELAXED: 1}), patience=0.05), ""),
         (Run(seconds=SECONDS, samples=samples(), said=said(errors={FAULT: 1}), patience=0.05), "overload"),
         (Run(seconds=SECONDS, samples=samples(), said=said(), complaints=["a page was cut off"]), "cut off"),
     ],

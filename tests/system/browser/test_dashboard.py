@@ -41,7 +41,7 @@ def jog(bench: Bench, view: View, button: Any) -> None:
     wait_until(moved, "the joint moves")
 
 
-def stands(bench: Bench) -> None:
+def comes_to_rest(bench: Bench) -> None:
     """It comes to rest and stays, short of the end of its range, where a jog that continued would get."""
 
     def stayed() -> bool:
@@ -58,7 +58,7 @@ def test_a_joint_moves_while_its_button_is_held_and_no_longer(bench: Bench, brow
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
     anna.page.mouse.up()
-    stands(bench)
+    comes_to_rest(bench)
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
@@ -75,7 +75,7 @@ def test_a_joint_moves_while_a_key_is_held_on_its_button(bench: Bench, browsers:
 
     wait_until(moved, "the joint moves")
     anna.page.keyboard.up(key)
-    stands(bench)
+    comes_to_rest(bench)
 
 
 @pytest.mark.parametrize("what", ["blur", "pagehide", "visibilitychange"])
@@ -83,7 +83,7 @@ def test_a_page_that_is_left_moves_nothing(bench: Bench, browsers: Browsers, wha
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
     anna.page.evaluate("what => (what === 'visibilitychange' ? document : window).dispatchEvent(new Event(what))", what)
-    stands(bench)  # although the mouse button is still down
+    comes_to_rest(bench)  # although the mouse button is still down
     expect(anna.plus).to_have_attribute("aria-pressed", "false")
 
 
@@ -91,7 +91,7 @@ def test_S03_a_page_that_is_closed_moves_nothing(bench: Bench, browsers: Browser
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
     anna.page.close()
-    stands(bench)
+    comes_to_rest(bench)
 
 
 def test_S04_a_page_that_is_frozen_moves_nothing(bench: Bench, browsers: Browsers) -> None:
@@ -102,7 +102,7 @@ def test_S04_a_page_that_is_frozen_moves_nothing(bench: Bench, browsers: Browser
     for process in frozen:
         process.send_signal(signal.SIGSTOP)
     try:
-        stands(bench)
+        comes_to_rest(bench)
     finally:
         for process in frozen:
             process.send_signal(signal.SIGCONT)
@@ -118,18 +118,18 @@ def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, 
     was = pan_rad(bench)
     wait_until(lambda: pan_rad(bench) > was + LEAST_RAD, "anna's continues")
     anna.page.mouse.up()
-    stands(bench)
+    comes_to_rest(bench)
     expect(bert.pan.locator(".locked")).not_to_contain_text("for anna")
     jog(bench, bert, bert.minus)
     bert.page.mouse.up()
-    stands(bench)
+    comes_to_rest(bench)
 
 
 def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench, browsers: Browsers) -> None:
     anna, chief = browsers.view("anna"), browsers.view("chief")
     jog(bench, anna, anna.plus)
     chief.page.keyboard.press("Escape")
-    stands(bench)
+    comes_to_rest(bench)
     expect(chief.stopped).to_contain_text("Confirmed by")
     expect(chief.stopped.locator("strong")).to_have_text("E-STOP: nothing moves until it is cleared.")
     expect(anna.stopped).to_contain_text("chief: dashboard")
@@ -150,7 +150,7 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     expect(anna.message).to_have_text("It may move again.")
     jog(bench, anna, anna.plus)
     anna.page.mouse.up()
-    stands(bench)
+    comes_to_rest(bench)
 
 
 def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
@@ -178,7 +178,7 @@ def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers:
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
     http.program.signal(signal.SIGKILL)
-    stands(bench)
+    comes_to_rest(bench)
     expect(anna.link).to_contain_text("Not connected")
     expect(anna.plus).to_be_disabled()
     anna.page.mouse.up()
@@ -187,7 +187,7 @@ def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers:
     expect(anna.plus).to_be_enabled()
     jog(bench, anna, anna.plus)
     anna.page.mouse.up()
-    stands(bench)
+    comes_to_rest(bench)
 
 
 def test_who_may_only_look_cannot_act_but_for_the_e_stop(bench: Bench, browsers: Browsers) -> None:

@@ -48,7 +48,7 @@ def conformance(*words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
 
 
-def told(ended: "subprocess.CompletedProcess[str]") -> list[dict[str, Any]]:
+def reported(ended: "subprocess.CompletedProcess[str]") -> list[dict[str, Any]]:
     return [json.loads(line) for line in ended.stdout.splitlines()]
 
 
@@ -63,7 +63,7 @@ def failed(outcomes: Sequence[dict[str, Any]]) -> dict[str, str]:
 @pytest.mark.timeout(600)
 def test_a_container_of_this_project_passes_every_check() -> None:
     ended = conformance("--peer", start(), "--motion", "--json")
-    outcomes = told(ended)
+    outcomes = reported(ended)
     assert failed(outcomes) == {}
     assert [one["check"] for one in outcomes] == [one.name for one in CHECKS]
     assert {one["outcome"] for one in outcomes} == {"ok"}
@@ -75,7 +75,7 @@ def test_a_container_of_this_project_passes_every_check() -> None:
 def test_who_breaks_a_rule_fails_its_check(broken: str) -> None:
     only = ("--only", "presence", "--only", NOTICED_BY[broken])
     ended = conformance("--peer", start(broken), "--motion", *only, "--json")
-    assert list(failed(told(ended))) == [NOTICED_BY[broken]], ended.stdout
+    assert list(failed(reported(ended))) == [NOTICED_BY[broken]], ended.stdout
     assert ended.returncode == 1
 
 
@@ -111,7 +111,7 @@ def test_without_motion_the_arm_is_never_turned_and_need_not_be_there(arm: str, 
     program, note = tmp_path / "noting.py", tmp_path / "turned"
     program.write_text(NOTING.format(here=str(PEER.parent), note=str(note), arm=arm), encoding="utf-8")
     ended = conformance("--peer", f"{sys.executable} {program}", "--json")
-    outcomes = told(ended)
+    outcomes = reported(ended)
     assert failed(outcomes) == {}
     assert {one["check"] for one in outcomes if one["outcome"] == "ok"} == {one.name for one in CHECKS if one.still}
     why = {one["why"] for one in outcomes if one["outcome"] == "left out"}
@@ -142,7 +142,7 @@ def test_a_shell_that_starts_it_leaves_nothing_behind(signs: str, tmp_path: Path
     finally:
         os.close(reader)
     assert set(began.split()) == {b"began"}
-    assert bool(failed(told(ended))) == (signs == "none"), ended.stdout
+    assert bool(failed(reported(ended))) == (signs == "none"), ended.stdout
 
 
 def test_a_command_that_ends_fails_what_it_is_asked_and_says_what_it_said() -> None:
@@ -171,7 +171,7 @@ def test_an_unknown_check_and_a_missing_command_are_mistakes_of_the_words() -> N
 
 
 def test_the_checks_are_listed_with_their_rules() -> None:
-    listed = told(conformance("--list", "--json"))[0]
+    listed = reported(conformance("--list", "--json"))[0]
     assert [one["check"] for one in listed] == [one.name for one in CHECKS]
     assert all(one["rule"] and one["what"] for one in listed)
     assert len({one.name for one in CHECKS}) == len(CHECKS)

@@ -31,10 +31,10 @@ def _missing() -> str:
     cargo = shutil.which("cargo")
     if cargo is None:
         return "there is no cargo on this machine"
-    told = subprocess.run([cargo, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    reported = subprocess.run([cargo, "--version"], capture_output=True, text=True, timeout=60, check=False)
     [needed] = re.findall(r'^rust-version = "(.*)"$', (CRATE / "Cargo.toml").read_text(encoding="utf-8"), re.MULTILINE)
-    if told.returncode != 0 or _version(told.stdout) < _version(needed):
-        return f"cargo is too old, or does not run: {told.stdout or told.stderr}; this takes {needed}"
+    if reported.returncode != 0 or _version(reported.stdout) < _version(needed):
+        return f"cargo is too old, or does not run: {reported.stdout or reported.stderr}; this takes {needed}"
     return ""
 
 

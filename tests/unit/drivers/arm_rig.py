@@ -60,7 +60,7 @@ class ArmRig:
         assert moving.error is None
         return moving
 
-    def stands(self) -> None:
+    def comes_to_rest(self) -> None:
         wait_until(lambda: not self.moving, "it is at rest")
         assert self.base_rad < FAR[0] - 0.5
 

@@ -136,7 +136,7 @@ def _close(robot: AttachedRobot) -> None:
 def gate() -> Iterator[Gate]:
     made = Gate()
     yield made
-    made.let_go()
+    made.release()
 
 
 @pytest.fixture

@@ -44,8 +44,8 @@ class Subject(ABC):
         self.sound = True
         """Fit for another fault: nothing is left over from the last one."""
         self.well = True
-        self.told: dict[object, str] = {}
-        self.robot = rig.attach(healthy=lambda: self.well, set_health=self.told.__setitem__)
+        self.reported: dict[object, str] = {}
+        self.robot = rig.attach(healthy=lambda: self.well, set_health=self.reported.__setitem__)
         self.provider = self.get()
 
     @abstractmethod
@@ -184,8 +184,8 @@ class Drive(_Joint):
         return self.robot.motor("leg.hip")
 
     def holds(self, since: float) -> list[Entry]:
-        told = self.rig.frames("rpdo1", HIP, since)
-        return [entry for entry in told if int.from_bytes(entry.data[:2], "little") & HALT]
+        reported = self.rig.frames("rpdo1", HIP, since)
+        return [entry for entry in reported if int.from_bytes(entry.data[:2], "little") & HALT]
 
     def exchanges(self, since: float) -> list[Entry]:
         return self.rig.frames("tpdo1", HIP, since)
@@ -240,8 +240,8 @@ class TailServo(_Joint):
         return self.robot.motor("tail.root")
 
     def holds(self, since: float) -> list[Entry]:
-        told = writes(self.log, device_id=self.device_id, register="goal_speed", since=since)
-        return [entry for entry in told if int.from_bytes(entry.data[5:7], "little") == self.full_speed]
+        reported = writes(self.log, device_id=self.device_id, register="goal_speed", since=since)
+        return [entry for entry in reported if int.from_bytes(entry.data[5:7], "little") == self.full_speed]
 
     def exchanges(self, since: float) -> list[Entry]:
         asked = instructions(self.log, "sync_read", since=since)

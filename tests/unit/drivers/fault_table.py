@@ -238,7 +238,7 @@ def _arm_stopped(fault: str, strike: Order, says: str, after: Recovery, cure: tu
     return Row("ur", fault, (strike,), DeviceFault, says, says, Stop.ITSELF, None, after, cure=cure)
 
 
-def _arm_let_go(fault: str, *strike: Order, stop: Stop = Stop.PROGRAM, cure: tuple[Order, ...] = (Heal(),)) -> Row:
+def _arm_relaxed(fault: str, *strike: Order, stop: Stop = Stop.PROGRAM, cure: tuple[Order, ...] = (Heal(),)) -> Row:
     return Row("ur", fault, strike, DeviceError, "", "", stop, None, Recovery.NOTHING, cure=cure, refuses=False)
 
 
@@ -252,19 +252,19 @@ _UR: Final = (
     _silent("ur", "frozen clock", Freeze(tick=True)),
     _silent("ur", "late, always", Late(s=1.0, instruction="data"), stop=Stop.HOLD_OR_PROGRAM),
     _forgiven("ur", "late, a little", Late(s=0.02, instruction="data")),
-    _arm_let_go("frozen value", Freeze(), stop=Stop.HOLD)._replace(error=DeviceFault, says="it makes no progress"),
-    _arm_let_go("noise", Garbage(instruction="data", count=1)),
-    _arm_let_go("RTDE link lost", HangUp(kind="rtde")),
+    _arm_relaxed("frozen value", Freeze(), stop=Stop.HOLD)._replace(error=DeviceFault, says="it makes no progress"),
+    _arm_relaxed("noise", Garbage(instruction="data", count=1)),
+    _arm_relaxed("RTDE link lost", HangUp(kind="rtde")),
     _arm_gone("network cut", Absent(), Absent(on=False), Stop.WATCHDOG),
     _arm_gone("connections dropped", Unplug(), Replug(), Stop.WATCHDOG),
     _forgiven("ur", "dashboard lost", Mute(instruction="dashboard")),
-    _arm_let_go("control process killed", Process("KILL")),
-    _arm_let_go("control process hung", Process("STOP")),
-    _arm_let_go("program ended by another client", Dashboard("stop"), stop=Stop.ITSELF),
-    _arm_let_go("remote control off, then killed", Local(), Process("KILL"), stop=Stop.WATCHDOG)._replace(
+    _arm_relaxed("control process killed", Process("KILL")),
+    _arm_relaxed("control process hung", Process("STOP")),
+    _arm_relaxed("program ended by another client", Dashboard("stop"), stop=Stop.ITSELF),
+    _arm_relaxed("remote control off, then killed", Local(), Process("KILL"), stop=Stop.WATCHDOG)._replace(
         refuses=True, cure=(Local(on=False),)
     ),
-    _arm_let_go("script refused, then killed", Mute(instruction="script"), Process("KILL"))._replace(refuses=True),
+    _arm_relaxed("script refused, then killed", Mute(instruction="script"), Process("KILL"))._replace(refuses=True),
     _arm_stopped("protective stop", HardwareFault(bits=3), "protective stop", Recovery.UNLOCK),
     _arm_stopped("blocked", Jam(), "protective stop", Recovery.UNLOCK),
     _arm_stopped("safeguard stop", HardwareFault(bits=5), "safeguard stop", Recovery.NOTHING, _MADE_NORMAL),
@@ -364,12 +364,12 @@ def _orders(row: Row, orders: tuple[Order, ...]) -> str:
 def _order(order: Order, struck: tuple[int, ...]) -> str:
     """An order as one would write it, without what is usual."""
     fields = msgspec.structs.fields(order)
-    told = [
+    reported = [
         f"{field.name} {getattr(order, field.name)}"
         for field in fields
         if getattr(order, field.name) not in (field.default, struck)
     ]
-    return f"`{' '.join([str(order.__struct_config__.tag), *told])}`"
+    return f"`{' '.join([str(order.__struct_config__.tag), *reported])}`"
 
 
 if __name__ == "__main__":

@@ -27,5 +27,5 @@ class Gate:
         self._open.clear()
         assert self._reached.wait(PATIENCE_S)
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         self._open.set()

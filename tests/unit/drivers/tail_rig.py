@@ -106,9 +106,9 @@ def lead_counts(speed_rad_s: float, accel_rad_s2: float = 20.0) -> float:
 
 def measured_before(log: list[Entry], write: Entry) -> int:
     """The position that the servo had last reported when this write came."""
-    told = [entry for entry in log if entry.kind == "sent" and entry.device_id == write.device_id]
-    told = [entry for entry in told if entry.name == "sync_read" and entry.t <= write.t]
-    return int.from_bytes(told[-1].data[5:7], "little")
+    reported = [entry for entry in log if entry.kind == "sent" and entry.device_id == write.device_id]
+    reported = [entry for entry in reported if entry.name == "sync_read" and entry.t <= write.t]
+    return int.from_bytes(reported[-1].data[5:7], "little")
 
 
 @contextmanager

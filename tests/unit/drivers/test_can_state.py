@@ -73,14 +73,18 @@ def test_it_is_a_service_of_the_robot_that_anybody_can_call(
 
 
 def test_joints_groups_and_the_bus_tell_that_the_bus_is_not_well_and_that_it_is_again(leg: Leg) -> None:
-    told: list[tuple[object, str]] = []
-    robot = leg.attach(set_health=lambda provider, health: told.append((provider, health)))
-    everybody = set(robot.providers.values())
+    reported: list[tuple[object, str]] = []
+    robot = leg.attach(set_health=lambda provider, health: reported.append((provider, health)))
+    providers = set(robot.providers.values())
     leg.sim.do(Unplug())
-    wait_until(lambda: {provider for provider, health in told if "CAN bus gone" in health} == everybody, "all tell")
-    told.clear()
+    wait_until(
+        lambda: {provider for provider, health in reported if "CAN bus gone" in health} == providers, "all report it"
+    )
+    reported.clear()
     leg.sim.do(Replug())
-    wait_until(lambda: {provider for provider, health in told if health == "healthy"} == everybody, "all are well")
+    wait_until(
+        lambda: {provider for provider, health in reported if health == "healthy"} == providers, "all are healthy"
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,8 +127,8 @@ def test_the_state_of_a_controller_is_parsed_from_the_reply_of_the_kernel(
     number: int, state: ErrorState | None
 ) -> None:
     data = attribute(2, attribute(1, bytes(32)) + attribute(4, number.to_bytes(4, "little")))
-    told = answer(1, attribute(3, b"can0\0"), attribute(18, attribute(1, b"can") + data))
-    assert parse_link(told) == Link(True, state)
+    reported = answer(1, attribute(3, b"can0\0"), attribute(18, attribute(1, b"can") + data))
+    assert parse_link(reported) == Link(True, state)
     assert parse_link(answer(0)) == Link(False, None)
 
 

@@ -247,8 +247,8 @@ def test_a_drive_holds_its_position_after_a_trajectory_and_moves_again(leg: Leg)
     robot = leg.attach()
     group, hip = robot.group("leg"), robot.motor("leg.hip")
     assert swing(group).wait().error is None
-    mark, told = written_now(), len(positions(leg))
-    wait_until(lambda: len(positions(leg)) > told + 5, "it gets the position to hold")
+    mark, reported = written_now(), len(positions(leg))
+    wait_until(lambda: len(positions(leg)) > reported + 5, "it gets the position to hold")
     assert len(set(positions(leg, HIP, mark))) == 1
     assert hip.move_to(0.2) == pytest.approx(0.2, abs=0.01)
     assert not leg.events("torque_off", HIP, mark)
@@ -342,12 +342,12 @@ def test_a_smooth_way_is_followed_to_the_count_and_after_a_gap_again() -> None:
     stream = Following(1, 0, speed=20_000, accel=100_000, period_s=0.01)
     way = [round(5 * k * k) for k in range(15)] + [980 + 140 * k for k in range(1, 200)]
     way[80:95] = [way[80]] * 15  # the bus thread was held up: nothing new was due
-    told: list[int] = []
+    reported: list[int] = []
     for stream.aim in way:
-        told += run(stream, 1)
-    assert all(abs(a - b) <= 1 for a, b in zip(told[:80], way[:80], strict=True))
-    assert told[-1] == way[-1]
-    steps = [after - before for before, after in itertools.pairwise(told)]
+        reported += run(stream, 1)
+    assert all(abs(a - b) <= 1 for a, b in zip(reported[:80], way[:80], strict=True))
+    assert reported[-1] == way[-1]
+    steps = [after - before for before, after in itertools.pairwise(reported)]
     assert max(steps) <= 201
 
 
@@ -369,9 +369,9 @@ def test_an_unmeasured_joint_is_assumed_to_follow_its_commands() -> None:
     stream = Turning(1, accel=10**9, period_s=0.01, blind_s=0.3)
     stream.end, stream.fastest = 1000, 500.0
     sample, unpack = Sample(0, 0, 0, 1), table.TURNING.layout.unpack
-    told = [unpack(stream.next(sample, 1 + 10_000_000 * k))[-1] for k in range(400)]
-    assert told[0] == 500
-    assert told == sorted(told, reverse=True)
-    assert sum(told) * 0.01 == pytest.approx(1000, abs=20)
+    reported = [unpack(stream.next(sample, 1 + 10_000_000 * k))[-1] for k in range(400)]
+    assert reported[0] == 500
+    assert reported == sorted(reported, reverse=True)
+    assert sum(reported) * 0.01 == pytest.approx(1000, abs=20)
     later = Sample(0, 0, 0, 5_000_000_000)
     assert unpack(stream.next(later, later.at_ns))[-1] == 500

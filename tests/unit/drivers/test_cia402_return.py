@@ -217,9 +217,9 @@ def test_a_driver_process_that_stood_still_finds_its_drives_again_and_moves_noth
             assert process.stdout.readline().startswith(("DeviceFault", "DeviceSilent", "moved"))
             assert not stand.goals(mark)
             for joint, number in (("leg.hip", HIP), ("leg.knee", KNEE)):
-                told = written_now()
+                reported = written_now()
                 wait_until(lambda joint=joint: ask(process, f"{joint} 0.1") == "0.1", f"{joint} is moved")
-                assert stand.started(told) == {number}
+                assert stand.started(reported) == {number}
         finally:
             process.kill()
 

@@ -87,11 +87,11 @@ def test_a_scan_names_who_answers_and_writes_nothing(line: Line) -> None:
 
 def test_a_scan_reports_after_each_rate_what_it_found(line: Line) -> None:
     line.plug(1, 2, bauds=(line.make.factory_baud, line.make.other_baud))
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     rates = [line.make.factory_baud, line.make.other_baud]
-    found = scan(line.commissioner, line.port, rates, range(4), lambda baud, count: told.append((baud, count)))
+    found = scan(line.commissioner, line.port, rates, range(4), lambda baud, count: reported.append((baud, count)))
     assert [(one.id, one.baud) for one in found] == [(1, rates[0]), (2, rates[1])]
-    assert told == [(rates[0], 1), (rates[1], 1)]
+    assert reported == [(rates[0], 1), (rates[1], 1)]
 
 
 def test_two_of_one_id_are_one_finding_with_its_remedy(line: Line) -> None:

@@ -47,15 +47,15 @@ def test_it_goes_through_its_points_at_the_speeds_given(given: tuple[list[float]
 def test_the_reported_extremes_are_those_of_the_curve(given: tuple[list[float], list[float], list[float]]) -> None:
     curve = Curve.through(*given)
     samples = [curve.at(time_s) for time_s in fine(curve)[:-1]]
-    for which, told in (
+    for which, reported in (
         (0, [angle for piece in curve.pieces for angle in piece.angles()]),
         (1, [speed for piece in curve.pieces for speed in piece.speeds()]),
     ):
         seen = [sample[which] for sample in samples]
         near = 0.02 * (max(seen) - min(seen)) + 1e-6
-        assert max(told) >= max(seen) - 1e-6
-        assert min(told) <= min(seen) + 1e-6
-        assert max(told) <= max(seen) + near + 0.5 * which * _steepest(curve) * curve.duration_s / 1000 + near
+        assert max(reported) >= max(seen) - 1e-6
+        assert min(reported) <= min(seen) + 1e-6
+        assert max(reported) <= max(seen) + near + 0.5 * which * _steepest(curve) * curve.duration_s / 1000 + near
     accels = [accel for piece in curve.pieces for accel in piece.accels()]
     rises = [(after - before) / (curve.duration_s / 1000) for (_, before), (_, after) in pairwise(samples)]
     assert max(map(abs, rises)) <= max(map(abs, accels)) + 1e-6

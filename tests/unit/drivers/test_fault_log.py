@@ -50,13 +50,13 @@ class Bench:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.clocks = Clocks()
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.log: FaultLog | None = None
         self.store: CountingStore
 
     def open(self, **options: Any) -> FaultLog:
         self.close()
-        self.store = CountingStore(self.path, self.told.append)
+        self.store = CountingStore(self.path, self.reported.append)
         clocks = self.clocks
         self.log = FaultLog("rosie", self.store, clock=lambda: clocks.s, wall=lambda: clocks.wall, **options)
         return self.log
@@ -305,7 +305,7 @@ def test_faults_with_more_to_them_than_this_version_knows_are_read(bench: Bench)
     assert only(log).device == PAN
     bench.begin(HOT, TILT)
     bench.written()
-    assert bench.told == []
+    assert bench.reported == []
     assert {info.device for info in bench.open().faults()} == {PAN, TILT}
 
 
@@ -320,7 +320,7 @@ def test_a_file_that_is_corrupt_is_moved_aside_and_faults_are_kept_in_a_new_one(
     bench.begin()
     assert only(bench.open()).kind == "overload"
     assert bench.path.with_name("rosie.sqlite.corrupt-1").read_bytes() == rubbish
-    assert ["is corrupt" in text for text in bench.told] == [True]
+    assert ["is corrupt" in text for text in bench.reported] == [True]
 
 
 def test_without_a_disk_all_is_known_and_said_once_and_written_when_it_is_back(bench: Bench) -> None:
@@ -332,12 +332,12 @@ def test_without_a_disk_all_is_known_and_said_once_and_written_when_it_is_back(b
         bench.written()
         bench.clocks.s += 1
     assert only(log).open
-    assert [text.startswith("no fault is saved: ") for text in bench.told] == [True]
+    assert [text.startswith("no fault is saved: ") for text in bench.reported] == [True]
     bench.path.parent.unlink()
     bench.end(LOAD)
     before = only(log)
     assert only(bench.open()) == before
-    assert bench.told[1].startswith("fault is saved again: ")
+    assert bench.reported[1].startswith("fault is saved again: ")
 
 
 def test_on_a_full_disk_what_was_refused_is_written_when_there_is_room(bench: Bench) -> None:
@@ -354,6 +354,6 @@ def test_on_a_full_disk_what_was_refused_is_written_when_there_is_room(bench: Be
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, before)
-    assert [text.startswith("no fault is saved: ") for text in bench.told] == [True]
+    assert [text.startswith("no fault is saved: ") for text in bench.reported] == [True]
     assert len(log.faults()) == 20
     assert len(bench.open().faults()) == 20

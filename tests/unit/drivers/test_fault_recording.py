@@ -246,8 +246,8 @@ def test_a_device_of_another_driver_is_asked_and_its_mistakes_are_faults_too() -
             wait_until(lambda kind=kind: log.health("rosie.pan") == kind, f"it is {kind!r}")
     finally:
         recorder.close()
-    told = {info.kind: (info.text, info.open) for info in log.faults()}
-    assert told == {
+    reported = {info.kind: (info.text, info.open) for info in log.faults()}
+    assert reported == {
         "overload": ("rosie.pan: overload", False),
         "silent": (str(silent), False),
         "TypeError": (

@@ -49,8 +49,8 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
     _check_stop(row, subject, struck)
 
     stood, rested = subject.travelled, written_now()
-    wait_until(lambda: _tells(subject, row.state), f"state() reports {row.state!r}")
-    wait_until(lambda: _one_of(row.registry, subject.told.get(subject.provider, "healthy")), row.registry)
+    wait_until(lambda: _reports(subject, row.state), f"state() reports {row.state!r}")
+    wait_until(lambda: _one_of(row.registry, subject.reported.get(subject.provider, "healthy")), row.registry)
     if row.refuses:
         _check_refused(row, subject)
     if row.then:
@@ -71,7 +71,7 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
     subject.recover(row.recovery, cured)
     subject.use()
     assert subject.provider.state().fault == ""
-    wait_until(lambda: subject.told.get(subject.provider, "healthy") == "healthy", "it is healthy")
+    wait_until(lambda: subject.reported.get(subject.provider, "healthy") == "healthy", "it is healthy")
     subject.sound = True
 
 
@@ -101,7 +101,7 @@ def _check_stop(row: Row, subject: Subject, struck: float) -> None:
         wait_until(lambda: subject.holds(struck), "it has heard that it is to hold")
         wait_until(lambda: not subject.truth.moving, "it is at rest there")  # it may have stood for a moment before
     if row.stop is Stop.UNTOLD:
-        wait_until(lambda: _tells(subject, row.state), "its silence is noticed")
+        wait_until(lambda: _reports(subject, row.state), "its silence is noticed")
         assert not subject.holds(struck)
     if row.stop is Stop.BLOCKED:
         wait_until(lambda: subject.holds(struck) or _ended_itself(subject, struck), "it holds, or has let go")
@@ -126,7 +126,7 @@ def _check_refused(row: Row, subject: Subject) -> None:
             subject.provider.stop()
 
 
-def _tells(subject: Subject, wanted: type[DeviceError] | str) -> bool:
+def _reports(subject: Subject, wanted: type[DeviceError] | str) -> bool:
     try:
         fault = subject.provider.state().fault
     except DeviceError as error:

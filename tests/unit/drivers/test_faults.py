@@ -173,13 +173,13 @@ def test_a_late_position_is_not_taken_for_a_new_one(head: Rig, robot: AttachedRo
     head.sim.do(sim.Place(ids=(1,), counts=2500))
     moved = written_now()
 
-    def measured_anew() -> bool:
+    def measured_again() -> bool:
         now = state(robot, "neck.pan")
         fresh = now is not None and now.measured_at > moved
         assert now is None or not fresh or now.position_rad == pytest.approx(452 * COUNT_RAD, abs=0.01)
         return now is not None and now.measured_at > moved + 0.2
 
-    wait_until(measured_anew, "later measurements came in")
+    wait_until(measured_again, "later measurements came in")
 
 
 def test_an_adapter_that_echoes_is_no_trouble(head: Rig, robot: AttachedRobot) -> None:

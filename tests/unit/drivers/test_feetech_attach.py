@@ -95,8 +95,8 @@ def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig
     goals = [0.3, -0.2, 0.25, 0.1, -0.3, 0.4]
     mark = written_now()
     assert arm.move_to(goals) == pytest.approx(goals, abs=0.03)
-    told = rig.goals(since=mark)
-    assert [entry.device_id for entry in told if entry.t == told[0].t] == [1, 2, 3, 4, 5, 6]  # in one packet
+    reported = rig.goals(since=mark)
+    assert [entry.device_id for entry in reported if entry.t == reported[0].t] == [1, 2, 3, 4, 5, 6]  # in one packet
     wait_until(lambda: all(rig.events("at_rest", i, mark) for i in range(1, 7)), "all joints rest")
     arrived = [rig.events("at_rest", i, mark)[-1].t for i in range(1, 7)]
     started = [rig.events("motion_started", i, mark)[0].t for i in range(1, 7)]

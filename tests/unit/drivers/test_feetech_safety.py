@@ -40,9 +40,9 @@ def test_S06_no_servo_has_a_watchdog_so_no_goal_is_farther_ahead_than_the_joint_
     root.enable()
     mark = written_now()
     root.move_to(1.2, 1.0)
-    log, told = tail.log, tail.goals(1, mark)
-    assert len(told) > 10
-    for write in told:
+    log, reported = tail.log, tail.goals(1, mark)
+    assert len(reported) > 10
+    for write in reported:
         assert abs(goal_of(write) - measured_before(log, write)) <= lead_counts(1.0)
 
 
@@ -53,8 +53,8 @@ def test_S06_nor_is_one_of_a_set_point(tail: TailRig) -> None:
     root.set_velocity(0.5, 1.0)
     tail.wait_for("at_rest", 1, mark)
     log = tail.log
-    told = [write for write in tail.goals(1, mark) if write.name == "sync_write"]
-    assert all(abs(goal_of(write) - measured_before(log, write)) <= lead_counts(0.5) for write in told)
+    reported = [write for write in tail.goals(1, mark) if write.name == "sync_write"]
+    assert all(abs(goal_of(write) - measured_before(log, write)) <= lead_counts(0.5) for write in reported)
 
 
 # --- S07, S08 stop

@@ -53,8 +53,10 @@ def test_an_odrive_gets_the_commands_that_the_dbc_of_odrive_can_defines(
     dbc: Any, command: Command, data: bytes, signals: dict[str, object]
 ) -> None:
     message = dbc.get_message_by_frame_id(frame_id(1, command))
-    told = message.decode(data.ljust(message.length, b"\0"))
-    assert {name: str(value) if isinstance(signals[name], str) else value for name, value in told.items()} == signals
+    reported = message.decode(data.ljust(message.length, b"\0"))
+    assert {
+        name: str(value) if isinstance(signals[name], str) else value for name, value in reported.items()
+    } == signals
 
 
 def test_a_heartbeat_of_odrive_cans_dbc_is_understood(dbc: Any) -> None:
@@ -96,8 +98,8 @@ def test_driver_and_simulator_agree_on_models_registers_and_status() -> None:
 
 
 def test_the_known_vector_of_a_mit_command() -> None:
-    told = decode_mit(bytes.fromhex("8A3C8210A3333832"), MODELS["DM4310"])
-    assert told == pytest.approx((0.9997, 0.4908, 19.902, 1.0, 0.2466), abs=5e-4)
+    reported = decode_mit(bytes.fromhex("8A3C8210A3333832"), MODELS["DM4310"])
+    assert reported == pytest.approx((0.9997, 0.4908, 19.902, 1.0, 0.2466), abs=5e-4)
 
 
 @given(
@@ -112,11 +114,11 @@ def test_feedback_is_read_as_it_was_written(
 ) -> None:
     ranges = MODELS["DM4310"]
     data = encode_feedback(status, number, (position, velocity, torque), ranges, (30, 41))
-    told = damiao.Feedback.decode(data, damiao.MODELS["DM4310"])
-    assert (told.status, told.nibble, told.temperature_c) == (status, number, 41)
-    assert told.position_rad == pytest.approx(position, abs=25 / 65535)
-    assert told.velocity_rad_s == pytest.approx(velocity, abs=60 / 4095)
-    assert told.torque_nm == pytest.approx(torque, abs=20 / 4095)
+    reported = damiao.Feedback.decode(data, damiao.MODELS["DM4310"])
+    assert (reported.status, reported.nibble, reported.temperature_c) == (status, number, 41)
+    assert reported.position_rad == pytest.approx(position, abs=25 / 65535)
+    assert reported.velocity_rad_s == pytest.approx(velocity, abs=60 / 4095)
+    assert reported.torque_nm == pytest.approx(torque, abs=20 / 4095)
 
 
 @given(data=st.binary(max_size=8))

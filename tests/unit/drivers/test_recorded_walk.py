@@ -1,6 +1,6 @@
 """A walk as others see it: python-can records the frames in candump's format, cantools decodes them by a DBC.
 
-The DBC is written here by hand from what the frames carry (CiA 402-2, docs/drivers.md): no table of ours is used.
+The DBC is written here by hand from what the frames carry (CiA 402-2, docs/drivers.md): no driver table is used.
 """
 
 import threading
@@ -123,9 +123,9 @@ def test_a_walk_is_read_out_of_its_frames_by_cantools(walk: list[Seen]) -> None:
         commanded = [frame.signals["Target"] for frame in raised if frame.name == f"{joint}_COMMAND"]
         assert commanded == pytest.approx(goals, abs=RAD)
         assert arrivals(walk, joint) == pytest.approx(goals, abs=0.01)
-        told = [frame.signals for frame in walk if frame.name == f"{joint}_STATUS"]
-        assert len(told) > 10 * len(STEPS)
-        assert all(signals["OperationEnabled"] and not signals["Fault"] for signals in told)
+        reported = [frame.signals for frame in walk if frame.name == f"{joint}_STATUS"]
+        assert len(reported) > 10 * len(STEPS)
+        assert all(signals["OperationEnabled"] and not signals["Fault"] for signals in reported)
         motion = [frame.signals for frame in walk if frame.name == f"{joint}_MOTION"]
         assert {(signals["Mode"], signals["ErrorCode"]) for signals in motion} == {(1, 0)}
         assert 0.1 < max(abs(signals["Velocity"]) for signals in motion) <= 1.01 * MAX_SPEED_RAD_S
@@ -143,15 +143,15 @@ def test_both_joints_of_a_walk_set_off_between_the_same_two_syncs(walk: list[See
 
 def test_ramps_of_a_walk_are_sent_before_each_set_point_and_within_the_limits(walk: list[Seen]) -> None:
     for joint in ("HIP", "KNEE"):
-        told: dict[str, Any] | None = None
+        reported: dict[str, Any] | None = None
         for frame in walk:
             if frame.name == f"{joint}_PROFILE":
-                told = frame.signals
-                assert 0 < told["Speed"] <= MAX_SPEED_RAD_S + RAD
-                assert 0 < told["Acceleration"] <= 20.0 + RAD
+                reported = frame.signals
+                assert 0 < reported["Speed"] <= MAX_SPEED_RAD_S + RAD
+                assert 0 < reported["Acceleration"] <= 20.0 + RAD
             elif frame.name == f"{joint}_COMMAND" and frame.signals["NewSetPoint"]:
-                assert told is not None
-                told = None
+                assert reported is not None
+                reported = None
 
 
 def arrivals(walk: list[Seen], joint: str) -> list[float]:

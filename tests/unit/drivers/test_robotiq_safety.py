@@ -48,7 +48,7 @@ def test_S01_a_command_of_a_gripper_at_rest_that_expires_while_the_bus_is_held_u
     late = Outcome(getattr(gripper, command), 0.05)
     with call(0.05) as expires_ns:
         sleep_past(expires_ns)
-    gate.let_go()
+    gate.release()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not hand.writes(mark)
 
@@ -104,7 +104,7 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, 
     mark = written_now()
     stop = Outcome(gripper.stop)
     wait_until(lambda: gripper._exchange._stops, "the stop is queued")  # type: ignore[attr-defined]
-    gate.let_go()
+    gate.release()
     assert stop.wait().error is None
     assert isinstance(moving.wait().error, MotionStopped)
     first = instructions(hand.log, since=mark)[0]

@@ -45,9 +45,9 @@ def test_S04_it_ramps_to_its_stop_at_the_joints_acceleration(rig: Rig) -> None:
     mark = written_now()
     pan.set_velocity(1.0, 1.0)
     wait_until(lambda: rig.goals(1, mark), "it got a goal")
-    told = rig.goals(1, mark)[0]
-    rest = rig.wait_for("at_rest", 1, told.t)
-    held = rig.goals(1, told.t + 1e-6)[0]
+    reported = rig.goals(1, mark)[0]
+    rest = rig.wait_for("at_rest", 1, reported.t)
+    held = rig.goals(1, reported.t + 1e-6)[0]
     assert rest.t - held.t > 0.8 * 1.0 / 2.0
 
 
@@ -133,7 +133,7 @@ def test_S01_a_set_point_held_up_beyond_its_time_is_never_written(head: Rig, gat
     late = Outcome(lambda: pan.set_velocity(0.5, 0.05))
     with call(0.1) as expires_ns:
         sleep_past(expires_ns)
-    gate.let_go()
+    gate.release()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not head.moves(since=mark)
 
@@ -148,7 +148,7 @@ def test_S08_a_stop_ends_a_set_point_and_what_was_under_way(head: Rig, gate: Gat
     wait_until(lambda: pan._exchange._inbox, "the renewal is admitted")  # type: ignore[attr-defined]
     stop = Outcome(pan.stop)
     wait_until(lambda: pan._exchange._stops, "the stop is admitted")  # type: ignore[attr-defined]
-    gate.let_go()
+    gate.release()
     stop.wait()
     assert isinstance(renewal.wait().error, MotionStopped)
     assert all(goal_counts(entry) < 2048 + 1.3 * COUNTS_PER_RAD for entry in head.goals(1, mark))

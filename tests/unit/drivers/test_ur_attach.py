@@ -37,7 +37,7 @@ def test_S19_leaving_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> 
     mark = written_now()
     rig.robot.close()
     assert isinstance(moving.wait().error, MotionStopped)
-    rig.stands()
+    rig.comes_to_rest()
     wait_until(lambda: rig.truth.program == "", "its program has ended")
     assert not rig.moves(mark)
     assert (rig.truth.robot_mode, rig.truth.safety_mode) == ("RUNNING", "NORMAL")

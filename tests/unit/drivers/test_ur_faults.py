@@ -53,7 +53,7 @@ def test_a_blocked_arm_leaves_its_trajectory_and_the_caller_hears_of_it(rig: Arm
     follower.join(30)
     assert errors
     rig.sim.do(Heal())
-    rig.stands()
+    rig.comes_to_rest()
 
 
 def test_another_move_takes_over_and_the_one_before_hears_of_it(rig: ArmRig) -> None:

@@ -59,7 +59,7 @@ def test_S01_what_waits_in_the_process_that_commands_expires_there(rig: ArmRig) 
 def test_S04_a_set_point_that_is_not_renewed_ends_in_a_stop(rig: ArmRig) -> None:
     rig.arm.servo(FAR, 0.3)
     wait_until(lambda: rig.base_rad > 0.02, "it is under way")
-    rig.stands()
+    rig.comes_to_rest()
     last = rig.moves()[-1]
     wait_until(lambda: instructions(rig.log, "servo_stop", since=last.t), "the stream is ended")
     mark = written_now()
@@ -94,7 +94,7 @@ def test_S06_without_its_driver_an_arm_that_follows_set_points_stops(free: ArmRi
         wait_until(lambda: free.base_rad > 0.05, "it is under way")
         os.kill(driver.process.pid, number)
         mark = written_now()
-        free.stands()
+        free.comes_to_rest()
         wait_until(lambda: events(free.log, "program_stopped", since=mark), "its program has ended")
         assert not free.moves(events(free.log, "program_stopped", since=mark)[0].t)
 
@@ -105,7 +105,7 @@ def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchd
     [pid] = children("control")
     os.kill(pid, signal.SIGKILL)
     assert isinstance(moving.wait().error, DeviceFault)
-    rig.stands()
+    rig.comes_to_rest()
     assert events(rig.log, "watchdog_expired")
     wait_until(lambda: children("control"), "there is a new one")
     mark = written_now()
@@ -134,7 +134,7 @@ def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_go_on(
     clock, asleep = exchange.lasting_clock, written_now()
     monkeypatch.setattr(exchange, "lasting_clock", lambda: clock() + 3600 * 10**9)
     error = moving.wait().error
-    rig.stands()
+    rig.comes_to_rest()
     assert len(rig.moves(asleep)) < 20  # a set-point that continues for its second is sent more than a hundred times
     mark = written_now()
     if how != "servo":  # whose call was answered when it began
@@ -168,7 +168,7 @@ def test_S07_a_stop_is_the_first_thing_the_controller_hears_however_many_wait(ri
     released.set()
     assert all(one.wait().error is not None for one in (moving, *waiting))
     assert stopping.wait().error is None
-    rig.stands()
+    rig.comes_to_rest()
     assert not rig.moves(mark)
 
 
@@ -208,7 +208,7 @@ def test_S10_a_stop_goes_through_the_dashboard_and_the_process_that_commands(rig
     assert not rig.moving
     assert [e for e in instructions(rig.log, "dashboard", since=mark) if e.detail.startswith("stop ->")]
     assert not rig.moves(mark)
-    rig.stands()
+    rig.comes_to_rest()
 
 
 def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(rig: ArmRig) -> None:
@@ -217,7 +217,7 @@ def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(r
     os.kill(pid, signal.SIGSTOP)
     rig.arm.stop()
     assert isinstance(moving.wait().error, MotionStopped)
-    rig.stands()
+    rig.comes_to_rest()
     wait_until(lambda: children("control") and children("control") != [pid], "it is killed and replaced")
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
 
@@ -227,7 +227,7 @@ def test_S10_a_dashboard_that_does_not_answer_does_not_hinder_a_stop(rig: ArmRig
     rig.sim.do(Mute(instruction="dashboard"))
     rig.arm.stop()
     assert isinstance(moving.wait().error, MotionStopped)
-    rig.stands()
+    rig.comes_to_rest()
 
 
 def test_S10_moves_are_asynchronous_so_that_a_stop_can_come_between(rig: ArmRig) -> None:
@@ -266,7 +266,7 @@ def test_S05_set_points_end_with_their_session(
     wait_until(lambda: shared.base_rad > 0.03, "it is under way")
     guide.close()
     closed = written_now()
-    shared.stands()
+    shared.comes_to_rest()
     ended = [*instructions(shared.log, "stop_j"), *instructions(shared.log, "servo_stop")]
     assert ended
     wait_until(lambda: answers(shared.arm, closed + 0.5), "time has passed")

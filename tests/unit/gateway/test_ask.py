@@ -97,9 +97,9 @@ def test_questions_about_lock_owners_and_faults_are_answered(
     other = memory.container("other")
     memory.settle()
     with other.lock(where(group="rosie.head"), purpose="looking", wait_s=20):
-        told = talk.say("Who has the head?")
-        assert told.text.startswith("tester/other has neck, for 'looking', since ")
-        assert talk.say("what is locked?").data == told.data
+        reported = talk.say("Who has the head?")
+        assert reported.text.startswith("tester/other has neck, for 'looking', since ")
+        assert talk.say("what is locked?").data == reported.data
     dizzy = Head()
     robot.register(dizzy, "dora.head")
     robot.set_health(dizzy, "degraded: dizzy")
@@ -108,10 +108,10 @@ def test_questions_about_lock_owners_and_faults_are_answered(
 
 
 def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory: MemorySystem) -> None:
-    told = talk.say("Stop everything because of smoke!")
+    reported = talk.say("Stop everything because of smoke!")
     memory.settle()
     assert [one.reason for one in robot.estops()] == ["smoke"]
-    assert "confirmed by" in told.text
+    assert "confirmed by" in reported.text
     assert "an e-stop is open" in talk.say("what is wrong").text
 
 

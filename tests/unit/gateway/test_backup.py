@@ -122,8 +122,8 @@ def test_however_the_gateway_file_is_named(
 def test_put_back_everything_is_as_it_was(config: Path, state: Path, out: Path, tmp_path: Path) -> None:
     back_up(config, out, state)
     to = tmp_path / "new" / "etc"
-    told = run("restore", out, "--to", to, "--state", tmp_path / "new" / "var").stdout
-    assert f"trade gateway {to}/gateway.toml --check" in " ".join(told.split())
+    reported = run("restore", out, "--to", to, "--state", tmp_path / "new" / "var").stdout
+    assert f"trade gateway {to}/gateway.toml --check" in " ".join(reported.split())
     assert content(to).items() <= content(config).items()
     assert content(tmp_path / "new" / "var") == {"lab/estop/door/open": b"smoke"}
     for name in KEYS:
@@ -159,8 +159,8 @@ def test_of_a_system_file_it_has_the_gateway_robots_and_rules_of_this_host(
 
 def test_without_any_state_it_says_so(config: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRADE_STATE_DIR", str(tmp_path / "none"))
-    told = run("backup", config / "gateway.toml", out)
-    assert f"there is no state in {tmp_path}/none" in told.stderr.replace("\n", "")
+    reported = run("backup", config / "gateway.toml", out)
+    assert f"there is no state in {tmp_path}/none" in reported.stderr.replace("\n", "")
 
 
 # --- databases
@@ -215,8 +215,8 @@ def test_what_a_database_left_unfinished_does_not_get_into_the_one_put_back(
 
 def test_a_damaged_database_is_kept_as_it_is_and_said(config: Path, state: Path, out: Path, database: Path) -> None:
     database.write_bytes(b"SQLite format 3\0" + b"garbage" * 500)
-    told = run("backup", config / "gateway.toml", out, "--state", state)
-    assert "door.state.sqlite is damaged" in told.stderr.replace("\n", " ")
+    reported = run("backup", config / "gateway.toml", out, "--state", state)
+    assert "door.state.sqlite is damaged" in reported.stderr.replace("\n", " ")
     [entry] = [entry for entry in read_archive(out).files if entry.path.endswith("sqlite")]
     assert entry.sha256 == hashlib.sha256(database.read_bytes()).hexdigest()
 
@@ -277,9 +277,9 @@ def test_who_was_revoked_since_stays_revoked(config: Path, state: Path, out: Pat
     (config / "revoked.toml").write_text('revoked = ["old"]')
     back_up(config, out, state)
     (config / "revoked.toml").write_text('revoked = ["new"]')
-    told = run("restore", out, "--to", config, "--state", tmp_path / "var-again", "--force")
+    reported = run("restore", out, "--to", config, "--state", tmp_path / "var-again", "--force")
     assert read_policy(config / "policy.toml").revoked == {"old", "new"}
-    assert "new stays revoked" in told.stderr
+    assert "new stays revoked" in reported.stderr
 
 
 def test_nothing_is_put_back_beneath_a_container_that_runs(config: Path, state: Path, out: Path) -> None:

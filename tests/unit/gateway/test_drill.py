@@ -146,9 +146,9 @@ def _stop(took_s: float | None, again_s: float | None = None) -> Stop:
 def test_a_drill_is_passed_if_each_joint_kept_its_limit_and_rested(stop: Stop, verdict: str) -> None:
     report = _report(stop)
     assert report.ok == (verdict == "ok")
-    told = as_data(report)
-    assert told["ok"] == report.ok
-    assert told["scenes"][1]["stops"][0]["verdict"] == verdict
+    reported = as_data(report)
+    assert reported["ok"] == report.ok
+    assert reported["scenes"][1]["stops"][0]["verdict"] == verdict
     assert f">{verdict}" in page(report)
 
 
@@ -215,15 +215,15 @@ def test_a_bar_ends_with_the_page_however_long_it_took() -> None:
 class ScriptedStand:
     """A stand whose joint does what a script says: times relative to the failure, and whether it moves from then on."""
 
-    def __init__(self, log: Path, script: list[tuple[float, bool]], after_mending: list[tuple[float, bool]]) -> None:
-        self._log, self._script, self._after_mending = log, script, after_mending
+    def __init__(self, log: Path, script: list[tuple[float, bool]], after_repair: list[tuple[float, bool]]) -> None:
+        self._log, self._script, self._after_repair = log, script, after_repair
         self._recovered = 0
         self.judge = Judge(log)
 
     def recover(self) -> None:
         self._recovered += 1
         if self._recovered == 2:  # the first time is before the failure
-            self._write(time.monotonic(), self._after_mending)
+            self._write(time.monotonic(), self._after_repair)
 
     def call(self, scene: Scene, targets: list[Target]) -> "ScriptedStand":
         return self
@@ -253,7 +253,7 @@ class ScriptedStand:
 
 
 @pytest.mark.parametrize(
-    ("script", "after_mending", "verdict"),
+    ("script", "after_repair", "verdict"),
     [
         ([(0.002, False)], [], "ok"),
         ([(0.002, False), (0.003, True), (0.9, False)], [], "too long"),
@@ -267,13 +267,13 @@ def test_a_joint_is_judged_by_when_it_rested_for_good(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     script: list[tuple[float, bool]],
-    after_mending: list[tuple[float, bool]],
+    after_repair: list[tuple[float, bool]],
     verdict: str,
 ) -> None:
     for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05), ("_REST_S", 2.0)):
         monkeypatch.setattr(_runner, name, seconds)
     targets, _ = targets_of(load(EXAMPLES / "head.toml"))
-    stand = ScriptedStand(tmp_path / "log.jsonl", script, after_mending)
+    stand = ScriptedStand(tmp_path / "log.jsonl", script, after_repair)
     played = play(stand, BY_NAME["unplug"], targets, Drill(unplug=0.5))
     assert (played.problems, [stop.verdict for stop in played.stops]) == ([], [verdict])
 

@@ -75,8 +75,8 @@ def test_a_whole_recording_is_one_episode_at_even_times(tmp_path: Path) -> None:
     file, folder = recording(tmp_path / "walk.mcap"), tmp_path / "set"
     done = export(file, folder, "--group", "rosie.head", "--fps", "30", "--json")
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)
-    assert (told["episodes"], told["frames"], told["joints"], told["tasks"]) == (1, 300, HEAD, ["walk"])
+    reported = json.loads(done.stdout)
+    assert (reported["episodes"], reported["frames"], reported["joints"], reported["tasks"]) == (1, 300, HEAD, ["walk"])
     data = rows(folder)
     assert [row["frame_index"] for row in data] == [row["index"] for row in data] == list(range(300))
     assert [row["timestamp"] for row in data] == pytest.approx([number / 30 for number in range(300)])
@@ -183,12 +183,12 @@ def test_the_tables_are_laid_out_as_version_3_says(tmp_path: Path) -> None:
     assert info["data_path"].format(chunk_index=0, file_index=0) in files
     schema = parquet.read_schema(tmp_path / "set/data/chunk-000/file-000.parquet")
     assert schema.names == list(info["features"])
-    for name, told in info["features"].items():
+    for name, reported in info["features"].items():
         kind = schema.field(name).type
-        if told["shape"] == [1]:
-            assert str(kind) in {told["dtype"], {"float32": "float"}.get(told["dtype"])}
+        if reported["shape"] == [1]:
+            assert str(kind) in {reported["dtype"], {"float32": "float"}.get(reported["dtype"])}
         else:
-            assert (str(kind.value_type), [kind.list_size], told["names"]) == ("float", told["shape"], HEAD)
+            assert (str(kind.value_type), [kind.list_size], reported["names"]) == ("float", reported["shape"], HEAD)
     tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")
     assert tasks.to_pylist() == [{"task_index": 0, "task": "look about"}]
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
@@ -203,9 +203,11 @@ def test_the_statistics_for_normalisation_are_exported(tmp_path: Path) -> None:
         for joint in (0, 1):
             values = [row[name][joint] for row in rows(tmp_path / "set")]
             mean = sum(values) / len(values)
-            told = {key: numbers[joint] for key, numbers in stats[name].items() if key != "count"}
+            reported = {key: numbers[joint] for key, numbers in stats[name].items() if key != "count"}
             std = math.sqrt(sum((value - mean) ** 2 for value in values) / len(values))
-            assert told == pytest.approx({"min": min(values), "max": max(values), "mean": mean, "std": std}, abs=1e-5)
+            assert reported == pytest.approx(
+                {"min": min(values), "max": max(values), "mean": mean, "std": std}, abs=1e-5
+            )
         assert stats[name]["count"] == [300]
 
 

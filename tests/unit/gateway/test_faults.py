@@ -27,7 +27,7 @@ def log() -> FaultLog:
     return FaultLog("rosie")
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
+def reported(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     return [(line["joint"], line["fault"]) for line in lines]
 
@@ -40,17 +40,19 @@ def test_each_change_is_reported_once_in_both_directions(
     assert not watch.report(out)
     log.begin("rosie.pan", found, 0.0, 0.0)
     assert [watch.report(out), watch.report(out)] == [True, False]
-    assert told(capsys) == [("rosie.pan", line)]
+    assert reported(capsys) == [("rosie.pan", line)]
     log.end("rosie.pan", found.kind, 1.0, 1.0)
     assert [watch.report(out), watch.report(out)] == [True, False]
-    assert told(capsys) == [("rosie.pan", "")]
+    assert reported(capsys) == [("rosie.pan", "")]
 
 
 def test_of_a_gripper_that_is_said_which_is_enough(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
     watch = FaultWatch(log, {"rosie.pan": create_autospec(Gripper, instance=True)})
     log.begin("rosie.pan", OVERLOAD, 0.0, 0.0)
     watch.report(Output(as_json=True))
-    assert told(capsys) == [("rosie.pan", "rosie.pan: overload. When you have looked: trade call rosie.pan.activate")]
+    assert reported(capsys) == [
+        ("rosie.pan", "rosie.pan: overload. When you have looked: trade call rosie.pan.activate")
+    ]
 
 
 def test_of_two_faults_the_newest_is_shown_and_health_returns_when_both_are_gone(
@@ -65,4 +67,4 @@ def test_of_two_faults_the_newest_is_shown_and_health_returns_when_both_are_gone
     log.end("rosie.pan", "protective stop", 1.0, 1.0)
     watch.report(out)
     remedied = "rosie.pan: protective stop; `trade call rosie.pan.unlock_protective_stop`"
-    assert [text for _, text in told(capsys)] == ["rosie.pan did not answer", remedied, ""]
+    assert [text for _, text in reported(capsys)] == ["rosie.pan did not answer", remedied, ""]

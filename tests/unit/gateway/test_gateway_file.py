@@ -106,9 +106,9 @@ def test_a_policy_that_is_being_written_when_the_gateway_is_up_does_not_end_it(
 
     monkeypatch.setattr(_gateway, "Gateway", Up)
     monkeypatch.setattr(_gateway, "_say_ready", say_ready)
-    told = CliRunner().invoke(app, ["gateway", str(file)])
-    assert (told.exit_code, told.exception) == (0, None), told.output
-    assert "leaving" in told.stdout
+    reported = CliRunner().invoke(app, ["gateway", str(file)])
+    assert (reported.exit_code, reported.exception) == (0, None), reported.output
+    assert "leaving" in reported.stdout
 
 
 def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:
@@ -222,8 +222,8 @@ def test_streams_of_all_are_limited_where_no_groups_are_named(file: Path) -> Non
     change(file, "export = []", "")
     settings = read_gateway_file(file).settings
     assert (settings.exports, settings.stream_hz["eth0"]) == ({"eth0": ("*",), "eth1": ("*",)}, {"*": 100})
-    told = CliRunner().invoke(app, ["gateway", str(file), "--check"]).stdout
-    assert "at most 100 samples a second of each stream of everything" in " ".join(told.split())
+    reported = CliRunner().invoke(app, ["gateway", str(file), "--check"]).stdout
+    assert "at most 100 samples a second of each stream of everything" in " ".join(reported.split())
 
 
 @pytest.mark.parametrize(
@@ -324,9 +324,9 @@ def test_changes_are_reported_by_name(file: Path) -> None:
 
 
 def test_check_starts_nothing(file: Path) -> None:
-    told = CliRunner().invoke(app, ["gateway", str(file), "--check"])
-    assert told.exit_code == 0
-    assert "is right" in told.stdout
+    reported = CliRunner().invoke(app, ["gateway", str(file), "--check"])
+    assert reported.exit_code == 0
+    assert "is right" in reported.stdout
     change(file, 'interface = "eth1"', 'interface = "eth0"')
     with pytest.raises(ConfigurationError):
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
@@ -342,8 +342,8 @@ def has(monkeypatch: pytest.MonkeyPatch, **addresses: str) -> None:
 
 
 def checked(file: Path) -> str:
-    told = CliRunner().invoke(app, ["gateway", str(file), "--check"])
-    return str(told.exception) if told.exception else told.stderr
+    reported = CliRunner().invoke(app, ["gateway", str(file), "--check"])
+    return str(reported.exception) if reported.exception else reported.stderr
 
 
 def test_interfaces_that_were_swapped_are_refused_before_anything_starts(
@@ -446,9 +446,9 @@ def test_the_share_of_the_example_is_right_and_shown(sharing: Path) -> None:
     assert (guest.system, guest.identity, guest.bridge) == ("clinic", "guest", ())
     assert guest.listen == ("tls/172.16.0.7:7450",)
     assert (plan.file.share["clinic"].export, plan.file.share["clinic"].import_) == (["rosie.head"], ["clinic.map"])
-    told = CliRunner().invoke(app, ["gateway", str(sharing), "--check"]).stdout
-    assert "system clinic, as guest: it sees rosie.head of lab" in told
-    assert "lab sees clinic.map of clinic" in told
+    reported = CliRunner().invoke(app, ["gateway", str(sharing), "--check"]).stdout
+    assert "system clinic, as guest: it sees rosie.head of lab" in reported
+    assert "lab sees clinic.map of clinic" in reported
 
 
 def test_what_is_not_listed_is_not_shared(sharing: Path) -> None:

@@ -81,12 +81,12 @@ def test_the_help_of_each_command_fits_a_narrow_terminal(name: str) -> None:
 )
 def test_words_are_completed(words: str, expected: set[str], other: str) -> None:
     asked = {"_TRADE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, "-c", "import sys; sys.argv[0] = 'trade'; from trade_gateway.cli import main; main()"],
         env={**os.environ, **asked},
         capture_output=True,
         text=True,
         check=True,
     ).stdout.split()
-    assert expected <= set(told)
-    assert other not in told
+    assert expected <= set(reported)
+    assert other not in reported

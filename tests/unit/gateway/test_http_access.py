@@ -97,8 +97,8 @@ def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:
         with opened(robot.me, tmp_path, origins=[page]) as (made, tokens):
             anna = Opened(robot, made, tokens).client()
             asked = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization"}
-            told = Client(made.url).ask("OPTIONS", "/estop", Origin=page, **asked)
-            assert (told.status, told.headers["access-control-allow-origin"]) == (200, page)
+            reported = Client(made.url).ask("OPTIONS", "/estop", Origin=page, **asked)
+            assert (reported.status, reported.headers["access-control-allow-origin"]) == (200, page)
             assert anna.ask("GET", "/services", Origin=page).headers["access-control-allow-origin"] == page
             assert anna.ask("GET", "/services", Origin="http://localhost:5174").status == 403
             with anna.socket(origin=page) as socket:
@@ -185,8 +185,8 @@ def test_no_token_is_in_a_log_or_an_answer(served: Opened, caplog: pytest.LogCap
         with anna.socket(subprotocols=["trade.v1", f"bearer.{anna.token}"]) as page:
             say(page, do="nonsense", id=1)
             heard(page)
-    told = [(record.name, record.getMessage()) for record in caplog.records if record.name != "websockets.client"]
-    showing = {name for name, text in told if wrong in text or anna.token in text}
+    reported = [(record.name, record.getMessage()) for record in caplog.records if record.name != "websockets.client"]
+    showing = {name for name, text in reported if wrong in text or anna.token in text}
     assert not showing
     assert wrong not in str(refused)
     assert anna.token not in served.tokens.read_text()

@@ -80,16 +80,16 @@ def served(tmp_path: Path) -> Iterator[Opened]:
 
 
 def test_each_service_is_described_with_its_arguments(served: Opened) -> None:
-    told = served.client().ask("GET", "/openapi.json").body
-    assert told["openapi"].startswith("3.1")
-    operation = told["paths"]["/call/lamp/set"]["post"]
+    reported = served.client().ask("GET", "/openapi.json").body
+    assert reported["openapi"].startswith("3.1")
+    operation = reported["paths"]["/call/lamp/set"]["post"]
     assert operation["summary"].startswith("set(level: float (0 to 1)")
     assert operation["description"] == "How bright, and in which colour."
     body = operation["requestBody"]["content"]["application/json"]["schema"]
     named = body["properties"]["args"]
     assert named["properties"]["level"] == {"type": "number", "minimum": 0, "maximum": 1}
     assert named["required"] == ["level"]
-    assert "lamp.set.Colour" in told["components"]["schemas"]
+    assert "lamp.set.Colour" in reported["components"]["schemas"]
 
 
 def test_what_comes_and_goes_is_in_the_document_as_it_does(served: Opened) -> None:
@@ -104,13 +104,13 @@ def test_what_comes_and_goes_is_in_the_document_as_it_does(served: Opened) -> No
 
 
 def test_each_operation_has_a_unique_name_and_generators_read_all_of_the_document(served: Opened) -> None:
-    told = served.client().ask("GET", "/openapi.json").body
-    names = [operation["operationId"] for path in told["paths"].values() for operation in path.values()]
+    reported = served.client().ask("GET", "/openapi.json").body
+    names = [operation["operationId"] for path in reported["paths"].values() for operation in path.values()]
     assert len(names) == len(set(names))
-    text = json.dumps(told)
+    text = json.dumps(reported)
     assert '"items": false' not in text
     assert '"title": "' not in text.replace('"title": "TRADE"', "")
-    ends = told["paths"]["/call/lamp/blend"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    ends = reported["paths"]["/call/lamp/blend"]["post"]["requestBody"]["content"]["application/json"]["schema"]
     assert ends["properties"]["args"]["properties"]["ends"]["maxItems"] == 2
 
 

@@ -75,8 +75,8 @@ def test_arguments_that_are_nested_too_deep_are_refused_by_name(
     else:
         with anna.socket() as page:
             page.send(f'{{"do": "call", "id": 1, "group": "lathe", "name": "take", "args": [{shape}]}}')
-            told = json.loads(page.recv(PATIENCE_S))
-        body = told.get("problem", told)
+            reported = json.loads(page.recv(PATIENCE_S))
+        body = reported.get("problem", reported)
         status = body.get("status", 200)
     assert status == (200 if depth < 100 else 400), body
     if depth > 100:
@@ -308,9 +308,9 @@ def test_S09_an_http_gateway_names_unreached_containers_and_calls_the_e_stop_inc
     assert anna.ask("GET", "/sight").body["apart"] == {}
     apart = {"tls/10.0.0.7:7450": "nothing accepts connections there"}
     monkeypatch.setattr(served.robot.me, "reachability", lambda **_: Reachability(("tester/a",), apart=apart))
-    told = anna.ask("POST", "/estop").body
-    assert (told["complete"], told["apart"]) == (False, apart)
-    assert set(told["confirmed"]) >= {"tester/a", "tester/b"}
+    reported = anna.ask("POST", "/estop").body
+    assert (reported["complete"], reported["apart"]) == (False, apart)
+    assert set(reported["confirmed"]) >= {"tester/a", "tester/b"}
 
 
 def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(served: Opened) -> None:

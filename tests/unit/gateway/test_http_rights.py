@@ -87,8 +87,8 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(served: Opened) 
 def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
     served: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[Event] = []
-    monkeypatch.setattr(served.robot.me._parts.audit, "_tell", told.append)
+    reported: list[Event] = []
+    monkeypatch.setattr(served.robot.me._parts.audit, "_tell", reported.append)
     bert, chief = served.client("bert"), served.client("chief")
     bert.call("robot.a.move", 2.0)
     with bert.socket() as page:
@@ -96,13 +96,13 @@ def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
     given = bert.ask("POST", "/estop").body
     bert.ask("POST", "/estop/clear", {"ids": [given["id"]]})
     chief.ask("POST", "/estop/clear", {"ids": [given["id"]]})
-    refused = [(one.who, one.what, one.outcome) for one in told if one.kind == "refused"]
+    refused = [(one.who, one.what, one.outcome) for one in reported if one.kind == "refused"]
     move, clear = ("robot.a.move", "AccessDenied"), (f"e-stop {given['id']}", "AccessDenied")
     assert refused == [("bert", *move), ("bert", *move), ("bert", *clear)]
-    assert "no rule of role viewer" in told[0].why
-    assert [(one.who, one.about) for one in told if one.what == "e-stop clearing"] == [("chief", given["id"])]
+    assert "no rule of role viewer" in reported[0].why
+    assert [(one.who, one.about) for one in reported if one.what == "e-stop clearing"] == [("chief", given["id"])]
     Client(served.gateway.url, "not a token").ask("GET", "/services")
-    assert len([one for one in told if one.kind == "refused"]) == 3  # else anybody could fill the record
+    assert len([one for one in reported if one.kind == "refused"]) == 3  # else anybody could fill the record
 
 
 def test_a_client_learns_its_identity_and_rights(served: Opened) -> None:
@@ -161,18 +161,18 @@ def test_the_log_is_sent_line_by_line_to_clients_that_read_the_system(served: Op
         while "the lamp is hot" not in (line := heard(page)["line"])["text"]:
             assert line["level"] >= 30
         say(page, do="cancel", id=2, which=1)
-        while (told := heard(page)).get("id") != 2:
+        while (reported := heard(page)).get("id") != 2:
             pass
-        assert told["result"] == {"cancelled": True}
+        assert reported["result"] == {"cancelled": True}
     with served.client("anna").socket() as page:
         assert ask(page, do="logs", id=1)["problem"]["title"] == "AccessDenied"
 
 
 def test_a_client_that_reads_the_system_sees_its_policy(served: Opened) -> None:
     chief = served.client("chief")
-    told = chief.ask("GET", "/policy").body
-    assert (told["governed"], told["revoked"]) == (True, [])
-    anna = next(one for one in told["identities"] if one["name"] == "anna")
+    reported = chief.ask("GET", "/policy").body
+    assert (reported["governed"], reported["revoked"]) == (True, [])
+    anna = next(one for one in reported["identities"] if one["name"] == "anna")
     assert (anna["roles"], anna["rights"]["call"], anna["rights"]["administer"]) == (["operator"], ["robot.a"], [])
 
 
@@ -185,13 +185,16 @@ def test_traced_calls_are_reported_as_they_end_to_clients_that_read_the_system(s
             for number in (1.0, 2.0):  # earlier calls are shown at most once, new ones are shown, too
                 anna.call("robot.a.where_is_it")
                 anna.call("robot.a.move", number)
-                told = [heard(page)["call"] for _ in ("asked", "served")]
-                assert {one["service"] for one in told} == {"robot.a.move"}
-                assert {one["side"] for one in told} == {"asked", "served"}
-                assert len({one["id"] for one in told}) == 1
-                assert all("/anna." in one["session"] for one in told)
+                reported = [heard(page)["call"] for _ in ("asked", "served")]
+                assert {one["service"] for one in reported} == {"robot.a.move"}
+                assert {one["side"] for one in reported} == {"asked", "served"}
+                assert len({one["id"] for one in reported}) == 1
+                assert all("/anna." in one["session"] for one in reported)
             say(page, do="cancel", id=2, which=1)
-            assert {(told := heard(page))["id"]: told["result"] for _ in "12"} == {1: None, 2: {"cancelled": True}}
+            assert {(reported := heard(page))["id"]: reported["result"] for _ in "12"} == {
+                1: None,
+                2: {"cancelled": True},
+            }
             say(page, do="calls", id=3, reads=True)
             assert heard(page)["call"]["service"] == "robot.a.where_is_it"
         with anna.socket() as page:
@@ -227,9 +230,9 @@ def test_streams_are_the_clients_rights_too_and_end_with_them(served: Opened, tm
         page.send('{"do": "stream", "id": 1, "group": "robot.a", "name": "where_is_it", "hz": 50}')
         assert page.recv(timeout=60)
         govern(served.robot, tmp_path, POLICY.replace('read = ["robot"]', 'read = ["robot.b"]'))
-        while b"problem" not in (told := page.recv(timeout=60, decode=False)):
+        while b"problem" not in (reported := page.recv(timeout=60, decode=False)):
             pass
-        assert b"AccessDenied" in told
+        assert b"AccessDenied" in reported
         denied = ask(page, do="stream", id=2, group="robot.a", name="where_is_it")
         assert denied["problem"]["title"] == "NoSuchService"
 

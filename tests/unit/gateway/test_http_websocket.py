@@ -68,9 +68,9 @@ def test_calls_and_their_errors_are_answered_under_their_ids(served: Opened) -> 
         refused = ask(page, do="call", id=2, group="robot.a", name="move", args=["far"])
         assert refused["problem"]["title"] == "InvalidArgument"
         say(page, do="call", id=3, group="robot.axis", name="stop")
-        told = [heard(page), heard(page)]  # the call that the stop ends may be answered before the stop is
-        assert {"id": 3, "result": None} in told
-        assert {"id": "slow", "result": 2.0} in told
+        reported = [heard(page), heard(page)]  # the call that the stop ends may be answered before the stop is
+        assert {"id": 3, "result": None} in reported
+        assert {"id": "slow", "result": 2.0} in reported
 
 
 def test_a_call_reports_its_progress(served: Opened) -> None:
@@ -78,20 +78,20 @@ def test_a_call_reports_its_progress(served: Opened) -> None:
     served.robot.system.settle()
     with served.client().socket() as page:
         say(page, do="call", id=1, group="walker", name="walk", args=[3])
-        told = [heard(page)]
-        while "progress" in told[-1]:
-            told.append(heard(page))
-        assert told[-1] == {"id": 1, "result": 3}
-        assert [one["progress"] for one in told[:-1]] == sorted(one["progress"] for one in told[:-1])
-        assert told[:-1]
+        reported = [heard(page)]
+        while "progress" in reported[-1]:
+            reported.append(heard(page))
+        assert reported[-1] == {"id": 1, "result": 3}
+        assert [one["progress"] for one in reported[:-1]] == sorted(one["progress"] for one in reported[:-1])
+        assert reported[:-1]
 
 
 def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(served: Opened) -> None:
     served.robot.system.container("walker").register(Walker(), "walker")
     served.robot.system.settle()
     with served.client().socket() as page:
-        told = ask(page, do="call", id=1, group="walker", name="map")
-        assert told["problem"]["title"] == "InvalidResult"
+        reported = ask(page, do="call", id=1, group="walker", name="map")
+        assert reported["problem"]["title"] == "InvalidResult"
         say(page, do="stream", id=2, group="walker", name="map")
         assert heard(page)["failed"]["title"] == "InvalidResult"
         assert ask(page, **go_on(number=3))["result"] is None
@@ -124,8 +124,8 @@ def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(served: Open
         for number in range(1, 11):
             say(page, **go_on(number=number))
         say(page, do="call", id="stop", group="robot.a", name="stop")
-        told = [heard(page) for _ in range(11)]
-        assert {"id": "stop", "result": None} in told
+        reported = [heard(page) for _ in range(11)]
+        assert {"id": "stop", "result": None} in reported
         served.robot.system.settle()
         wait_until(lambda: not served["a"].resource.calls, "all have ended")
         assert not served["a"].resource.moving
@@ -137,8 +137,8 @@ def test_what_cannot_be_read_is_answered_and_ends_nothing(served: Opened) -> Non
     with served.client().socket() as page:
         for nonsense in ("[", '{"do": "dance", "id": 1}', '{"do": "call", "id": 1}', '{"do":"estop","id":1,"x":2}'):
             page.send(nonsense)
-            told = heard(page)
-            assert told["problem"]["title"] == "BadMessage"
+            reported = heard(page)
+            assert reported["problem"]["title"] == "BadMessage"
         page.send(b"\x00")
         assert heard(page)["problem"]["title"] == "BadMessage"
         assert ask(page, **go_on())["result"] is None
@@ -148,7 +148,7 @@ class Slow:
     """Its stop takes until it is let go."""
 
     def __init__(self) -> None:
-        self.let_go = self.stopped = self.hold = threading.Event()
+        self.go_on = self.stopped = self.hold = threading.Event()
         self.inside = self.most = self.stops = 0
 
     @service
@@ -159,7 +159,7 @@ class Slow:
         self.stops += 1
         self.inside += 1
         self.most = max(self.most, self.inside)
-        self.let_go.wait(30)
+        self.go_on.wait(30)
         self.inside -= 1
 
 
@@ -173,18 +173,18 @@ def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(s
         for number in range(many):
             say(page, do="call", id=number, group="robot.slow", name="stop")
         say(page, do="call", id="seen", group="robot.a", name="where_is_it")
-        told = [heard(page)]
-        while told[-1]["id"] != "seen":
-            told.append(heard(page))
-        refused = [one["id"] for one in told if "problem" in one]
+        reported = [heard(page)]
+        while reported[-1]["id"] != "seen":
+            reported.append(heard(page))
+        refused = [one["id"] for one in reported if "problem" in one]
         assert len(refused) > 100  # beyond those whose answer may be waited for; they are carried out all the same
         assert threading.active_count() - before < 40
         begun = slow.stops
         assert begun <= 4
-        slow.let_go.set()
-        told += [heard(page) for _ in range(many + 1 - len(told))]
-        assert {one["id"] for one in told} == {*range(many), "seen"}
-        assert {one["problem"]["title"] for one in told if "problem" in one} == {"TooMany"}
+        slow.go_on.set()
+        reported += [heard(page) for _ in range(many + 1 - len(reported))]
+        assert {one["id"] for one in reported} == {*range(many), "seen"}
+        assert {one["problem"]["title"] for one in reported if "problem" in one} == {"TooMany"}
         assert slow.stops == begun + 1  # begun after the last of them had come
         assert slow.most <= 4
         assert ask(page, do="call", id="again", group="robot.slow", name="stop") == {"id": "again", "result": None}
@@ -247,9 +247,9 @@ def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(serv
     with served.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot.a")["result"]
         served.robot.me.break_lock([served.robot.find("a")], "it is needed")
-        told = heard(page)
-        assert (told["event"], told["lock"]) == ("lock_lost", taken["lock"])
-        assert told["problem"]["title"] == "LockLost"
+        reported = heard(page)
+        assert (reported["event"], reported["lock"]) == ("lock_lost", taken["lock"])
+        assert reported["problem"]["title"] == "LockLost"
         assert ask(page, **go_on())["problem"]["title"] == "LockLost"
         assert not served["a"].resource.moving
         ask(page, do="unlock", id=2, lock=taken["lock"])
@@ -273,9 +273,9 @@ def test_a_stream_ends_with_its_service(served: Opened) -> None:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=10)
         heard(page)
         served.robot.system.container("a").deregister(served["a"])
-        while "problem" not in (told := heard(page)):
+        while "problem" not in (reported := heard(page)):
             pass
-        assert told["problem"]["title"] == "ServiceGone"
+        assert reported["problem"]["title"] == "ServiceGone"
 
 
 def test_services_that_come_and_go_are_reported(served: Opened) -> None:
@@ -284,8 +284,8 @@ def test_services_that_come_and_go_are_reported(served: Opened) -> None:
         there = sorted(heard(page)["service"]["group"] for _ in range(3))
         assert there == ["robot.a", "robot.axis", "robot.b"]
         served.robot.system.container("b").deregister(served["b"])
-        told = heard(page)
-        assert (told["id"], told["event"], told["service"]["group"]) == (1, "left", "robot.b")
+        reported = heard(page)
+        assert (reported["id"], reported["event"], reported["service"]["group"]) == (1, "left", "robot.b")
         served.robot.system.container("b").register(served["b"], "robot.c")
         assert heard(page)["service"]["group"] == "robot.c"
         assert ask(page, do="cancel", id=2, which=1)["result"] == {"cancelled": True}

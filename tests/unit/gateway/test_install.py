@@ -80,21 +80,21 @@ def said_of(text: str, key: str) -> list[str]:
 
 
 def test_it_writes_both_files_and_says_what_to_run_next(file: Path, root: Path) -> None:
-    told = install(file, root).stdout
+    reported = install(file, root).stdout
     [command] = said_of(unit(root).read_text(), "ExecStart")
     assert command == f"{sys.executable} -m trade_gateway gateway {file}"
     assert UDEV_RULES in rules(root).read_text()
     assert (unit(root).stat().st_mode & 0o777, rules(root).stat().st_mode & 0o777) == (0o644, 0o644)
     for words in ("systemctl daemon-reload", "systemctl enable trade-gateway", "udevadm control --reload"):
-        assert words in told
+        assert words in reported
 
 
 def test_again_it_writes_only_what_has_become_different(file: Path, root: Path) -> None:
     install(file, root)
     before = (unit(root).stat().st_ino, rules(root).stat().st_ino)
-    told = " ".join(install(file, root).stdout.split())
+    reported = " ".join(install(file, root).stdout.split())
     assert (unit(root).stat().st_ino, rules(root).stat().st_ino) == before
-    assert "wrote" not in told
+    assert "wrote" not in reported
     install(file, root, "--user", "robot")
     assert said_of(unit(root).read_text(), "User") == ["robot"]
     assert rules(root).stat().st_ino == before[1]
@@ -123,12 +123,12 @@ def test_what_the_services_user_may_not_read_is_warned_of_with_the_remedy(tmp_pa
     for path, mode in ((file, 0o644), (key, 0o600), (elsewhere, 0o600), (own, 0o755), (papers, 0o700)):
         path.touch()
         path.chmod(mode)
-    told = list(_closed_to("nobody", [file, key, elsewhere]))  # plain: nobody
-    assert [words.split(", so")[0] for words in told] == [
+    reported = list(_closed_to("nobody", [file, key, elsewhere]))  # plain: nobody
+    assert [words.split(", so")[0] for words in reported] == [
         f"user nobody cannot enter {papers}",  # plain: nobody
         f"user nobody cannot read {key}",  # plain: nobody
     ]
-    assert f"sudo chgrp {user.pw_gid} {papers} && sudo chmod 0750 {papers}" in told[0]
+    assert f"sudo chgrp {user.pw_gid} {papers} && sudo chmod 0750 {papers}" in reported[0]
     papers.chmod(0o755)
     key.chmod(0o644)
     assert not list(_closed_to("nobody", [file, key]))  # plain: nobody
@@ -138,9 +138,9 @@ def test_what_the_services_user_may_not_read_is_warned_of_with_the_remedy(tmp_pa
 def test_what_the_service_may_not_find_is_warned_of(file: Path, root: Path, tmp_path: Path) -> None:
     (file.parent / "rosie.toml").write_text(HEAD.replace("/dev/ttyNOWHERE", "/tmp/lines/neck"))
     file.write_text('system = "lab"\n[container.rosie]\nrobot = "rosie.toml"\n')
-    told = " ".join(install(file, tmp_path / "root").stdout.split())
-    assert "warning port /tmp/lines/neck lies in /tmp, which the service does not see" in told
-    assert f"warning file {file} lies in /" in told
+    reported = " ".join(install(file, tmp_path / "root").stdout.split())
+    assert "warning port /tmp/lines/neck lies in /tmp, which the service does not see" in reported
+    assert f"warning file {file} lies in /" in reported
 
 
 def test_what_lies_where_it_lasts_is_not_warned_of(root: Path, tmp_path: Path) -> None:
@@ -166,10 +166,10 @@ def test_a_wrong_gateway_file_writes_nothing(file: Path, root: Path) -> None:
 
 
 def test_it_prints_what_it_would_write(file: Path, root: Path) -> None:
-    told = install(file, root, "--print").stdout
+    reported = install(file, root, "--print").stdout
     assert not root.exists()
     install(file, root)
-    assert told == "".join(f"# {path}\n{path.read_text()}\n" for path in (unit(root), rules(root)))
+    assert reported == "".join(f"# {path}\n{path.read_text()}\n" for path in (unit(root), rules(root)))
 
 
 def test_without_rights_it_says_how_to_get_them(file: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

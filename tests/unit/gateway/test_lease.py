@@ -265,7 +265,7 @@ class TwoHosts(RuleBasedStateMachine):
 
     @precondition(lambda self: self.arbiter.mine)
     @rule()
-    def somebody_hands_it_back(self) -> None:
+    def hand_back(self) -> None:
         self.arbiter.hand_back()
         self.settle()
 

@@ -119,8 +119,8 @@ def test_a_late_page_gets_the_current_locks_and_faults_and_no_other_page_does(li
         for looking in (first, second):
             looking.subscribe("/faults")
             greet_next(live)
-            _, at_ns, told = looking.message()
-            assert (at_ns, told["about"], told["text"]) == (7, "rosie.tail", "silent")
+            _, at_ns, reported = looking.message()
+            assert (at_ns, reported["about"], reported["text"]) == (7, "rosie.tail", "silent")
         second.subscribe("/locks")
         greet_next(live)
         assert second.message()[0] == "/locks"

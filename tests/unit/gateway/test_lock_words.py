@@ -51,11 +51,11 @@ def test_what_helps_is_said_in_words_of_the_command_line(capsys: pytest.CaptureF
     say_error(LockedByOther(resources=("rosie.pan",), owner="anna/desk"))
     say_error(LockLost(resources=("rosie.pan",), reason="its lease ended"))
     say_error(ServiceGone(service="rosie.pan.move_to"))
-    told = capsys.readouterr().err
-    assert "`trade lock --wait SECONDS`" in told
-    assert "`trade unlock GROUP --break REASON`" in told
-    assert "trade.lock(" not in told
-    assert "trade.find(" not in told
+    reported = capsys.readouterr().err
+    assert "`trade lock --wait SECONDS`" in reported
+    assert "`trade unlock GROUP --break REASON`" in reported
+    assert "trade.lock(" not in reported
+    assert "trade.find(" not in reported
 
 
 def test_what_a_device_needs_is_said_as_it_is_typed(capsys: pytest.CaptureFixture[str]) -> None:

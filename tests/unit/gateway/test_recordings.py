@@ -212,7 +212,13 @@ class Kept:
         self.saved: list[tuple[Path, str, int]] = []
         self.problems: list[str] = []
         self.sink = SavedAtFault(
-            folder, Ring(30, 1_000_000), {}, [], lambda *told: self.saved.append(told), self.problems.append, self.clock
+            folder,
+            Ring(30, 1_000_000),
+            {},
+            [],
+            lambda *reported: self.saved.append(reported),
+            self.problems.append,
+            self.clock,
         )
 
     def clock(self) -> float:

@@ -142,8 +142,8 @@ def test_a_file_is_tried_out_without_calling_anything(desk: Desk, file: Path) ->
     assert "alone: missing name='dance', if the service with name='is_dark': would fire now" in text
     assert "call name='note': desk.note in desk: would be called" in text
     assert "NoSuchService: no service matches name='missing'" in text
-    told = json.loads(trade("rules", "test", str(file), "--json").stdout)
-    assert [(one["rule"], one["fires"]) for one in told] == [("greet", False), ("alone", True)]
+    reported = json.loads(trade("rules", "test", str(file), "--json").stdout)
+    assert [(one["rule"], one["fires"]) for one in reported] == [("greet", False), ("alone", True)]
     assert desk.noted == []
 
 

@@ -61,36 +61,36 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def told() -> list[str]:
+def reported() -> list[str]:
     return []
 
 
 @pytest.fixture
-def opened(path: Path, told: list[str]) -> Iterator[Callable[[], StateStore]]:
+def opened(path: Path, reported: list[str]) -> Iterator[Callable[[], StateStore]]:
     made: list[StateStore] = []
 
     def open_store() -> StateStore:
         for one in made:
             one.close()
-        made.append(StateStore(path, told.append))
+        made.append(StateStore(path, reported.append))
         return made[-1]
 
     yield open_store
     made[-1].close()
 
 
-def test_the_last_save_is_available_to_the_next_process(opened: Callable[[], StateStore], told: list[str]) -> None:
+def test_the_last_save_is_available_to_the_next_process(opened: Callable[[], StateStore], reported: list[str]) -> None:
     store = opened()
     assert store.load("a") == {}
     assert store.save("a", {"lamp": {"on": True}, "clock": [1, 2.5, "x", b"y", None]})
     assert store.save("a", {"lamp": {"on": False}})
     assert store.save("b", {"lamp": 3})
     assert opened().load("a") == {"lamp": {"on": False}, "clock": [1, 2.5, "x", b"y", None]}
-    assert told == []
+    assert reported == []
 
 
 def test_a_table_that_a_later_version_gave_a_column_more_is_gone_on_with(
-    opened: Callable[[], StateStore], path: Path, told: list[str]
+    opened: Callable[[], StateStore], path: Path, reported: list[str]
 ) -> None:
     assert opened().save("a", {"lamp": 1})
     with contextlib.closing(sqlite3.connect(path)) as file:
@@ -98,7 +98,7 @@ def test_a_table_that_a_later_version_gave_a_column_more_is_gone_on_with(
     store = opened()
     assert store.save("a", {"lamp": 2, "clock": 3})
     assert store.load("a") == {"lamp": 2, "clock": 3}
-    assert told == []
+    assert reported == []
 
 
 def test_only_its_user_reads_it(opened: Callable[[], StateStore], path: Path) -> None:
@@ -108,7 +108,7 @@ def test_only_its_user_reads_it(opened: Callable[[], StateStore], path: Path) ->
 
 @pytest.mark.parametrize("content", [b"nonsense" * 1000, b"SQLite format 3\0" + b"nonsense" * 1000])
 def test_a_file_that_is_no_database_is_moved_aside_and_a_fresh_one_is_begun(
-    opened: Callable[[], StateStore], path: Path, told: list[str], content: bytes
+    opened: Callable[[], StateStore], path: Path, reported: list[str], content: bytes
 ) -> None:
     path.parent.mkdir()
     for number in (1, 2):
@@ -119,11 +119,11 @@ def test_a_file_that_is_no_database_is_moved_aside_and_a_fresh_one_is_begun(
         assert store.load("a") == {"lamp": number}
         store.close()
         assert path.with_name(f"{path.name}.corrupt-{number}").read_bytes() == content
-    assert [text.count("is corrupt") for text in told] == [1, 1]
+    assert [text.count("is corrupt") for text in reported] == [1, 1]
 
 
 def test_a_database_with_pages_gone_bad_is_moved_aside(
-    opened: Callable[[], StateStore], path: Path, told: list[str]
+    opened: Callable[[], StateStore], path: Path, reported: list[str]
 ) -> None:
     store = opened()
     store.save("a", {f"lamp {n}": BIG for n in range(20)})
@@ -131,26 +131,26 @@ def test_a_database_with_pages_gone_bad_is_moved_aside(
     whole = path.read_bytes()
     path.write_bytes(whole[:4096] + random.Random(1).randbytes(len(whole) - 4096))
     assert opened().load("a") == {}
-    assert "corrupt-1" in told[0]
+    assert "corrupt-1" in reported[0]
 
 
 def test_without_its_folder_it_says_so_once_and_again_when_there_is_one(
-    opened: Callable[[], StateStore], path: Path, told: list[str]
+    opened: Callable[[], StateStore], path: Path, reported: list[str]
 ) -> None:
     path.parent.write_text("a file, where a folder should be")
     store = opened()
     for _ in range(3):
         assert not store.save("a", {"lamp": 1})
         assert store.load("a") == {}
-    assert [text.startswith("no state is saved: ") for text in told] == [True]
+    assert [text.startswith("no state is saved: ") for text in reported] == [True]
     path.parent.unlink()
     assert store.save("a", {"lamp": 1})
-    assert told[1:] == [f"state is saved again: {path}"]
+    assert reported[1:] == [f"state is saved again: {path}"]
     assert store.load("a") == {"lamp": 1}
 
 
 def test_on_a_full_disk_the_last_save_is_kept_and_saving_resumes_when_there_is_room(
-    opened: Callable[[], StateStore], told: list[str]
+    opened: Callable[[], StateStore], reported: list[str]
 ) -> None:
     store = opened()
     assert store.save("a", {"lamp": 1})
@@ -160,17 +160,17 @@ def test_on_a_full_disk_the_last_save_is_kept_and_saving_resumes_when_there_is_r
         resource.setrlimit(resource.RLIMIT_FSIZE, (64 * 1024, hard))
         for _ in range(2):
             assert not store.save("a", {"lamp": "x" * 1_000_000})
-        assert len(told) == 1
+        assert len(reported) == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, before)
     assert store.load("a") == {"lamp": 1}
     assert store.save("a", {"lamp": 2})
-    assert told[1].startswith("state is saved again")
+    assert reported[1].startswith("state is saved again")
 
 
 def test_a_file_that_another_process_has_locked_costs_a_save_and_no_more(
-    opened: Callable[[], StateStore], path: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    opened: Callable[[], StateStore], path: Path, reported: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert opened().save("a", {"lamp": 1})
     with monkeypatch.context() as impatient:
@@ -183,7 +183,7 @@ def test_a_file_that_another_process_has_locked_costs_a_save_and_no_more(
         other.close()
     assert store.save("a", {"lamp": 3})
     assert store.load("a") == {"lamp": 3}
-    assert [text.split(":")[0].split(" again")[0] for text in told] == ["no state is saved", "state is saved"]
+    assert [text.split(":")[0].split(" again")[0] for text in reported] == ["no state is saved", "state is saved"]
 
 
 def _saver(path: Path, how: str) -> "subprocess.Popen[str]":
@@ -193,11 +193,11 @@ def _saver(path: Path, how: str) -> "subprocess.Popen[str]":
 
 def _whole(path: Path) -> int:
     """The turn that all objects are of."""
-    told: list[str] = []
-    store = StateStore(path, told.append)
+    reported: list[str] = []
+    store = StateStore(path, reported.append)
     states = store.load("a")
     store.close()
-    assert told == []
+    assert reported == []
     assert len(states) == 5
     [turn] = {state[0] for state in states.values()}
     return turn

@@ -39,7 +39,7 @@ class Body:
     def __init__(self, name: str) -> None:
         self.name = name
         self.pid = next(self.pids)
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.said = self.dead = False
         self.end, self._end = os.pipe()
         self.output, self._mouth = os.pipe()
@@ -57,10 +57,10 @@ class Body:
         return (Started(self.name, "epoch", self.pid) if said else None), bool(said)
 
     def leave(self) -> None:
-        self.told.append("leave")
+        self.reported.append("leave")
 
     def kill(self) -> None:
-        self.told.append("kill")
+        self.reported.append("kill")
 
     def close(self) -> str:
         os.close(self.end)
@@ -113,7 +113,7 @@ class Kept:
         self.launches = self.missed = 0
         self.asked = -math.inf
         self.ends: list[float] = []
-        self.told: list[str] = []
+        self.reported: list[str] = []
 
     @property
     def alive(self) -> bool:
@@ -156,9 +156,9 @@ class Model(RuleBasedStateMachine):
         try:
             while self._alive():
                 self.it_agrees(closing=True)
-                told = sorted(name for name, child in self.kept.items() if child.alive and child.told)
-                assert told
-                self._dies(told[0])
+                reported = sorted(name for name, child in self.kept.items() if child.alive and child.reported)
+                assert reported
+                self._dies(reported[0])
             closing.join(PATIENCE_S)
             assert not closing.is_alive()
         finally:
@@ -227,7 +227,13 @@ class Model(RuleBasedStateMachine):
 
     def _launch(self, child: Kept) -> None:
         child.launches += 1
-        child.state, child.until, child.then, child.told, child.asking = "starting", self.now + START_S, "", [], False
+        child.state, child.until, child.then, child.reported, child.asking = (
+            "starting",
+            self.now + START_S,
+            "",
+            [],
+            False,
+        )
         if self.no_processes:
             self._ended(child)
 
@@ -236,7 +242,7 @@ class Model(RuleBasedStateMachine):
         child.then = then
         if child.state != "stopping":
             child.state, child.until = "stopping", self.now + GRACE_S
-            child.told.append("leave")
+            child.reported.append("leave")
 
     def _due(self, child: Kept) -> None:
         match child.state:
@@ -245,7 +251,7 @@ class Model(RuleBasedStateMachine):
             case "starting":
                 self._end(child, "fail")
             case "stopping":
-                child.told.append("kill")
+                child.reported.append("kill")
                 child.until = math.inf
             case _:
                 child.asking, child.asked, child.until = True, self.now, math.inf
@@ -292,9 +298,9 @@ class Model(RuleBasedStateMachine):
             child.leaving = child.leaving or name not in names
         for name in names:
             child = self.kept.setdefault(name, Kept(version))
-            anew = child.begun and (child.leaving or child.version != version)
+            restarted = child.begun and (child.leaving or child.version != version)
             child.version, child.leaving = version, False
-            if anew:
+            if restarted:
                 self._start(child)
         self._settle()
         self.real.go_by([_child(name, version) for name in names])
@@ -442,8 +448,8 @@ class Model(RuleBasedStateMachine):
         thought = {name: (child.state, max(0, child.launches - 1)) for name, child in self.kept.items()}
         assert {name: seen[name] for name in thought} == thought
         assert closing or seen.keys() == thought.keys()
-        with_process = {name: self._body(name).told for name in self._alive()}
-        assert with_process == {name: self.kept[name].told for name in with_process}
+        with_process = {name: self._body(name).reported for name in self._alive()}
+        assert with_process == {name: self.kept[name].reported for name in with_process}
         assert sorted(body.name for body in self.bodies if not body.dead) == sorted(with_process)
 
 

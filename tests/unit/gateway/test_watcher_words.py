@@ -41,9 +41,9 @@ def base(start_container: StartContainer) -> Container:
 def test_notifications_are_listed_and_cancelled(base: Container) -> None:
     dock, is_low = base.find(where(name="dock")), base.find(where(name="is_low"))
     noted = base.every(60, dock.bind(0.3), if_=is_low)
-    [told] = json.loads(trade("notifications", "--json").stdout)
-    assert (told["id"], told["occasion"], told["call"]) == (noted.id, "every 60 s", "rosie.base.dock(0.3)")
-    assert (told["condition"], told["container"], told["fired"]) == ("if rosie.base.is_low()", "base", 0)
+    [reported] = json.loads(trade("notifications", "--json").stdout)
+    assert (reported["id"], reported["occasion"], reported["call"]) == (noted.id, "every 60 s", "rosie.base.dock(0.3)")
+    assert (reported["condition"], reported["container"], reported["fired"]) == ("if rosie.base.is_low()", "base", 0)
     table = trade("notifications").stdout
     assert all(text in table for text in ("OCCASION", noted.id, "every 60 s", "rosie.base.dock(0.3)", base.session))
     assert f"cancelled: {noted.id}" in trade("notifications", "--cancel", noted.id).stdout
@@ -56,9 +56,9 @@ def test_hooks_are_listed_and_detached(base: Container) -> None:
     dock = base.find(where(name="dock"))
     hook = base.after_service(dock, base.find(where(name="saw")))
     dock()
-    [told] = json.loads(trade("hooks", "--json").stdout)
-    assert (told["id"], told["side"], told["target"]) == (hook.id, "after", "rosie.base.dock")
-    assert (told["call"], told["services"], told["fired"]) == ("rosie.base.saw", ["rosie.base.dock"], 1)
+    [reported] = json.loads(trade("hooks", "--json").stdout)
+    assert (reported["id"], reported["side"], reported["target"]) == (hook.id, "after", "rosie.base.dock")
+    assert (reported["call"], reported["services"], reported["fired"]) == ("rosie.base.saw", ["rosie.base.dock"], 1)
     table = trade("hooks").stdout
     assert all(text in table for text in ("TARGET", hook.id, "attached", "rosie.base.saw", base.session))
     assert f"detached: {hook.id}" in trade("hooks", "--detach", hook.id).stdout

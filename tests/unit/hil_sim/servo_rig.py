@@ -19,8 +19,8 @@ class Rig:
 
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock
-        self.told: list[tuple[str, float]] = []
-        self.servo = Servo(1, t=clock(), emit=lambda entry: self.told.append((entry.name, entry.t)), **options)
+        self.reported: list[tuple[str, float]] = []
+        self.servo = Servo(1, t=clock(), emit=lambda entry: self.reported.append((entry.name, entry.t)), **options)
 
     def write(self, address: int, value: int, size: int | None = None) -> None:
         size = size or SIZES[address]
@@ -36,10 +36,10 @@ class Rig:
         self.servo.advance(self.clock.advance(s))
 
     def names(self) -> list[str]:
-        return [name for name, _ in self.told]
+        return [name for name, _ in self.reported]
 
     def at(self, name: str) -> float:
-        return next(t for told, t in self.told if told == name)
+        return next(t for reported, t in self.reported if reported == name)
 
 
 @pytest.fixture

@@ -63,9 +63,9 @@ def test_the_log_has_the_position_of_a_servo_when_it_gets_a_goal(sdk: SimpleName
     for goal in (2200, 2100):
         assert sdk.ph.write4ByteTxRx(sdk.port, 1, GOAL, goal) == OK
         wait_until(lambda: sdk.ph.read1ByteTxRx(sdk.port, 1, 122)[0] == 0, "the end of the motion")
-    told = motion_writes(bus.log.entries, device_id=1)
-    assert [entry.position_counts for entry in told] == [2048, 2048, 2200]
-    assert len({entry.joint for entry in told}) == 1
+    reported = motion_writes(bus.log.entries, device_id=1)
+    assert [entry.position_counts for entry in reported] == [2048, 2048, 2200]
+    assert len({entry.joint for entry in reported}) == 1
 
 
 def test_reg_write_and_action(sdk: SimpleNamespace, bus: DynamixelBus) -> None:

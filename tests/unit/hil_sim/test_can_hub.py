@@ -335,13 +335,13 @@ def test_an_adapter_that_is_bus_off_says_so_and_carries_nothing(make_can: Any, c
     bus = make_can(1)
     client = connect(bus)
     bus.do(BusOff())
-    [told] = take(client, 1)
-    assert (told.is_error_frame, told.arbitration_id) == (True, 0x40)
+    [reported] = take(client, 1)
+    assert (reported.is_error_frame, reported.arbitration_id) == (True, 0x40)
     client.send(ASK)
     assert bus.devices[0].heard == []
     bus.do(BusOff(on=False))
-    [told] = take(client, 1)
-    assert (told.is_error_frame, told.arbitration_id) == (True, 0x100)
+    [reported] = take(client, 1)
+    assert (reported.is_error_frame, reported.arbitration_id) == (True, 0x100)
     client.send(message(0x100, b"\x07"))
     assert bytes(take(client, 1)[0].data) == b"\x07"
     assert [f.data for f in bus.devices[0].heard] == [b"\x07"]

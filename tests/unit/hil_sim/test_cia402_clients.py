@@ -291,14 +291,14 @@ def test_frames_written_by_hand_bring_a_drive_up_and_cantools_reads_what_it_says
         target = database.encode_message("KNEE_RPDO1", {"Control": control, "Target": 1.5})
         client.send(can.Message(arbitration_id=0x205, data=target, is_extended_id=False))
     say(client, 0x605, "2b00180514000000")  # every 20 ms
-    told: list[Any] = []
+    reported: list[Any] = []
 
     def arrived() -> bool:
-        told.append(database.decode_message(0x185, take(client, 0x185)[0].data))
-        return bool(told[-1]["Reached"]) and told[-1]["Position"] == 1.5
+        reported.append(database.decode_message(0x185, take(client, 0x185)[0].data))
+        return bool(reported[-1]["Reached"]) and reported[-1]["Position"] == 1.5
 
     wait_until(arrived, "the arrival")
-    assert (told[-1]["Enabled"], told[-1]["Fault"], told[-1]["Mode"]) == (1, 0, 1)
+    assert (reported[-1]["Enabled"], reported[-1]["Fault"], reported[-1]["Mode"]) == (1, 0, 1)
     moves = motion_writes(bus.log.entries, device_id=5)
     assert [e.data[:2].hex() for e in moves if e.name == "rpdo1"] == ["0600", "0700", "0f00", "1f00"]
     assert frames(bus.log.entries, "rpdo1", source="client1", direction="in", device_id=5)

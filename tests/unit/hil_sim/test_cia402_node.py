@@ -348,8 +348,8 @@ def test_writes_are_in_the_log_and_say_whether_they_could_move_it(running: Bench
     running.hear(0x205, "0600")
     running.hear(0x205, "0600")  # repeats what it has: a frame, but no instruction
     running.put(0x6040, 6, 2)
-    told = [(e.name, e.registers, e.moves, e.device_id) for e in running.log if e.kind == "instruction"]
-    assert told == [
+    reported = [(e.name, e.registers, e.moves, e.device_id) for e in running.log if e.kind == "instruction"]
+    assert reported == [
         ("sdo_write", ("profile_velocity",), False, NODE),
         ("rpdo1", ("controlword",), True, NODE),
         ("sdo_write", ("controlword",), False, NODE),

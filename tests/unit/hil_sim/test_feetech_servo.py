@@ -16,8 +16,8 @@ class Rig:
 
     def __init__(self, clock: Any, **options: Any) -> None:
         self.clock = clock
-        self.told: list[str] = []
-        self.servo = Servo(1, t=clock(), emit=lambda entry: self.told.append(entry.name), **options)
+        self.reported: list[str] = []
+        self.servo = Servo(1, t=clock(), emit=lambda entry: self.reported.append(entry.name), **options)
 
     def write(self, address: int, value: int) -> None:
         self.servo.write(address, BY_ADDRESS[address].encode(value), self.clock())
@@ -95,7 +95,7 @@ def test_what_cannot_be_written_stays_as_it_is(rig: Rig, address: int, value: in
 def test_half_a_register_is_not_written(rig: Rig) -> None:
     rig.servo.write(GOAL, b"\0", rig.clock())
     assert rig.read(GOAL) == 2048
-    assert rig.told == ["refused"]
+    assert rig.reported == ["refused"]
 
 
 # --- motion
@@ -111,14 +111,14 @@ def test_it_goes_to_its_goal_at_its_speed_and_says_so_while_it_does(rig: Rig) ->
     assert 2048 + 400 < rig.read(POSITION) < 2048 + 500
     rig.pass_s(1.2)
     assert (rig.read(POSITION), rig.read(58), rig.read(66)) == (3048, 0, 0)
-    assert rig.told == ["torque_on", "motion_started", "at_rest"]
+    assert rig.reported == ["torque_on", "motion_started", "at_rest"]
 
 
 def test_a_goal_switches_torque_on_as_on_real_servos(rig: Rig) -> None:
     rig.write(GOAL, 3000)
     rig.pass_s(2)
     assert (rig.read(TORQUE), rig.read(POSITION)) == (1, 3000)
-    assert rig.told == ["torque_on", "motion_started", "at_rest"]
+    assert rig.reported == ["torque_on", "motion_started", "at_rest"]
 
 
 def test_a_servo_set_not_to_keeps_a_goal_without_torque_and_torque_moves_it_there(clock: Any) -> None:
@@ -164,7 +164,7 @@ def test_straining_against_a_jam_is_an_overload_after_its_time(rig: Rig) -> None
     assert rig.servo.status == 0
     rig.pass_s(0.2)
     assert rig.servo.status == Status.OVERLOAD
-    assert rig.told[-1] == "shutdown"
+    assert rig.reported[-1] == "shutdown"
 
 
 def test_released_after_an_overload_it_continues_by_itself_with_its_remaining_torque(rig: Rig) -> None:

@@ -40,7 +40,7 @@ def run(controller: UrBus, program: str) -> Any:
 
 
 def test_the_receive_interface_reads_a_stream_that_advances(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         """
 from rtde_receive import RTDEReceiveInterface
@@ -53,13 +53,13 @@ print(json.dumps({"q": r.getActualQ(), "pose": r.getActualTCPPose(), "mode": r.g
     "safe": r.getSafetyMode(), "connected": r.isConnected(), "advances": max(seen) > first}))
 """,
     )
-    assert told["q"] == pytest.approx(HOME)
-    assert told["pose"] == pytest.approx(controller.arm.pose(), abs=1e-6)
-    assert (told["mode"], told["safe"], told["connected"], told["advances"]) == (7, 1, True, True)
+    assert reported["q"] == pytest.approx(HOME)
+    assert reported["pose"] == pytest.approx(controller.arm.pose(), abs=1e-6)
+    assert (reported["mode"], reported["safe"], reported["connected"], reported["advances"]) == (7, 1, True, True)
 
 
 def test_the_dashboard_client_asks_and_orders(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         """
 from dashboard_client import DashboardClient
@@ -82,7 +82,7 @@ d.disconnect()
 print(json.dumps([answers, flags]))
 """,
     )
-    answers, flags = told
+    answers, flags = reported
     assert answers[:2] == ["Robotmode: RUNNING", "Safetystatus: NORMAL"]
     assert answers[2].startswith("STOPPED")
     assert answers[3:5] == ["20210000001", "UR5"]
@@ -91,7 +91,7 @@ print(json.dumps([answers, flags]))
 
 
 def test_the_io_interface_sets_the_speed_slider(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         """
 from rtde_io import RTDEIOInterface
@@ -104,7 +104,7 @@ while r.getTargetSpeedFraction() != 0.25 and time.monotonic() < deadline:
 print(json.dumps([ok, r.getTargetSpeedFraction()]))
 """,
     )
-    assert told == [True, 0.25]
+    assert reported == [True, 0.25]
     assert controller.state().arms[0].speed_fraction == 0.25
 
 
@@ -123,7 +123,7 @@ def until(true):
 
 
 def test_the_control_interface_moves_in_joint_space_and_along_a_line(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -139,10 +139,10 @@ until(lambda: abs(r.getActualTCPPose()[2] - line[2]) < 1e-4)
 print(json.dumps({"ok": ok, "off": after[0] - goal[0], "pose": pose, "end": r.getActualTCPPose(), "line": line}))
 """,
     )
-    assert told["ok"] == [True, True]
-    assert told["pose"] == pytest.approx(controller.arm.pose((HOME[0] + 0.2, *HOME[1:])), abs=1e-6)
-    assert abs(told["off"]) < 1e-6
-    assert told["end"] == pytest.approx(told["line"], abs=1e-4)
+    assert reported["ok"] == [True, True]
+    assert reported["pose"] == pytest.approx(controller.arm.pose((HOME[0] + 0.2, *HOME[1:])), abs=1e-6)
+    assert abs(reported["off"]) < 1e-6
+    assert reported["end"] == pytest.approx(reported["line"], abs=1e-4)
     wait_until(lambda: len(events(controller.log.entries, "at_rest")) == 2, "both moves have come to rest")
     assert all(
         "until it ends" in entry.detail for entry in motion_writes(controller.log.entries) if entry.name != "upload"
@@ -152,7 +152,7 @@ print(json.dumps({"ok": ok, "off": after[0] - goal[0], "pose": pose, "end": r.ge
 @pytest.mark.parametrize("model", ["UR5", "UR5e"])
 def test_all_interfaces_work_with_controllers_of_both_series(model: str) -> None:
     with UrBus(Arm(model)) as controller:
-        told = run(
+        reported = run(
             controller,
             CONTROL
             + """
@@ -165,12 +165,12 @@ scaled = RTDEIOInterface(host).setSpeedSlider(0.9)
 print(json.dumps([d.polyscopeVersion().split(".")[0], scaled, c.moveJ(goal, 2.0, 8.0)]))
 """,
         )
-        assert told == ["5" if model.endswith("e") else "3", True, True]
+        assert reported == ["5" if model.endswith("e") else "3", True, True]
         assert controller.state().arms[0].positions_rad[0] == pytest.approx(HOME[0] + 0.1)
 
 
 def test_the_angles_for_a_pose_are_computed_and_an_unreachable_pose_is_reported(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -180,12 +180,12 @@ print(json.dumps([c.getInverseKinematics(pose, near), c.getInverseKinematicsHasS
     c.getInverseKinematicsHasSolution([5.0, *pose[1:]], near)]))
 """,
     )
-    assert told[0] == pytest.approx(HOME, abs=1e-6)
-    assert told[1:] == [True, False]
+    assert reported[0] == pytest.approx(HOME, abs=1e-6)
+    assert reported[1:] == [True, False]
 
 
 def test_an_asynchronous_move_reports_its_progress_and_is_stopped(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -198,13 +198,13 @@ until(lambda: not any(r.getActualQd()))
 print(json.dumps([ok, running, stopped, r.getActualQ()[0] - q[0]]))
 """,
     )
-    ok, running, stopped, way = told
+    ok, running, stopped, way = reported
     assert (ok, running, stopped) == (True, True, False)
     assert 0.02 < way < 1.0
 
 
 def test_a_stream_of_set_points_arrives_whole_and_is_followed(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -220,14 +220,14 @@ c.stopScript()
 print(json.dumps([sent, r.getActualQ()[0] - q[0]]))
 """,
     )
-    sent, way = told
+    sent, way = reported
     assert sent == len(instructions(controller.log.entries, "servo_j")) == 250
     assert way == pytest.approx(0.2 * 249 / 250, abs=0.01)  # set-points that come in a heap make it swing
     assert controller.state().arms[0].program == ""
 
 
 def test_a_watchdog_that_is_not_fed_ends_the_program_and_the_motion(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -237,13 +237,13 @@ until(lambda: not c.isProgramRunning())
 print(json.dumps([armed, c.moveJ([q[0], *q[1:]], 0.3, 1.0)]))
 """,
     )
-    assert told == [True, False]
+    assert reported == [True, False]
     assert len(events(controller.log.entries, "watchdog_expired")) == 1
     assert abs(controller.state().arms[0].positions_rad[0]) < 1.0
 
 
 def test_freedrive_and_a_protective_stop_are_seen_by_the_library(controller: UrBus) -> None:
-    told = run(
+    reported = run(
         controller,
         CONTROL
         + """
@@ -256,7 +256,7 @@ flags += [c.isProgramRunning(), c.moveJ(q, 1.0, 1.0)]
 print(json.dumps([flags, r.getSafetyMode()]))
 """,
     )
-    assert told == [[True, True, False, False], 3]
+    assert reported == [[True, True, False, False], 3]
 
 
 def test_a_second_client_for_control_ends_the_program_of_the_first(controller: UrBus) -> None:

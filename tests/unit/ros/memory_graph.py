@@ -219,10 +219,10 @@ class _Service:
             try:
                 with self._turn:
                     try:
-                        told = self._answer(types.from_bytes(self._request, asked), who, came_at)
+                        reported = self._answer(types.from_bytes(self._request, asked), who, came_at)
                     finally:
                         self.answered += 1
-                said.put(types.from_bytes(self._response, types.to_bytes(self._response, told)))
+                said.put(types.from_bytes(self._response, types.to_bytes(self._response, reported)))
             except Exception as error:  # noqa: BLE001 - it is sent to the caller
                 said.put(error)
 
@@ -271,7 +271,7 @@ class _Pursuit:
         self, action: _Action, message: Message, client: str, feedback: Callable[[Message], object] | None
     ) -> None:
         self._action, self.message, self.client, self._feedback = action, message, client, feedback
-        self._tells: list[Callable[[], object]] = []
+        self._callbacks: list[Callable[[], object]] = []
         self._ended: queue.SimpleQueue[Outcome | Exception] = queue.SimpleQueue()
         self._guard = threading.Lock()
         self.canceled = False
@@ -285,20 +285,20 @@ class _Pursuit:
         types, result = self._action.ros.types, self._action.parts[1]
         try:
             outcome = self._action.do(self)
-            told = types.from_bytes(result, types.to_bytes(result, outcome.result))
-            self._ended.put(Outcome(outcome.how, told, outcome.text))
+            reported = types.from_bytes(result, types.to_bytes(result, outcome.result))
+            self._ended.put(Outcome(outcome.how, reported, outcome.text))
         except Exception as error:  # noqa: BLE001 - it is sent to the caller
             self._ended.put(Outcome(Ended.ABORTED, types.zero(result), str(error)))
 
     def feedback(self, message: Mapping[str, Any]) -> None:
         types, part = self._action.ros.types, self._action.parts[2]
-        told = types.from_bytes(part, types.to_bytes(part, message))
+        reported = types.from_bytes(part, types.to_bytes(part, message))
         if self._feedback is not None:
-            self._feedback(told)
+            self._feedback(reported)
 
     def when_canceled(self, tell: Callable[[], object]) -> None:
         with self._guard:
-            self._tells.append(tell)
+            self._callbacks.append(tell)
             now = self.canceled
         if now:
             tell()
@@ -318,6 +318,6 @@ class _Pursuit:
             if self.canceled:
                 return
             self.canceled = True
-            tells = list(self._tells)
-        for tell in tells:
+            callbacks = list(self._callbacks)
+        for tell in callbacks:
             threading.Thread(target=tell, name="memory-ros-cancel", daemon=True).start()

@@ -234,14 +234,14 @@ def test_when_ros_is_lost_all_that_its_nodes_move_stops_and_that_is_said(stand: 
     assert stand.robot.legs.stopped.wait(PATIENCE_S)
     spins.join(PATIENCE_S)
     wait_until(lambda: stand.container.locks() == [])
-    [tells] = stand.container.services(where(name="bridged", group="ros"))
-    wait_until(lambda: tells.health.startswith("ROS is lost: no router"))
+    [bridge_state] = stand.container.services(where(name="bridged", group="ros"))
+    wait_until(lambda: bridge_state.health.startswith("ROS is lost: no router"))
     answer = stand.trigger(node, "/rosie/head/spin")
     assert "the end of /teleop would be invisible" in answer["message"]
     assert not stand.robot.head.goes.is_set()
     assert stand.trigger(node, "/rosie/head/stop")["success"]
     stand.ros.problem = ""
-    wait_until(lambda: tells.health == "healthy")
+    wait_until(lambda: bridge_state.health == "healthy")
     assert stand.set_bool(node, "/rosie/head/lock", True)["success"]
     assert bridge.bridged().nodes == ["/teleop"]
 

@@ -34,13 +34,13 @@ def test_S08_what_a_node_asked_for_before_its_stop_does_not_begin_after_it(stand
     node = stand.node()
     first, _ = apart(lambda: stand.trigger(node, SPIN))
     assert stand.robot.head.goes.wait(PATIENCE_S)
-    second, told = apart(lambda: stand.trigger(node, SPIN))
+    second, reported = apart(lambda: stand.trigger(node, SPIN))
     wait_until(lambda: stand.ros.services[SPIN].asked == 2)
     assert stand.trigger(node, STOP)["success"]
     first.join(PATIENCE_S)
     second.join(PATIENCE_S)
     assert stand.robot.head.spins == 1
-    assert not told[0]["success"]
+    assert not reported[0]["success"]
 
 
 def test_S03_what_waited_for_its_turn_when_its_node_died_does_not_begin(stand: Stand) -> None:

@@ -39,8 +39,8 @@ def test_check_says_what_a_file_maps_and_joins_nothing() -> None:
     ended = trade("ros", str(EXAMPLE), "--check")
     assert ended.returncode == 0, ended.stderr
     assert "joints of rosie.head as action /head_controller/follow_joint_trajectory" in ended.stdout
-    told = json.loads(trade("ros", str(EXAMPLE), "--check", "--json").stdout)
-    assert len(told["maps"]) == 11
+    reported = json.loads(trade("ros", str(EXAMPLE), "--check", "--json").stdout)
+    assert len(reported["maps"]) == 11
 
 
 def test_a_wrong_file_is_one_line_and_exit_code_1(tmp_path: Path) -> None:

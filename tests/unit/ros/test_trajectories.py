@@ -36,9 +36,9 @@ def arm(stand: Stand) -> Any:
 def goal(
     *points: tuple[float, Sequence[float]], names: Sequence[str] = ("a", "b"), stamp_s: float = 0.0, **more: Any
 ) -> dict[str, Any]:
-    told = [{"time_from_start": ros_stamp(at), "positions": list(angles)} for at, angles in points]
+    reported = [{"time_from_start": ros_stamp(at), "positions": list(angles)} for at, angles in points]
     return {
-        "trajectory": {"header": {"stamp": ros_stamp(stamp_s)}, "joint_names": list(names), "points": told},
+        "trajectory": {"header": {"stamp": ros_stamp(stamp_s)}, "joint_names": list(names), "points": reported},
         **more,
     }
 
@@ -122,8 +122,8 @@ def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Limb) -> None:
     off = [{"name": "a", "position": -1.0}]
     asked = {**TO_THERE, "path_tolerance": tolerance, "goal_tolerance": off, "goal_time_tolerance": ros_stamp(2.5)}
     assert ended(stand.node(), asked).how is Ended.SUCCEEDED
-    told = arm.plans[0].tolerances
-    assert (told.path_rad, told.goal_rad, told.goal_time_s) == (0.05, 0.03, 2.5)
+    reported = arm.plans[0].tolerances
+    assert (reported.path_rad, reported.goal_rad, reported.goal_time_s) == (0.05, 0.03, 2.5)
 
 
 def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Limb) -> None:
@@ -189,13 +189,13 @@ def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Limb) -> None:
 def test_what_is_said_of_the_way_is_feedback(stand: Stand, arm: Limb) -> None:
     heard: list[Any] = []
 
-    def told(plan: Any) -> list[float]:
+    def reported(plan: Any) -> list[float]:
         plan.course.note("rosie.arm.a", 0.125)
         plan.course.ready(time.monotonic_ns())
         wait_until(lambda: plan.course.report(time.monotonic_ns()) or heard)
         return arm.at
 
-    arm.stream = told  # type: ignore[method-assign]
+    arm.stream = reported  # type: ignore[method-assign]
     stand.up(ARM)
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE, heard.append)
     assert pursuit.wait(PATIENCE_S).how is Ended.SUCCEEDED

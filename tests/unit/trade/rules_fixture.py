@@ -61,19 +61,19 @@ class Engine:
         self._container = container
         self.file = folder / "rules.toml"
         self.audit = folder / "audit.jsonl"
-        self._told: queue.SimpleQueue[Firing] = queue.SimpleQueue()
+        self._reported: queue.SimpleQueue[Firing] = queue.SimpleQueue()
         self.running: Rules | None = None
 
     def __call__(self, text: str, *, dry_run: bool = False) -> Rules:
         self.file.write_text(text)
-        self.running = Rules(self._container, self.file, audit=self.audit, dry_run=dry_run, tell=self._told.put)
+        self.running = Rules(self._container, self.file, audit=self.audit, dry_run=dry_run, tell=self._reported.put)
         return self.running
 
     def next(self) -> Firing:
-        return self._told.get(timeout=20)
+        return self._reported.get(timeout=20)
 
     def quiet(self) -> bool:
-        return self._told.empty()
+        return self._reported.empty()
 
 
 TELL = 'do = [{ call = { name = "tell" }, args = ["$service", "$container"] }]'

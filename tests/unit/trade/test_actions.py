@@ -72,10 +72,10 @@ class Walk:
     def finish_nicely(self) -> str:
         call = current_call()
         assert call is not None
-        told = threading.Event()
-        call.on_cancel(told.set)
+        reported = threading.Event()
+        call.on_cancel(reported.set)
         self.entered.set()
-        assert told.wait(20)
+        assert reported.wait(20)
         return "half way"
 
     @service

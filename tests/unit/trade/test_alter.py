@@ -219,11 +219,11 @@ _wire = st.recursive(
 
 
 @given(st.fixed_dictionaries({}, optional={"meta": _wire, "health": _wire, "kinds": _wire}))
-def test_an_entry_with_anything_in_its_new_fields_is_taken_or_dropped(told: dict[str, Any]) -> None:
+def test_an_entry_with_anything_in_its_new_fields_is_taken_or_dropped(reported: dict[str, Any]) -> None:
     info = ProviderInfo(revision=1, groups=("a",), kind="A", host="h", pid=1, services=())
     plain: dict[str, Any] = msgspec.msgpack.decode(encode_message(info))
     try:
-        taken = decode_provider(msgspec.msgpack.encode({**plain, **told}))
+        taken = decode_provider(msgspec.msgpack.encode({**plain, **reported}))
     except Malformed:
         return
     assert decode_provider(encode_message(taken)).groups == ("a",)

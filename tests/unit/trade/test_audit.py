@@ -65,7 +65,7 @@ def rows(container: Container, folder: Path) -> list[AuditRow]:
     return [link.row for link in found]
 
 
-def told(container: Container, folder: Path) -> list[tuple[str, str, str]]:
+def reported(container: Container, folder: Path) -> list[tuple[str, str, str]]:
     return [(row.kind, row.what, row.outcome) for row in rows(container, folder) if row.kind != "audit"]
 
 
@@ -115,7 +115,7 @@ def test_what_comes_of_a_call_has_the_id_of_the_one_that_began_it_all_in_every_r
 
 def test_a_call_within_the_container_is_written_down_too(there: Container, folder: Path) -> None:
     call(there, "reach", 0.5)
-    assert ("call", "rosie.arm.reach", "ok") in told(there, folder)
+    assert ("call", "rosie.arm.reach", "ok") in reported(there, folder)
 
 
 def test_the_audit_record_names_an_error_without_its_message(here: Container, there: Container, folder: Path) -> None:
@@ -136,7 +136,7 @@ def test_what_is_secret_is_in_no_record(here: Container, there: Container, folde
 def test_reads_are_written_down_only_if_asked_for(here: Container, there: Container, folder: Path) -> None:
     call(here, "angle")
     here.containers()
-    assert told(there, folder) == []
+    assert reported(there, folder) == []
 
 
 def test_reads_that_are_asked_for_are_written_down(
@@ -146,13 +146,13 @@ def test_reads_that_are_asked_for_are_written_down(
     there = start_container("there", audit=folder)
     there.register(Arm(), "rosie.arm")
     call(here, "angle")
-    assert ("read", "rosie.arm.angle", "ok") in told(there, folder)
+    assert ("read", "rosie.arm.angle", "ok") in reported(there, folder)
 
 
 def test_wrong_arguments_are_a_refusal(here: Container, there: Container, folder: Path) -> None:
     with pytest.raises(InvalidArgument):
         call(here, "reach", "far")
-    assert told(there, folder) == [("refused", "rosie.arm.reach", "InvalidArgument")]
+    assert reported(there, folder) == [("refused", "rosie.arm.reach", "InvalidArgument")]
 
 
 def test_who_locks_what_and_who_is_refused_for_it(
@@ -279,7 +279,7 @@ def test_hooks_and_tracing_leave_a_record_as_it_is(here: Container, there: Conta
     call(here, "reach", 0.5)
     there.set_tracing(False)
     call(here, "reach", 0.5)
-    assert [one for one in told(there, folder) if one[0] == "call"] == [("call", "rosie.arm.reach", "ok")] * 2
+    assert [one for one in reported(there, folder) if one[0] == "call"] == [("call", "rosie.arm.reach", "ok")] * 2
 
 
 # --- off

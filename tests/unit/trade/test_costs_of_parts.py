@@ -190,13 +190,13 @@ with memory_system() as system:
 def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
     if shutil.which("strace") is None:
         pytest.fail("there is no strace") if os.environ.get("CI") == "true" else pytest.skip("there is no strace")
-    told = tmp_path / "trace"
-    command = ["strace", "-o", str(told), sys.executable, "-c", LOCAL_CALLS]  # of its main thread only
+    reported = tmp_path / "trace"
+    command = ["strace", "-o", str(reported), sys.executable, "-c", LOCAL_CALLS]  # of its main thread only
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     if "ptrace" in done.stderr:
         pytest.skip(f"strace may not look: {done.stderr}")
     assert done.returncode == 0, done.stderr
-    lines = told.read_text().splitlines()
+    lines = reported.read_text().splitlines()
     first, last = (number for number, line in enumerate(lines) if line.startswith("getppid("))
     calls = [line for line in lines[first + 1 : last] if not line.startswith("---")]
     assert len(calls) <= 100, calls  # to wait its turn among threads, and for memory; not one for each of 2,000 calls
@@ -208,24 +208,24 @@ def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
 def test_a_notification_is_one_call_and_nothing_while_it_waits(
     here: Container, there: Container, system: MemorySystem, heard: Heard
 ) -> None:
-    told = threading.Semaphore(0)
+    reported = threading.Semaphore(0)
 
     class Listener:
         @service
         def came(self, which: Handle) -> None:
-            told.release()
+            reported.release()
 
     there.register(Listener(), "listener")
     came = here.find(where(name="came"), wait_s=20)
     with heard.exactly():
         standing = here.joined(where(name="move"), call=came)
     system.container("third").register(Joint(), "first")
-    assert told.acquire(timeout=20)
+    assert reported.acquire(timeout=20)
     system.settle()
     third = system.container("third")
     with heard.exactly(announce=2, put=2):
         third.register(Joint(), "second")
-        assert told.acquire(timeout=20)
+        assert reported.acquire(timeout=20)
         wait_until(lambda: standing.info().fired == 2, "its call has been answered")
         wait_until(lambda: heard.kinds[Kind.PUT] == 2, "the answer has passed")
     with heard.exactly():
@@ -243,9 +243,9 @@ def test_a_sample_is_read_once_and_sent_once_to_each_listener(
     wait_until(lambda: all(heard.streamed[ear.name] >= TIMES for ear in ears), "all have heard many samples")
     for stream in streams:
         stream.close()
-    asked, told = joint.asked, heard.streamed
-    assert set(told) == {ear.name for ear in ears}
-    assert max(told.values()) <= asked + 2 * listeners  # who begins to listen is given one at once
+    asked, reported = joint.asked, heard.streamed
+    assert set(reported) == {ear.name for ear in ears}
+    assert max(reported.values()) <= asked + 2 * listeners  # who begins to listen is given one at once
     assert heard.kinds[Kind.PUT] <= 2 * listeners * (2 + 2 + asked // 200)  # to ask for it, again every two seconds
 
 

@@ -529,10 +529,10 @@ def test_an_estop_with_a_path_as_its_id_is_dropped_and_not_written(eventually: E
             Address("mallory", "x", "e"),
         )
         up = "/.." * len((Path(folder) / "memory" / "estop").parts[1:])
-        told = entry_with(Estop(f"{up}{folder}/found", str(mallory), "", 0.0))
+        reported = entry_with(Estop(f"{up}{folder}/found", str(mallory), "", 0.0))
         before, _sign = one.dropped_messages, raw.appear(alive_key(mallory))
         system.settle()
-        raw.announce(registry_key("trade", mallory, "estops"), encode_message(told))
+        raw.announce(registry_key("trade", mallory, "estops"), encode_message(reported))
         assert eventually(lambda: one.dropped_messages > before or bool(one.estops()))
         one.close()  # what it writes is written
         assert not list(Path(folder).glob("found*"))
@@ -551,10 +551,10 @@ def test_S09_an_estop_reported_by_another_container_is_recorded_with_its_reporte
     )
     rows: list[Event] = []
     one._parts.audit._tell = rows.append
-    told = entry_with(Estop("abc", "boss/desk/e1", "fire", 0.0, told_by="boss/desk"))
+    reported = entry_with(Estop("abc", "boss/desk/e1", "fire", 0.0, told_by="boss/desk"))
     _sign = raw.appear(alive_key(mallory))
     system.settle()
-    raw.announce(registry_key("trade", mallory, "estops"), encode_message(told))
+    raw.announce(registry_key("trade", mallory, "estops"), encode_message(reported))
     assert eventually(lambda: bool(one.estops()))
     assert [(known.by, known.told_by) for known in one.estops()] == [("boss/desk/e1", "mallory/x")]
     late = system.container("late")
@@ -569,18 +569,18 @@ def test_S09_an_estop_reported_by_another_container_is_recorded_with_its_reporte
 def test_S09_an_estop_causes_only_small_announcements_between_containers(system: MemorySystem) -> None:
     """It is as much as the square of how many there are, in a moment that matters."""
     drivers(system, *(f"d{number}" for number in range(4)))
-    caller, told = system.container("caller"), Counter[str]()
+    caller, reported = system.container("caller"), Counter[str]()
 
     def hear(passage: InFlightMessage) -> None:
         if passage.kind is Kind.ANNOUNCE and not passage.arrived:
-            told[passage.source] += len(passage.payload or b"")
+            reported[passage.source] += len(passage.payload or b"")
 
     system.tap(hear)
     caller.estop_clear([caller.estop(limit_s=GENEROUS_S).id], limit_s=GENEROUS_S)
     system.settle()
     others, changes = 4, 2
-    assert len(told) == 5
-    assert max(told.values()) <= others * changes * MOST_BYTES_OF_ESTOPS
+    assert len(reported) == 5
+    assert max(reported.values()) <= others * changes * MOST_BYTES_OF_ESTOPS
 
 
 def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:

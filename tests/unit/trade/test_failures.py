@@ -266,12 +266,12 @@ def test_what_a_provider_raises_unmeant_is_logged_once_where_it_runs(
     [(0.005, "on /dev/x."), (0.0, "on /dev/x."), (0.34, "on /dev/x for 0.3 s."), (20.487, "on /dev/x for 20 s.")],
 )
 def test_device_silent_states_how_long_the_device_was_silent(silent_s: float, said: str) -> None:
-    told = str(errors.DeviceSilent(device="rosie.pan", bus="/dev/x", waited_s=silent_s))
-    assert told.startswith(f"rosie.pan did not answer {said} Is it powered")
+    reported = str(errors.DeviceSilent(device="rosie.pan", bus="/dev/x", waited_s=silent_s))
+    assert reported.startswith(f"rosie.pan did not answer {said} Is it powered")
 
 
 @pytest.mark.parametrize("bus", ["/tmp/trade-sim-x1/neck", "socketcand:127.0.0.1:4242/can0"])
 def test_a_silence_says_what_it_is_of_a_device_and_of_a_simulated_one(bus: str) -> None:
-    told = str(errors.DeviceSilent(device="rosie.pan", bus=bus, waited_s=0.3))
-    assert "Is it powered, plugged in" in told
-    assert told.endswith("If it is simulated, this computer may be too busy")
+    reported = str(errors.DeviceSilent(device="rosie.pan", bus=bus, waited_s=0.3))
+    assert "Is it powered, plugged in" in reported
+    assert reported.endswith("If it is simulated, this computer may be too busy")

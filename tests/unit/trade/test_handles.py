@@ -185,8 +185,8 @@ def test_handles_of_different_services_differ(here: Container) -> None:
 def test_a_handle_shows_the_name_groups_and_container_of_its_service(here: Container, there: Container) -> None:
     there.register(Counter(), ["rosie.head", "lab"])
     seen = found(here, "add")
-    told = (seen.name, seen.label, seen.groups, seen.container, seen.local, seen.alive, seen.roles)
-    assert told == ("add", "rosie.head.add", ("rosie.head", "lab"), "there", False, True, ())
+    reported = (seen.name, seen.label, seen.groups, seen.container, seen.local, seen.alive, seen.roles)
+    assert reported == ("add", "rosie.head.add", ("rosie.head", "lab"), "there", False, True, ())
     assert repr(seen) == "<Handle rosie.head.add in there>"
 
 
@@ -354,8 +354,8 @@ def test_a_failing_done_callback_does_not_block_the_other_callbacks(
     [add] = [handle for handle in here.register(Counter(), "counted") if handle.name == "add"]
     run = add.start(5)
     assert run.result(20) == 5
-    told: list[int] = []
-    run.when_done(lambda _: told.append(1 // 0))
-    run.when_done(lambda ended: told.append(ended.result()))
-    assert told == [5]
+    reported: list[int] = []
+    run.when_done(lambda _: reported.append(1 // 0))
+    run.when_done(lambda ended: reported.append(ended.result()))
+    assert reported == [5]
     assert "a callback at the end of" in caplog.text

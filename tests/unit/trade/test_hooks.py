@@ -40,7 +40,7 @@ class Planner:
 class Observer:
     def __init__(self) -> None:
         self.seen: queue.SimpleQueue[HookEvent] = queue.SimpleQueue()
-        self.let_go = threading.Event()
+        self.released = threading.Event()
         self.error: Exception | None = None
         self.times = 0
 
@@ -54,7 +54,7 @@ class Observer:
     @service(effect="read")
     def dawdle(self, called: HookEvent) -> None:
         self.times += 1
-        self.let_go.wait(5)
+        self.released.wait(5)
 
     def next(self) -> HookEvent:
         return self.seen.get(timeout=20)
@@ -321,7 +321,7 @@ def test_a_slow_hook_is_cut_off(
     hook = here.before_service(plan, watch("dawdle"))
     for _ in range(4):
         plan("coffee")
-    observer.let_go.set()
+    observer.released.set()
     [info] = hook.infos()
     assert info.suspended
     assert "cut off" in info.last_error
@@ -333,7 +333,7 @@ def test_a_slow_hook_in_the_same_container_is_cut_off_as_well(here: Container, o
     here.register(observer, "eye")
     hook = here.before_service(plan, here.find(where(name="dawdle")))
     assert plan("coffee", 1) == ["coffee"]
-    observer.let_go.set()
+    observer.released.set()
     assert hook.infos()[0].failures == 1
 
 
@@ -343,7 +343,7 @@ def test_what_is_too_late_after_its_hooks_does_not_run(
     here.before_service(plan, watch("dawdle"))
     with pytest.raises((errors.DeadlineExceeded, errors.OutcomeUnknown)):
         plan.with_(deadline_s=0.05)("coffee")
-    observer.let_go.set()
+    observer.released.set()
     time.sleep(0.2)
     assert planner.ran == []
 
@@ -378,10 +378,10 @@ def test_nothing_comes_before_a_stop_and_what_comes_after_does_not_hold_it_up(
     here.before_service(where(group="mind"), watch("see"))
     here.after_service(where(group="mind"), watch("dawdle"))
     halt.with_(deadline_s=20)()
-    assert not observer.let_go.is_set()
+    assert not observer.released.is_set()
     assert planner.ran == [("halt", 0)]
     wait_until(lambda: observer.times == 1)  # the one after it
-    observer.let_go.set()
+    observer.released.set()
 
 
 @pytest.mark.parametrize("call", [print, "eye.see", None], ids=["function", "text", "none"])

@@ -14,27 +14,27 @@ from trade._registry.index import Index
 from trade._registry.registry import Record, Registry
 
 
-def record(number: int, **told: Any) -> Record:
-    address = Address("me", told.get("container", "driver"), "e1")
-    name = told.get("name", f"s{number}")
-    achieves, uses = tuple(told.get("achieves", ())), tuple(told.get("uses", ()))
+def record(number: int, **reported: Any) -> Record:
+    address = Address("me", reported.get("container", "driver"), "e1")
+    name = reported.get("name", f"s{number}")
+    achieves, uses = tuple(reported.get("achieves", ())), tuple(reported.get("uses", ()))
     return Record(
         key=ServiceKey(address, "_", f"Arm-{number}", name),
         info=ServiceInfo(name=name, signature=f"{name}()", achieves=achieves, uses=uses),
-        groups=tuple(told.get("groups", ())),
+        groups=tuple(reported.get("groups", ())),
         kind="Arm",
         host="edge",
         pid=1,
         local=False,
-        kinds=tuple(told.get("kinds", ("Arm",))),
+        kinds=tuple(reported.get("kinds", ("Arm",))),
         meta={},
-        health=told.get("health", HEALTHY),
+        health=reported.get("health", HEALTHY),
         members={},
     )
 
 
 _labels = st.lists(st.sampled_from(["a", "b", "a.b", "a.b.c", "ab"]), max_size=2)
-_told = st.fixed_dictionaries(
+_reported = st.fixed_dictionaries(
     {
         "name": st.sampled_from(["a", "b", "a*"]),
         "container": st.sampled_from(["a", "b"]),
@@ -62,12 +62,12 @@ _constraints = st.recursive(
 )
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5), _told), max_size=20), _constraints)
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5), _reported), max_size=20), _constraints)
 def test_the_index_finds_what_looking_at_all_finds(events: list[tuple[bool, int, Any]], constraint: Constraint) -> None:
     index: Index[Record] = Index()
     everything: dict[ServiceKey, Record] = {}
-    for comes, number, told in events:
-        entry = record(number, **{**told, "name": "a", "container": "a"} if number < 3 else told)
+    for comes, number, reported in events:
+        entry = record(number, **{**reported, "name": "a", "container": "a"} if number < 3 else reported)
         if comes:
             index.put(entry)
             everything[entry.key] = entry

@@ -56,12 +56,12 @@ def test_the_load_report_counts_running_and_queued_calls(here: Container, there:
 
 
 def test_the_load_report_agrees_with_the_operating_system(here: Container) -> None:
-    told, process = here.system.load(), psutil.Process()
-    assert (told.container, told.cores) == ("here", psutil.cpu_count())
-    assert told.threads == threading.active_count()
-    assert told.memory_bytes is not None
-    assert 0.5 < told.memory_bytes / process.memory_info().rss < 2
-    assert told.load_1min is not None
+    reported, process = here.system.load(), psutil.Process()
+    assert (reported.container, reported.cores) == ("here", psutil.cpu_count())
+    assert reported.threads == threading.active_count()
+    assert reported.memory_bytes is not None
+    assert 0.5 < reported.memory_bytes / process.memory_info().rss < 2
+    assert reported.load_1min is not None
 
 
 class Elapsing:
@@ -95,19 +95,19 @@ def test_a_process_that_works_has_more_than_one_that_waits() -> None:
 def test_load_readings_less_than_a_second_apart_cover_a_longer_period() -> None:
     clock = Elapsing()
     load = LoadMeter("c", list[WorkerPool], none_queued, clock)
-    told = list[float]()
+    reported = list[float]()
     for later_s in (0.5, 2.0, 0.5, 0.5, 1.0):
         clock.now_s += later_s
-        told.append(load.read().over_s)
-    assert told == [0.5, 2.5, 3.0, 1.0, 1.0]
+        reported.append(load.read().over_s)
+    assert reported == [0.5, 2.5, 3.0, 1.0, 1.0]
 
 
 def test_what_a_system_does_not_tell_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delattr("os.getloadavg")
     monkeypatch.setattr(module, "_STATUS", tmp_path / "status")
     monkeypatch.setattr(module, "_STAT", tmp_path / "stat")
-    told = LoadMeter("c", list[WorkerPool], none_queued).read()
-    assert (told.host_cpu_percent, told.load_1min, told.memory_bytes) == (None, None, None)
+    reported = LoadMeter("c", list[WorkerPool], none_queued).read()
+    assert (reported.host_cpu_percent, reported.load_1min, reported.memory_bytes) == (None, None, None)
 
 
 def test_the_share_of_the_host_leaves_out_what_idles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

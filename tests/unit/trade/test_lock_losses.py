@@ -25,10 +25,10 @@ from trade.errors import (
 
 class Losses:
     def __init__(self) -> None:
-        self.told: list[LockLost] = []
+        self.reported: list[LockLost] = []
 
     def __call__(self, lost: LockLost) -> None:
-        self.told.append(lost)
+        self.reported.append(lost)
 
 
 @pytest.mark.parametrize("victim", ["a", "b"])
@@ -39,7 +39,7 @@ def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot,
         handle = robot.find(rest)
         robot.system.kill(victim)
         assert robot[rest].stopped.wait(20)
-        wait_until(lambda: losses.told)
+        wait_until(lambda: losses.reported)
         assert not lock.held
         with pytest.raises(LockLost, match=f"container {victim} has ended"):
             handle(0.2)
@@ -65,7 +65,7 @@ def test_S12_a_partition_ends_the_lock_on_both_sides(robot: Robot) -> None:
     lock = robot.me.lock(WHOLE, lease_s=60, on_lost=losses).acquire()
     robot.system.partition("me", "a")
     robot.system.advance(2)
-    wait_until(lambda: losses.told)
+    wait_until(lambda: losses.reported)
     assert not lock.held
     with robot.other.lock(WHOLE, wait_s=20):
         robot.system.heal()
@@ -233,7 +233,7 @@ def test_a_refused_call_marks_the_lock_as_lost_immediately(robot: Robot) -> None
     assert not lock.held  # which a renewal would tell in 15 s
     with pytest.raises(LockLost, match="to see"):
         lock.check()
-    wait_until(lambda: losses.told)
+    wait_until(lambda: losses.reported)
     wait_until(lambda: robot.other.locks() == [])
 
 

@@ -251,15 +251,15 @@ def test_S15_what_a_provider_leaves_running_has_no_permit_any_more() -> None:
 
 def test_request_release_reaches_the_owner(robot: Robot) -> None:
     heard = list[tuple[str, str]]()
-    told = threading.Event()
+    reported = threading.Event()
 
     def on_request(who: str, reason: str) -> None:
         heard.append((who, reason))
-        told.set()
+        reported.set()
 
     with robot.me.lock(WHOLE, on_request=on_request):
         assert set(robot.other.request_release(WHOLE, "the door")) == {"tester/me"}
-        assert told.wait(20)
+        assert reported.wait(20)
     assert ("tester/other", "the door") in heard
     assert robot.other.request_release(WHOLE, "again") == []
 

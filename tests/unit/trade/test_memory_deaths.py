@@ -98,8 +98,8 @@ def test_a_death_at_any_message_hangs_no_client_and_the_rest_continues(
             assert labels(survivor) == [], (step, death.at)
             system.container("callee").register(Lamp(), "again")
             assert found(survivor, "again")(0.9) == 0.9
-            everybody = ["caller", "callee"]
-            assert sorted(info.name for info in survivor.containers()) == sorted(everybody), (step, death.at)
+            expected = ["caller", "callee"]
+            assert sorted(info.name for info in survivor.containers()) == sorted(expected), (step, death.at)
 
 
 @pytest.mark.parametrize("arrived", [False, True])
@@ -157,7 +157,7 @@ class Storm:
         for name in self._names:
             system.container(name)
         self._acts = [self._offer] * 5 + [self._withdraw] * 3 + [self._wait] * 3
-        self._acts += [self._cut, self._cut, self._mend, self._die] if faults else []
+        self._acts += [self._cut, self._cut, self._reconnect, self._die] if faults else []
         system.delay(0.001, jitter_s=0.05)
 
     def rage(self, turns: int) -> None:
@@ -187,7 +187,7 @@ class Storm:
         one, other = self._random.sample(self._names, 2)
         self._system.partition(one, other, one_way=self._random.random() < 0.3)
 
-    def _mend(self) -> None:
+    def _reconnect(self) -> None:
         self._system.heal(self._any())
 
     def _die(self) -> None:

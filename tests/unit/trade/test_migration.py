@@ -165,8 +165,8 @@ def test_of_several_that_fit_it_goes_to_the_least_busy(
 ) -> None:
     for number, (host, own, calls) in enumerate(busy, 1):
         meter = scene.memory.container(f"new-{number}", instantiable=["migrants_there:*"]).meter
-        told = structs.replace(meter.read(), host_cpu_percent=host, cpu_percent=own, calls_per_s=calls)
-        monkeypatch.setattr(meter, "read", lambda told=told: told)
+        reported = structs.replace(meter.read(), host_cpu_percent=host, cpu_percent=own, calls_per_s=calls)
+        monkeypatch.setattr(meter, "read", lambda reported=reported: reported)
     scene.memory.settle()
     [count, _] = scene.asker.migrate(scene.counter()[0], to="new-?")
     assert count.container == "new-2"

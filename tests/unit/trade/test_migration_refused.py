@@ -42,7 +42,7 @@ def refused(scene: Scene, which: Handle, to: str = "new", **options: Any) -> Bas
     return error.value
 
 
-def goes_on(scene: Scene, count: Handle) -> bool:
+def continues(scene: Scene, count: Handle) -> bool:
     """Whether the handle from before still counts on from three."""
     scene.module.before.clear()
     return count() == 4
@@ -57,7 +57,7 @@ def test_what_is_locked_stays_also_if_who_asks_has_the_lock(scene: Scene) -> Non
         error = refused(scene, count)
         assert isinstance(error, LockedByOther)
         assert (error.owner, error.purpose) == ("chief/asker", "mine")
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_a_lock_on_what_reads_counts_too(scene: Scene) -> None:
@@ -119,7 +119,7 @@ def test_a_provider_does_not_move_itself_away_under_its_own_call(scene: Scene, m
     scene.module.before["count"] = lambda: scene.old.migrate(here, to="new")
     with pytest.raises(LockedByOther, match="a call or a motion that has not ended"):
         count()
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_a_lock_that_is_broken_meanwhile_ends_the_attempt(scene: Scene) -> None:
@@ -128,7 +128,7 @@ def test_a_lock_that_is_broken_meanwhile_ends_the_attempt(scene: Scene) -> None:
     error = refused(scene, count)
     assert isinstance(error, LockedByOther)
     assert "no time for that" in str(error)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_a_stop_that_comes_meanwhile_ends_the_attempt(scene: Scene) -> None:
@@ -223,7 +223,7 @@ def test_there_must_be_another_container_of_that_name(scene: Scene, to: str) -> 
     count, _ = scene.counter()
     error = refused(scene, count, to=to)
     assert isinstance(error, NoSuchService)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_only_what_the_other_container_allows_is_made_there(scene: Scene) -> None:
@@ -231,7 +231,7 @@ def test_only_what_the_other_container_allows_is_made_there(scene: Scene) -> Non
     scene.memory.container("closed")
     scene.memory.settle()
     assert isinstance(refused(scene, count, to="closed"), NotInstantiable)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_a_class_that_is_not_there_is_not_made(scene: Scene) -> None:
@@ -240,7 +240,7 @@ def test_a_class_that_is_not_there_is_not_made(scene: Scene) -> None:
     error = refused(scene, count)
     assert isinstance(error, NoSuchClass)
     assert "migrants_there has no such class" in str(error)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_a_class_that_is_another_version_there_is_not_made(scene: Scene, old: st
     assert isinstance(error, CannotMigrate)
     assert "another version" in str(error)
     assert module.events == []
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_other_words_in_a_docstring_are_no_other_version(scene: Scene) -> None:
@@ -273,7 +273,7 @@ def test_other_words_in_a_docstring_are_no_other_version(scene: Scene) -> None:
 def test_a_constructor_that_fails_there_changes_nothing(scene: Scene) -> None:
     count, _ = scene.counter()
     assert isinstance(refused(scene, count, args=[1, 2, 3]), CannotInstantiate)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_a_full_container_says_so(scene: Scene) -> None:
@@ -302,7 +302,7 @@ def test_a_providers_exception_is_reported_and_changes_nothing(scene: Scene, met
     assert isinstance(error, CannotMigrate)
     assert f"{method}_state" in str(error)
     assert "OSError: the disk is full. It continues where it was" in str(error)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 @pytest.mark.parametrize("method", ["save", "restore"])
@@ -317,7 +317,7 @@ def test_a_provider_that_takes_too_long_with_its_state_stays(
     leave.set()
     assert isinstance(error, CannotMigrate)
     assert f"{method}_state has not ended after" in str(error)
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 def test_state_that_cannot_be_sent_stays_with_its_provider(scene: Scene) -> None:
@@ -355,7 +355,7 @@ def test_who_loses_the_role_while_it_is_prepared_is_refused(scene: Scene) -> Non
     scene.module.before["restore"] = lambda: scene.old.load_policy(scene.policy(chief="member", load=False))
     assert isinstance(refused(scene, count), AccessDenied)
     scene.policy()
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 @pytest.mark.parametrize(("who", "complaint"), [("new", "new may not register"), ("old", "old may not register")])
@@ -430,7 +430,7 @@ def test_who_waits_no_more_gets_nothing_moved(scene: Scene) -> None:
     with pytest.raises((DeadlineExceeded, TimeoutError)):
         migrate.with_(deadline_s=0.2)(count, "new")
     wait_until(lambda: scene.old.locks() == [])
-    assert goes_on(scene, count)
+    assert continues(scene, count)
 
 
 Fault = Callable[[Container], None]
@@ -441,4 +441,4 @@ def test_a_container_that_dies_while_it_prepares_leaves_it_where_it_was(scene: S
     scene.module.before["restore"] = lambda: scene.memory.kill("new")
     with pytest.raises((ContainerLost, ServiceGone)):
         scene.asker.migrate(count, to="new")
-    assert goes_on(scene, count)
+    assert continues(scene, count)

@@ -133,13 +133,13 @@ def test_ticks_do_not_overlap_and_missed_ones_become_one(here: Container) -> Non
 
 
 def test_a_slow_call_holds_up_no_other(here: Container) -> None:
-    let_go: queue.SimpleQueue[None] = queue.SimpleQueue()
+    go_on: queue.SimpleQueue[None] = queue.SimpleQueue()
     ticks: queue.SimpleQueue[int] = queue.SimpleQueue()
-    here.once(lambda: let_go.get(timeout=20))
+    here.once(lambda: go_on.get(timeout=20))
     here.every(SOON_S, lambda: ticks.put(1))
     for _ in range(3):
         ticks.get(timeout=20)
-    let_go.put(None)
+    go_on.put(None)
 
 
 # --- what is called
@@ -301,9 +301,9 @@ def test_each_kind_of_failure_is_reported_once_with_its_subject(
         noted = here.every(SOON_S, go, if_=holds)
         wait_until(lambda: noted.info().failures >= 12)
         noted.cancel()
-    told = [one for one in caplog.messages if noted.id in one]
-    assert [sum(f"the {part} of" in one for one in told) for part in ("condition", "call")] == [2, 1]
-    assert "holds" in next(one for one in told if "the condition of" in one)
+    reported = [one for one in caplog.messages if noted.id in one]
+    assert [sum(f"the {part} of" in one for one in reported) for part in ("condition", "call")] == [2, 1]
+    assert "holds" in next(one for one in reported if "the condition of" in one)
 
 
 def test_a_callback_that_fails_kills_nothing(here: Container) -> None:

@@ -165,16 +165,16 @@ def test_a_collector_gets_what_is_noted_once_its_url_is_set(
         user.find(where(name="step"), wait_s=30)(0.5)
     assert {(path, kind) for path, kind, _ in collector.got} == {("/v1/traces", "application/x-protobuf")}
     resources = [one for _, _, request in collector.got for one in request.resource_spans]
-    told = {
+    reported = {
         next(pair.value.string_value for pair in one.resource.attributes if pair.key == "service.name"): span
         for one in resources
         for scope in one.scope_spans
         for span in scope.spans
     }
-    assert {name: span.name for name, span in told.items()} == {"user": "rosie.leg.step", "leg": "rosie.leg.step"}
-    assert told["leg"].parent_span_id == told["user"].span_id
-    assert told["leg"].trace_id == told["user"].trace_id
-    assert told["leg"].trace_id[:8] != bytes(8)
+    assert {name: span.name for name, span in reported.items()} == {"user": "rosie.leg.step", "leg": "rosie.leg.step"}
+    assert reported["leg"].parent_span_id == reported["user"].span_id
+    assert reported["leg"].trace_id == reported["user"].trace_id
+    assert reported["leg"].trace_id[:8] != bytes(8)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5])

@@ -27,19 +27,19 @@ class News:
     """What has happened since the last question."""
 
     def __init__(self) -> None:
-        self.told: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.reported: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     @service
     def came(self, what: Handle) -> None:
-        self.told.put(f"new: {what.label} in {what.container}")
+        self.reported.put(f"new: {what.label} in {what.container}")
 
     @service
     def went(self, what: Handle) -> None:
-        self.told.put(f"gone: {what.label}")
+        self.reported.put(f"gone: {what.label}")
 
     @service
     def is_other(self, what: Handle) -> None:
-        self.told.put(f"changed: {what.label}: {what.health}")
+        self.reported.put(f"changed: {what.label}: {what.health}")
 
 
 @pytest.fixture
@@ -79,11 +79,11 @@ def test_what_is_new_is_answered_by_notifications(memory: MemorySystem) -> None:
     head = Head()
     robot.register(head, "rosie.head")
     memory.settle()
-    assert news.told.get(timeout=20) == "new: rosie.head.turn in robot"
+    assert news.reported.get(timeout=20) == "new: rosie.head.turn in robot"
     robot.set_health(head, "degraded: overheating")
     memory.settle()
-    assert news.told.get(timeout=20) == "changed: rosie.head.turn: degraded: overheating"
+    assert news.reported.get(timeout=20) == "changed: rosie.head.turn: degraded: overheating"
     robot.deregister(head)
     memory.settle()
-    assert news.told.get(timeout=20) == "gone: rosie.head.turn"
-    assert news.told.empty()  # what was there before is not new
+    assert news.reported.get(timeout=20) == "gone: rosie.head.turn"
+    assert news.reported.empty()  # what was there before is not new

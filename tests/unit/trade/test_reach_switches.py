@@ -110,10 +110,10 @@ def test_an_endpoint_may_be_a_name(apart: tuple[Container, Container]) -> None:
 
 
 def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -> None:
-    nobody = free_endpoint()
+    empty = free_endpoint()
     with pytest.raises(CannotConnect, match=r"nothing accepts connections there\. Is it up") as raised:
-        here.system.connect(nobody)
-    assert raised.value.endpoint == nobody
+        here.system.connect(empty)
+    assert raised.value.endpoint == empty
     assert isinstance(raised.value, ConnectionError)
 
 

@@ -25,7 +25,7 @@ def info(revision: int = 1, *names: str, group: str = "rosie") -> ProviderInfo:
     return ProviderInfo(revision=revision, groups=(group,), kind="Arm", host="edge", pid=1, services=services)
 
 
-class Told:
+class Reports:
     def __init__(self, registry: Registry) -> None:
         self.changes: list[tuple[list[str], list[str], list[str]]] = []
         registry.changes.subscribe(self.hear)
@@ -41,8 +41,8 @@ def registry() -> Registry:
 
 
 @pytest.fixture
-def told(registry: Registry) -> Told:
-    return Told(registry)
+def reported(registry: Registry) -> Reports:
+    return Reports(registry)
 
 
 def answer(registry: Registry, revision: int, **offered: ProviderInfo) -> None:
@@ -51,56 +51,56 @@ def answer(registry: Registry, revision: int, **offered: ProviderInfo) -> None:
     registry.settle(state, revision, {name: ("rosie", entry) for name, entry in offered.items()})
 
 
-def test_an_entry_counts_only_while_its_owner_is_alive(registry: Registry, told: Told) -> None:
+def test_an_entry_counts_only_while_its_owner_is_alive(registry: Registry, reported: Reports) -> None:
     registry.put(OTHER, "rosie", "arm", info())
     assert registry.select(where()) == []
     assert registry.appear(OTHER)
-    assert told.changes == []
+    assert reported.changes == []
     answer(registry, 1, arm=info())
-    assert told.changes == [(["go"], [], [])]
+    assert reported.changes == [(["go"], [], [])]
 
 
-def test_an_entry_after_the_sign_of_life_counts_at_once(registry: Registry, told: Told) -> None:
+def test_an_entry_after_the_sign_of_life_counts_at_once(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info())
-    assert told.changes == [(["go"], [], [])]
+    assert reported.changes == [(["go"], [], [])]
 
 
-def test_a_sign_of_life_that_falls_takes_the_services_along(registry: Registry, told: Told) -> None:
+def test_a_sign_of_life_that_falls_takes_the_services_along(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info())
     registry.vanish(OTHER)
     assert registry.select(where()) == []
     assert registry.appear(OTHER)
     answer(registry, 1, arm=info())
-    assert told.changes == [(["go"], [], []), ([], ["go"], []), (["go"], [], [])]
+    assert reported.changes == [(["go"], [], []), ([], ["go"], []), (["go"], [], [])]
 
 
-def test_signs_of_life_heard_twice_change_nothing(registry: Registry, told: Told) -> None:
+def test_signs_of_life_heard_twice_change_nothing(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info())
     assert not registry.appear(OTHER)
     registry.vanish(OTHER)
     registry.vanish(OTHER)
-    assert told.changes == [(["go"], [], []), ([], ["go"], [])]
+    assert reported.changes == [(["go"], [], []), ([], ["go"], [])]
 
 
-def test_entries_heard_twice_change_nothing(registry: Registry, told: Told) -> None:
+def test_entries_heard_twice_change_nothing(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info())
     registry.put(OTHER, "rosie", "arm", info())
     answer(registry, 1, arm=info())
     registry.put(OTHER, "rosie", "arm", info())
-    assert told.changes == [(["go"], [], [])]
+    assert reported.changes == [(["go"], [], [])]
 
 
-def test_a_deregistered_provider_never_comes_back_in_that_boot(registry: Registry, told: Told) -> None:
+def test_a_deregistered_provider_never_comes_back_in_that_boot(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info())
     registry.put(OTHER, "rosie", "arm", gone(2))
     answer(registry, 1, arm=info())
     registry.put(OTHER, "rosie", "arm", info(3))
-    assert told.changes == [(["go"], [], []), ([], ["go"], [])]
+    assert reported.changes == [(["go"], [], []), ([], ["go"], [])]
 
 
 # --- what was missed
@@ -121,22 +121,22 @@ def test_a_container_that_appeared_is_to_be_asked_once(registry: Registry) -> No
     assert not left_open(registry)
 
 
-def test_a_missed_announcement_shows_with_the_next_one(registry: Registry, told: Told) -> None:
+def test_a_missed_announcement_shows_with_the_next_one(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     answer(registry, 1, arm=info())
     assert not registry.put(OTHER, "rosie", "head", info(3, "nod"))
-    assert told.changes[-1] == (["nod"], [], [])
+    assert reported.changes[-1] == (["nod"], [], [])
     answer(registry, 3, arm=info(), leg=info(2, "kick"), head=info(3, "nod"))
-    assert told.changes[-1] == (["kick"], [], [])
+    assert reported.changes[-1] == (["kick"], [], [])
     assert not left_open(registry)
 
 
-def test_a_missed_withdrawal_shows_in_the_answer(registry: Registry, told: Told) -> None:
+def test_a_missed_withdrawal_shows_in_the_answer(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     answer(registry, 2, arm=info(), leg=info(2, "kick"))
     assert not registry.count(OTHER, 3)
     answer(registry, 3, arm=info())
-    assert told.changes[-1] == ([], ["kick"], [])
+    assert reported.changes[-1] == ([], ["kick"], [])
     assert registry.removed(ServiceKey(OTHER, "rosie", "leg", "kick"))
 
 
@@ -150,7 +150,7 @@ def test_the_last_announcement_that_was_missed_shows_with_the_count(registry: Re
     assert registry.count(OTHER, 2)
 
 
-def test_an_answer_older_than_what_is_known_takes_nothing_back(registry: Registry, told: Told) -> None:
+def test_an_answer_older_than_what_is_known_takes_nothing_back(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info(1))
     registry.put(OTHER, "rosie", "leg", info(2, "kick"))
@@ -222,11 +222,11 @@ def test_whatever_is_lost_the_answer_that_closes_everything_is_true(data: st.Dat
 # --- changes
 
 
-def test_a_new_revision_lists_what_came_what_went_and_what_stayed(registry: Registry, told: Told) -> None:
+def test_a_new_revision_lists_what_came_what_went_and_what_stayed(registry: Registry, reported: Reports) -> None:
     registry.appear(OTHER)
     registry.put(OTHER, "rosie", "arm", info(1, "a", "b"))
     registry.put(OTHER, "rosie", "arm", info(2, "b", "c", group="lab"))
-    assert told.changes[1] == (["c"], ["a"], ["b"])
+    assert reported.changes[1] == (["c"], ["a"], ["b"])
     assert [record.groups for record in registry.select(where(name="b"))] == [("lab",)]
 
 
@@ -298,14 +298,14 @@ _events = st.lists(
 @given(_events)
 def test_reported_changes_add_up_to_the_present_services(events: list[tuple[str, Address, str, int]]) -> None:
     registry = Registry(OWN)
-    told: set[ServiceKey] = set()
+    reported: set[ServiceKey] = set()
 
     def hear(change: Change) -> None:
         joined, left = {record.key for record in change.joined}, {record.key for record in change.left}
-        assert not joined & told, "came twice"
-        assert left <= told, "left without having come"
-        told.update(joined)
-        told.difference_update(left)
+        assert not joined & reported, "came twice"
+        assert left <= reported, "left without having come"
+        reported.update(joined)
+        reported.difference_update(left)
 
     registry.changes.subscribe(hear)
     for event, address, provider, revision in events:
@@ -322,4 +322,4 @@ def test_reported_changes_add_up_to_the_present_services(events: list[tuple[str,
                 registry.appear(address)
             case _:
                 registry.vanish(address)
-    assert told == {record.key for record in registry.select(where())}
+    assert reported == {record.key for record in registry.select(where())}

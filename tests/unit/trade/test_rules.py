@@ -186,8 +186,8 @@ def test_every_firing_is_audited_in_a_file_and_as_a_service(there: Container, de
     lines = [json.loads(line) for line in engine.audit.read_text().splitlines()]
     assert [line["service"] for line in lines] == [firing.service for firing in firings]
     assert lines[0]["steps"][0]["result"] == "'noted'"
-    told = there.find(where(name="rule_firings"), wait_s=20)()
-    assert told == firings
+    reported = there.find(where(name="rule_firings"), wait_s=20)()
+    assert reported == firings
     [info] = there.call(where(name="rules", kind="Rules"))
     assert (info.name, info.container, info.state, info.fired) == ("r", "here", "standing", 2)
 
@@ -245,21 +245,21 @@ def test_a_rehearsal_says_what_would_fire_now(here: Container, desk: Desk, tmp_p
         when = {{ left = {{ name = "switch" }} }}
         {TELL}
         """)
-    told = {rehearsal.rule: rehearsal for rehearsal in rehearse(here, read_rules(file))}
-    assert {name: rehearsal.fires for name, rehearsal in told.items()} == {
+    reported = {rehearsal.rule: rehearsal for rehearsal in rehearse(here, read_rules(file))}
+    assert {name: rehearsal.fires for name, rehearsal in reported.items()} == {
         "absent": True,
         "timed": False,
         "coming": False,
         "going": False,
     }
-    assert [rehearsal.now for rehearsal in told.values()] == [
+    assert [rehearsal.now for rehearsal in reported.values()] == [
         "nothing matches",
         "the condition does not hold",
         "1 match: desk.strain",
         "nothing matches",
     ]
-    assert [did.service for did in told["coming"].steps] == ["desk.tell"]
-    assert told["going"].steps == ()
+    assert [did.service for did in reported["coming"].steps] == ["desk.tell"]
+    assert reported["going"].steps == ()
     assert desk.heard.empty()
 
 

@@ -28,8 +28,8 @@ def test_announcing_many_services_takes_no_pool_and_a_large_result_does(here: Co
     program = start_program(OFFERS)
     handle = here.find(where(name="picture", group="house.room39"), wait_s=30)
     program.tell()
-    told = int(program.heard())
-    assert told < 4096
+    reported = int(program.heard())
+    assert reported < 4096
     handle()
     program.tell()
-    assert int(program.heard()) > told + 4096  # it would be seen
+    assert int(program.heard()) > reported + 4096  # it would be seen

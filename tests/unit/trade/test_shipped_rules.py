@@ -81,8 +81,8 @@ def seers(looking: Container) -> list[str]:
 
 
 def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) -> None:
-    told = {rehearsal.rule: rehearsal.fires for rehearsal in rehearse(here, read_rules(SHIPPED))}
-    assert told == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
+    reported = {rehearsal.rule: rehearsal.fires for rehearsal in rehearse(here, read_rules(SHIPPED))}
+    assert reported == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
 
 
 def test_bootstrap_stays_discoverable_until_a_provider_that_can_see_has_joined(

@@ -54,5 +54,5 @@ def test_a_failure_that_only_lasts_longer_is_reported_once(caplog: pytest.LogCap
                     samples.next(PATIENCE_S)
                 texts.add(str(silent.value))
     assert len(texts) == 3
-    told = [record for record in caplog.records if "while it is listened to" in record.getMessage()]
-    assert len(told) == 1
+    reported = [record for record in caplog.records if "while it is listened to" in record.getMessage()]
+    assert len(reported) == 1

@@ -60,7 +60,7 @@ def echo(container: Container) -> Any:
     return container.find(where(name="echo", local=False), wait_s=20)
 
 
-def sees_nobody(container: Container) -> bool:
+def sees_no_other(container: Container) -> bool:
     with pytest.raises(NoSuchService):
         container.find(where(name="echo", local=False), wait_s=1.2)
     return len(container.containers()) == 1 and links(container) == []
@@ -115,7 +115,7 @@ def test_who_has_a_certificate_of_another_authority_is_not_linked_and_sees_nothi
     containers = [start_container(f"c{number}", tls=folders[number]) for number in (first, 1 - first)]
     for container in containers:
         container.register(Echo(), "robot")
-    assert all(sees_nobody(container) for container in containers)
+    assert all(sees_no_other(container) for container in containers)
 
 
 def test_an_endpoint_that_refuses_a_certificate_is_warned_of(
@@ -256,11 +256,11 @@ def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewe
 def test_a_container_warns_at_start_of_a_certificate_that_ends_soon(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for hours, told in ((20, True), (30, False)):
+    for hours, reported in ((20, True), (30, False)):
         caplog.clear()
         with caplog.at_level(logging.WARNING, "trade"):
             start_container(f"arm-{hours}", tls=papers.of("arm", lasts=timedelta(hours=hours)))
-        assert ("the certificate of arm ends" in caplog.text) == told
+        assert ("the certificate of arm ends" in caplog.text) == reported
 
 
 def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
@@ -317,7 +317,7 @@ def test_with_and_without_certificates_are_not_linked_and_it_says_so(
     with caplog.at_level(logging.WARNING, "trade"):
         certified = start_container("certified", tls=papers.of("arm"))
     assert "without certificates, and this container is with certificates: they cannot be linked" in caplog.text
-    assert sees_nobody(certified)
+    assert sees_no_other(certified)
 
 
 @pytest.mark.parametrize(("of", "seen"), [("papers", True), ("strangers", False), ("", False)])

@@ -203,13 +203,13 @@ def test_a_call_that_is_refused_is_noted_by_who_asked(here: Container, there: Co
 
 
 def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Container, eventually: Eventually) -> None:
-    entered, let_go = threading.Event(), threading.Event()
+    entered, released = threading.Event(), threading.Event()
 
     class Queue:
         @service(serial=True)
         def hold(self) -> None:
             entered.set()
-            let_go.wait(20)
+            released.wait(20)
 
         @service(serial=True)
         def follow(self) -> None: ...
@@ -226,7 +226,7 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
     seen_waiting_ns = time.monotonic_ns()
     threading.Event().wait(0.02)
     waited_s = (time.monotonic_ns() - seen_waiting_ns) / 1e9
-    let_go.set()
+    released.set()
     first.result(20)
     second.result(20)
     served = {span.service: span for span in here.spans() if span.side == "served"}

@@ -133,8 +133,8 @@ def test_messages_survive_the_wire(message: Any) -> None:
 
 def test_an_effect_that_is_not_known_counts_as_actuating() -> None:
     odd = ServiceInfo(name="turn", signature="turn()", effect="servo")
-    told = ProviderInfo(revision=1, groups=("rosie",), kind="Arm", host="here", pid=1, services=(odd,))
-    [read] = decode_provider(encode_message(told)).services
+    reported = ProviderInfo(revision=1, groups=("rosie",), kind="Arm", host="here", pid=1, services=(odd,))
+    [read] = decode_provider(encode_message(reported)).services
     assert read.effect == "actuate"
 
 

@@ -187,20 +187,20 @@ def kind_of(message: Any) -> str:
 
 
 def _meaning(message: Any) -> Any:
-    return _told(msgpack.decode(msgpack.encode(message), strict=False))
+    return _reported(msgpack.decode(msgpack.encode(message), strict=False))
 
 
-def _told(value: Any) -> Any:
+def _reported(value: Any) -> Any:
     if isinstance(value, bytes):
         return {"$bytes": value.hex()}
     if isinstance(value, msgpack.Ext):
         return {"$extension": [value.code, bytes(value.data).hex()]}
     if isinstance(value, list):
-        return [_told(one) for one in value]
+        return [_reported(one) for one in value]
     if isinstance(value, dict):
         if all(isinstance(name, str) for name in value):
-            return {name: _told(one) for name, one in value.items()}
-        return {"$map": [[_told(name), _told(one)] for name, one in value.items()]}
+            return {name: _reported(one) for name, one in value.items()}
+        return {"$map": [[_reported(name), _reported(one)] for name, one in value.items()]}
     return value
 
 

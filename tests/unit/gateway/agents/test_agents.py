@@ -23,9 +23,9 @@ def test_an_agent_looks_at_what_there_is(agent: Container) -> None:
     async def looks(client: Client) -> None:
         found = await client("services", group="rosie.head")
         assert {one["name"] for one in found} == {"state", "turn", "spin", "stop"}
-        told = await client("describe", group="rosie.head", name="turn")
-        assert told["arguments"]["properties"]["angle_rad"]["type"] == "number"
-        assert (told["needs_lock"], told["needs_approval"]) == (True, False)
+        reported = await client("describe", group="rosie.head", name="turn")
+        assert reported["arguments"]["properties"]["angle_rad"]["type"] == "number"
+        assert (reported["needs_lock"], reported["needs_approval"]) == (True, False)
         assert await client("call", group="rosie.head", name="state") == {"result": {"position_rad": 0}}
         assert (await client("ask", sentence="Who has the head?"))[
             "text"
@@ -223,22 +223,22 @@ def test_P58_the_dialogue_of_trade_ask_is_the_same_over_the_protocol(agent: Cont
 def test_each_use_of_a_tool_is_on_the_record_also_a_refused_one(
     memory: MemorySystem, robot: Robot, tmp_path: Path
 ) -> None:
-    told: list[Any] = []
+    reported: list[Any] = []
     agent = memory.container("agent", identity="agent")
     memory.settle()
-    agent._parts.audit = Audit(told.append, agent.address)
+    agent._parts.audit = Audit(reported.append, agent.address)
 
     async def uses(client: Client) -> None:
         await client("services", group="rosie.head")
         await client.refused("call", group="rosie.head", name="turn", args=[0.123])
 
     run(uses, agent)
-    mine = [(one.what, one.about, one.outcome, one.who) for one in told if one.what.startswith("agent's tool")]
+    mine = [(one.what, one.about, one.outcome, one.who) for one in reported if one.what.startswith("agent's tool")]
     assert mine == [
         ("agent's tool services", "rosie.head", "ok", "agent"),
         ("agent's tool call", "rosie.head.turn", "NeedsLock", "agent"),
     ]
-    assert "0.123" not in str(told)
+    assert "0.123" not in str(reported)
 
 
 @pytest.mark.parametrize("sentence", ["stop", "Halt!", "E-stop because of smoke", "stop everything because I say so"])

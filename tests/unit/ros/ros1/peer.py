@@ -12,13 +12,13 @@ import rospy
 import yaml
 from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 
-FOR_EVER, ABORTS, HANGS = 0, -1, -2
+ENDLESS, ABORTS, HANGS = 0, -1, -2
 opened: dict = {}
-told = threading.Lock()
+reported = threading.Lock()
 
 
 def tell(event, what=None) -> None:
-    with told:
+    with reported:
         print(json.dumps({"event": event, "what": what}), flush=True)
 
 
@@ -53,7 +53,7 @@ def pursued(server, goal) -> None:
     if goal.goal == ABORTS:
         server.set_aborted(TestResult(goal.goal), "too far")
         return
-    while goal.goal in (FOR_EVER, HANGS) or steps < goal.goal:
+    while goal.goal in (ENDLESS, HANGS) or steps < goal.goal:
         if server.is_preempt_requested() and goal.goal != HANGS:
             server.set_preempted(TestResult(steps), "as you wish")
             tell("preempted", goal.goal)

@@ -15,13 +15,13 @@ from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, 
 from trade_gateway.ros.ros1 import Ros1, _action_client
 
 TEST = "actionlib/action/Test"
-FOR_EVER, ABORTS, HANGS = 0, -1, -2
+ENDLESS, ABORTS, HANGS = 0, -1, -2
 SUCCEEDED, PREEMPTED, ABORTED, RECALLED = 3, 2, 4, 8
 
 
-def server(stand: Stand, name: str = "mover", deed: str = "act") -> Peer:
+def server(stand: Stand, name: str = "mover", job: str = "act") -> Peer:
     peer = stand.peer(name)
-    peer.do(deed, "/move")
+    peer.do(job, "/move")
     peer.wait_for("did")
     return peer
 
@@ -49,7 +49,7 @@ def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -
 def test_a_goal_is_canceled(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
-    goal = pursue(graph, FOR_EVER, heard)
+    goal = pursue(graph, ENDLESS, heard)
     wait_until(lambda: heard, "it runs")
     goal.cancel()
     outcome = goal.wait(PATIENCE_S)
@@ -62,7 +62,7 @@ def test_a_goal_that_the_server_aborts_says_so(graph: Ros1, stand: Stand) -> Non
 
 
 def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
-    server(stand, deed="reject")
+    server(stand, job="reject")
     with pytest.raises(RosRefused, match="/move: not now"):
         pursue(graph, 1).wait(PATIENCE_S)
 
@@ -75,7 +75,7 @@ def test_an_action_without_a_server_is_unreachable(graph: Ros1, monkeypatch: pyt
 
 def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_yet(graph: Ros1, stand: Stand) -> None:
     server(stand)
-    goal = pursue(graph, FOR_EVER)
+    goal = pursue(graph, ENDLESS)
     with pytest.raises(RosUnreachable, match="its end was not received within"):
         goal.wait(0.05)
     goal.cancel()
@@ -113,7 +113,7 @@ class Lossy:
 
 def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     peer = server(stand)
-    goal = pursue(graph, FOR_EVER)
+    goal = pursue(graph, ENDLESS)
     client = graph._clients["/move"]
     monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 3))
     goal.cancel()
@@ -124,7 +124,7 @@ def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypa
 def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
-    goal = pursue(graph, FOR_EVER, heard)
+    goal = pursue(graph, ENDLESS, heard)
     wait_until(lambda: heard, "it runs")
     our_node().kill()
     goal.cancel()
@@ -136,7 +136,7 @@ def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
 ) -> None:
     peer = server(stand)
     heard: list[int] = []
-    goal = pursue(graph, FOR_EVER, heard)
+    goal = pursue(graph, ENDLESS, heard)
     wait_until(lambda: heard, "it runs")
     client = graph._clients["/move"]
     monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 1))
@@ -151,7 +151,7 @@ def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
 def test_calls_in_progress_are_canceled_when_we_close(graph: Ros1, stand: Stand) -> None:
     peer = server(stand)
     heard: list[int] = []
-    goal = pursue(graph, FOR_EVER, heard)
+    goal = pursue(graph, ENDLESS, heard)
     wait_until(lambda: heard, "it runs")
     client = graph._clients["/move"]
     graph.close()
@@ -186,7 +186,7 @@ class Mover:
         self.times.append(goal.came_at)
         ends = threading.Event()
         goal.when_canceled(ends.set)
-        if number == FOR_EVER:
+        if number == ENDLESS:
             assert ends.wait(PATIENCE_S)
             self.canceled.append(number)
             return Outcome(Ended.CANCELED, {"result": 1}, "stopped")
@@ -233,10 +233,10 @@ def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand:
 
 
 def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
-    peer = client(stand, FOR_EVER)
+    peer = client(stand, ENDLESS)
     peer.wait_for("active")
     peer.do("cancel", "/move")
-    assert peer.wait_for("done") == {"goal": FOR_EVER, "state": PREEMPTED, "result": 1, "text": "stopped"}
+    assert peer.wait_for("done") == {"goal": ENDLESS, "state": PREEMPTED, "result": 1, "text": "stopped"}
 
 
 def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover, stand: Stand) -> None:
@@ -244,7 +244,7 @@ def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover,
     peer.do("advertise", "/move/goal", "actionlib/TestActionGoal")
     peer.do("meet", "/move/goal")
     peer.wait_for("met")
-    peer.do("send", "/move/goal", {"goal_id": {"id": "timeless"}, "goal": {"goal": FOR_EVER}})
+    peer.do("send", "/move/goal", {"goal_id": {"id": "timeless"}, "goal": {"goal": ENDLESS}})
     wait_until(lambda: mover.came, "it runs")
     other = stand.peer("stopper")
     other.do("advertise", "/move/cancel", "actionlib_msgs/GoalID")
@@ -256,24 +256,24 @@ def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover,
 
 
 def test_a_client_receives_reports_of_failures(mover: Mover, stand: Stand) -> None:
-    told = client(stand, ABORTS).wait_for("done")
-    assert (told["state"], told["text"]) == (ABORTED, "a joint is stuck")
+    reported = client(stand, ABORTS).wait_for("done")
+    assert (reported["state"], reported["text"]) == (ABORTED, "a joint is stuck")
 
 
 def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand: Stand) -> None:
     graph.act("/move", TEST, lambda goal: Outcome(Ended.SUCCEEDED, {"resolt": 1}))
-    told = client(stand, 1).wait_for("done")
-    assert told["state"] == ABORTED
-    assert "has no resolt" in told["text"]
+    reported = client(stand, 1).wait_for("done")
+    assert reported["state"] == ABORTED
+    assert "has no resolt" in reported["text"]
 
 
 def test_a_later_goal_of_whomever_ends_the_one_before_and_is_done(mover: Mover, stand: Stand) -> None:
-    first = client(stand, FOR_EVER, "first")
+    first = client(stand, ENDLESS, "first")
     first.wait_for("active")
     second = client(stand, 2, "second")
     assert second.wait_for("done")["state"] == SUCCEEDED
     assert first.wait_for("done")["state"] == PREEMPTED
-    assert mover.came == [(FOR_EVER, "/first"), (2, "/second")]
+    assert mover.came == [(ENDLESS, "/first"), (2, "/second")]
 
 
 def test_a_goal_that_waits_for_the_end_of_another_is_recalled_by_the_next(graph: Ros1, stand: Stand) -> None:
@@ -302,7 +302,9 @@ def _states(graph: Ros1, stand: Stand) -> int:
     """How many goals the action reports."""
     seen: list[int] = []
     heard = graph.subscribe(
-        "/move/status", "actionlib_msgs/msg/GoalStatusArray", lambda told, who: seen.append(len(told["status_list"]))
+        "/move/status",
+        "actionlib_msgs/msg/GoalStatusArray",
+        lambda reported, who: seen.append(len(reported["status_list"])),
     )
     wait_until(lambda: seen, "its state is reported")
     heard.close()
@@ -312,17 +314,17 @@ def _states(graph: Ros1, stand: Stand) -> int:
 def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -> None:
     mover = Mover()
     action = graph.act("/move", TEST, mover.do)
-    peer = client(stand, FOR_EVER)
+    peer = client(stand, ENDLESS)
     peer.wait_for("active")
     action.close()
     action.close()
-    assert mover.canceled == [FOR_EVER]
+    assert mover.canceled == [ENDLESS]
 
 
 def test_our_two_ends_understand_each_other(mover: Mover, graph: Ros1) -> None:
     heard: list[int] = []
     assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(Ended.SUCCEEDED, {"result": 3}, "done")
-    goal = pursue(graph, FOR_EVER)
-    wait_until(lambda: (FOR_EVER, "/trade") in mover.came, "it runs")
+    goal = pursue(graph, ENDLESS)
+    wait_until(lambda: (ENDLESS, "/trade") in mover.came, "it runs")
     goal.cancel()
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED

@@ -18,11 +18,11 @@ TRIGGER = "std_srvs/srv/Trigger"
 
 class Watch:
     def __init__(self, graph: Ros1) -> None:
-        self.told: list[tuple[str, bool]] = []
-        self.watch = graph.watch_nodes(lambda name, there: self.told.append((name, there)))
+        self.reported: list[tuple[str, bool]] = []
+        self.watch = graph.watch_nodes(lambda name, there: self.reported.append((name, there)))
 
     def until(self, name: str, there: bool) -> None:
-        wait_until(lambda: (name, there) in self.told, f"{name} is reported: {self.told}")
+        wait_until(lambda: (name, there) in self.reported, f"{name} is reported: {self.reported}")
 
 
 def answers(graph: Ros1) -> bool:
@@ -42,9 +42,9 @@ def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Sta
     peer.end(signal.SIGKILL)
     watch.until("/arm", there=False)
     stand.peer("arm")
-    wait_until(lambda: watch.told.count(("/arm", True)) == 2, "it is reported again")
-    assert [there for name, there in watch.told if name == "/arm"] == [True, False, True]
-    assert "/trade" not in {name for name, _ in watch.told}
+    wait_until(lambda: watch.reported.count(("/arm", True)) == 2, "it is reported again")
+    assert [there for name, there in watch.reported if name == "/arm"] == [True, False, True]
+    assert "/trade" not in {name for name, _ in watch.reported}
 
 
 def test_a_node_that_ends_is_reported_gone(graph: Ros1, stand: Stand) -> None:
@@ -64,7 +64,7 @@ def test_a_new_subscriber_gets_the_existing_ones_and_an_ended_one_none(graph: Ro
     first.watch.close()
     stand.peer("leg")
     late.until("/leg", there=True)
-    assert ("/leg", True) not in first.told
+    assert ("/leg", True) not in first.reported
 
 
 def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros1, stand: Stand) -> None:
@@ -107,7 +107,7 @@ def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(gra
     peer.do("advertise", "/orders", "std_msgs/String", True)
     peer.do("send", "/orders", {"data": "go"})
     wait_until(lambda: heard == ["go"], "the subscription is open again")
-    assert ("/old", False) not in watch.told
+    assert ("/old", False) not in watch.reported
     old.end()
     watch.until("/old", there=False)
 
@@ -156,7 +156,7 @@ def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open
 
     before.kill()
     watch.until("/arm", there=False)
-    wait_until(lambda: watch.told.count(("/arm", True)) == 2, "it is seen again")
+    wait_until(lambda: watch.reported.count(("/arm", True)) == 2, "it is seen again")
     wait_until(lambda: not graph.healthy, "all is well again")
     assert our_node().pid != before.pid
     peer.do("hear", "/state", "std_msgs/String")
@@ -172,7 +172,9 @@ def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> Non
     peer.do("act", "/move")
     peer.wait_for("did")
     heard: list[int] = []
-    goal = graph.pursue("/move", "actionlib/action/Test", {"goal": 0}, lambda told: heard.append(told["feedback"]))
+    goal = graph.pursue(
+        "/move", "actionlib/action/Test", {"goal": 0}, lambda reported: heard.append(reported["feedback"])
+    )
     wait_until(lambda: heard, "it runs")
     our_node().kill()
     seen = len(heard)

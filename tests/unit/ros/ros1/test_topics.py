@@ -31,11 +31,11 @@ def test_a_node_hears_what_is_published_here(graph: Ros1, stand: Stand) -> None:
     joints = graph.advertise("/joints", JOINTS)
     message = {"header": {"frame_id": "base", "stamp": {"sec": 3, "nanosec": 5}}, "name": ["pan"], "position": [0.25]}
     send_until(lambda: joints.send(message), lambda: peer.all("heard"))
-    told = peer.all("heard")[0]
-    assert told["who"] == "/trade"
-    assert told["header"]["stamp"] == {"secs": 3, "nsecs": 5}
-    assert told["header"]["frame_id"] == "base"
-    assert (told["name"], told["position"], told["velocity"]) == (["pan"], [0.25], [])
+    reported = peer.all("heard")[0]
+    assert reported["who"] == "/trade"
+    assert reported["header"]["stamp"] == {"secs": 3, "nsecs": 5}
+    assert reported["header"]["frame_id"] == "base"
+    assert (reported["name"], reported["position"], reported["velocity"]) == (["pan"], [0.25], [])
 
 
 def test_what_a_node_publishes_is_heard_here_with_its_name(graph: Ros1, stand: Stand) -> None:
@@ -151,7 +151,7 @@ def test_a_topic_that_is_closed_and_opened_at_once_is_heard_at_both_ends(graph: 
             "/orders", TEXT, lambda message, who, heard=heard: heard.append(message["data"]), latched=True
         )
         topic.send({"data": str(number)})
-        peer.wait_for("heard", lambda told, number=number: told["data"] == str(number))
+        peer.wait_for("heard", lambda reported, number=number: reported["data"] == str(number))
         wait_until(lambda heard=heard: heard, "it was heard here")
         orders.close()
         topic.close()

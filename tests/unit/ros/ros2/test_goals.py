@@ -141,17 +141,17 @@ def test_the_result_of_a_goal_that_is_not_known_is_answered_as_such(graph: Ros2,
 
 
 def test_the_status_of_goals_is_published(graph: Ros2, raw: zenoh.Session) -> None:
-    doing, told = Doing(), []
-    with raw.declare_subscriber(key("fib8", "status"), lambda it: told.append(it.payload.to_bytes())):
+    doing, reported = Doing(), []
+    with raw.declare_subscriber(key("fib8", "status"), lambda it: reported.append(it.payload.to_bytes())):
         graph.act("/fib8", FIBONACCI, doing)
         wait_until(
             lambda: list(raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**/%fib8%_action%status/**")), "it is published"
         )
         ask(raw, "fib8", "send_goal", ID + struct.pack("<i", 1))
         doing.go_on.set()
-        wait_until(lambda: told and told[-1][32] == 4, "its success is published")
-    assert told[-1][:24] == CDR + b"\1\0\0\0" + ID
-    assert {each[32] for each in told} <= {1, 2, 4}
+        wait_until(lambda: reported and reported[-1][32] == 4, "its success is published")
+    assert reported[-1][:24] == CDR + b"\1\0\0\0" + ID
+    assert {each[32] for each in reported} <= {1, 2, 4}
 
 
 # --- ours with ours

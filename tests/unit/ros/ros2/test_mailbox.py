@@ -13,12 +13,12 @@ class Slow:
     """Takes one item at a time, when the test lets it."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.busy = threading.Event()
         self.go_on = threading.Event()
 
     def __call__(self, item: str) -> None:
-        self.told.append(item)
+        self.reported.append(item)
         self.busy.set()
         assert self.go_on.wait(60)
 
@@ -31,9 +31,9 @@ def test_the_oldest_goes_when_there_are_too_many() -> None:
     for item in ("old", "newer", "newest"):
         mailbox.put(item)
     slow.go_on.set()
-    wait_until(lambda: len(slow.told) == 3, "all are handled")
+    wait_until(lambda: len(slow.reported) == 3, "all are handled")
     mailbox.close()
-    assert (slow.told, dropped) == (["first", "newer", "newest"], ["old"])
+    assert (slow.reported, dropped) == (["first", "newer", "newest"], ["old"])
 
 
 def test_S01_the_mailbox_drops_messages_that_waited_too_long() -> None:
@@ -47,38 +47,38 @@ def test_S01_the_mailbox_drops_messages_that_waited_too_long() -> None:
     slow.go_on.set()
     wait_until(lambda: dropped, "it is dropped")
     mailbox.close()
-    assert (slow.told, dropped) == (["first"], ["late"])
+    assert (slow.reported, dropped) == (["first"], ["late"])
 
 
 def test_what_comes_after_the_end_is_dropped() -> None:
-    told, dropped = [], []
-    mailbox = Mailbox[str]("test", told.append, drop=dropped.append)
+    reported, dropped = [], []
+    mailbox = Mailbox[str]("test", reported.append, drop=dropped.append)
     mailbox.close()
     mailbox.close()
     mailbox.put("too late")
-    assert (told, dropped) == ([], ["too late"])
+    assert (reported, dropped) == ([], ["too late"])
 
 
 def test_a_listener_may_close_its_own_queue() -> None:
-    told = []
-    mailbox = Mailbox[str]("test", lambda item: (told.append(item), mailbox.close()))
+    reported = []
+    mailbox = Mailbox[str]("test", lambda item: (reported.append(item), mailbox.close()))
     mailbox.put("end")
-    wait_until(lambda: told, "it is handled")
+    wait_until(lambda: reported, "it is handled")
     mailbox.close()
-    assert told == ["end"]
+    assert reported == ["end"]
 
 
 def test_a_failure_is_logged_and_the_next_event_is_delivered(caplog: pytest.LogCaptureFixture) -> None:
-    told = []
+    reported = []
 
     def tell(item: str) -> None:
         if item == "bad":
             raise ValueError(item)
-        told.append(item)
+        reported.append(item)
 
     mailbox = Mailbox[str]("its name", tell)
     mailbox.put("bad")
     mailbox.put("good")
-    wait_until(lambda: told, "the next is handled")
+    wait_until(lambda: reported, "the next is handled")
     mailbox.close()
     assert "its name failed" in caplog.text

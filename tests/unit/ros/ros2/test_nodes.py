@@ -11,7 +11,7 @@ from trade_gateway.ros.ros2 import Ros2
 from trade_gateway.ros.ros2._names import Kind, gid
 
 
-class Told:
+class Reports:
     """Of nodes."""
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Told:
 def test_a_new_watcher_is_notified_of_the_nodes_already_present(graph: Ros2, peer: Process) -> None:
     peer.ask("listen", topic="/present")  # its node is one with its endpoint
     peer.hear("listening", topic="/present")
-    first, second = Told(), Told()
+    first, second = Reports(), Reports()
     graph.watch_nodes(first)
     wait_until(lambda: first.of("/sdk"), "the node is seen")
     graph.watch_nodes(second)
@@ -36,39 +36,39 @@ def test_a_new_watcher_is_notified_of_the_nodes_already_present(graph: Ros2, pee
 
 
 def test_a_node_in_a_namespace_has_its_whole_name(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
-    told = Told()
-    graph.watch_nodes(told)
+    reported = Reports()
+    graph.watch_nodes(reported)
     other = open_graph(router, node="/arm/left/driver")
-    wait_until(lambda: told.of("/arm/left/driver") == [True], "it is reported present")
+    wait_until(lambda: reported.of("/arm/left/driver") == [True], "it is reported present")
     other.close()
-    wait_until(lambda: told.of("/arm/left/driver") == [True, False], "it is reported gone")
+    wait_until(lambda: reported.of("/arm/left/driver") == [True, False], "it is reported gone")
 
 
 def test_a_killed_node_is_reported_as_gone(graph: Ros2, router: Router, start_peer: Callable[..., Process]) -> None:
-    told = Told()
-    graph.watch_nodes(told)
+    reported = Reports()
+    graph.watch_nodes(reported)
     doomed = start_peer(router, "doomed")
     doomed.ask("listen", topic="/doomed")
-    wait_until(lambda: told.of("/doomed") == [True], "it is reported present")
+    wait_until(lambda: reported.of("/doomed") == [True], "it is reported present")
     doomed.kill()
-    wait_until(lambda: told.of("/doomed") == [True, False], "it is reported gone")
+    wait_until(lambda: reported.of("/doomed") == [True, False], "it is reported gone")
     again = start_peer(router, "doomed")
     again.ask("listen", topic="/doomed")
-    wait_until(lambda: told.of("/doomed") == [True, False, True], "it is reported present again")
+    wait_until(lambda: reported.of("/doomed") == [True, False, True], "it is reported present again")
 
 
 def test_a_name_shared_by_two_nodes_is_reported_gone_and_present_when_one_ends(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
-    told = Told()
-    graph.watch_nodes(told)
+    reported = Reports()
+    graph.watch_nodes(reported)
     one, other = open_graph(router, node="/twin"), open_graph(router, node="/twin")
     open_graph(router, node="/after_them")
-    wait_until(lambda: told.of("/after_them"), "who came after them is seen")
+    wait_until(lambda: reported.of("/after_them"), "who came after them is seen")
     one.close()
-    wait_until(lambda: told.of("/twin") == [True, False, True], "the death of one is reported")
+    wait_until(lambda: reported.of("/twin") == [True, False, True], "the death of one is reported")
     other.close()
-    wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is reported")
+    wait_until(lambda: reported.of("/twin") == [True, False, True, False], "the death of the other is reported")
 
 
 def test_node_lookup_waits_for_a_liveliness_token_that_arrives_late(
@@ -140,26 +140,26 @@ def test_S07_strangers_are_waited_for_one_after_another_with_pauses(
 def test_the_node_watch_does_not_report_its_own_node(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
-    told = Told()
-    graph.watch_nodes(told)
+    reported = Reports()
+    graph.watch_nodes(reported)
     open_graph(router, node="/other")
-    wait_until(lambda: told.of("/other"), "another is reported")
-    assert not told.of("/trade")
+    wait_until(lambda: reported.of("/other"), "another is reported")
+    assert not reported.of("/trade")
 
 
 def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
-    told = Told()
-    graph.watch_nodes(told)
+    reported = Reports()
+    graph.watch_nodes(reported)
     open_graph(router, node="/far", domain_id=7)
     open_graph(router, node="/near")
-    wait_until(lambda: told.of("/near"), "who came later is seen")
-    assert not told.of("/far")
+    wait_until(lambda: reported.of("/near"), "who came later is seen")
+    assert not reported.of("/far")
 
 
 def test_a_closed_watch_receives_no_more_notifications(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
-    ended, other = Told(), Told()
+    ended, other = Reports(), Reports()
     watch = graph.watch_nodes(ended)
     graph.watch_nodes(other)
     watch.close()

@@ -106,8 +106,8 @@ def test_a_whole_number_fits_a_parameter_of_numbers(
     graph: Ros2, offering: Offering, name: str, value: Any, put: Any
 ) -> None:
     graph.set_parameter("/camera", name, value, LONG_S)
-    told = offering.set[0]["value"]
-    assert put in (told["double_value"], told["double_array_value"])
+    reported = offering.set[0]["value"]
+    assert put in (reported["double_value"], reported["double_array_value"])
 
 
 def test_an_empty_list_is_of_the_type_the_parameter_has(graph: Ros2, offering: Offering) -> None:

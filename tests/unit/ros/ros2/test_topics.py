@@ -42,13 +42,13 @@ def test_what_we_publish_is_heard_by_another_node(graph: Ros2, peer: Process) ->
 
 
 def test_a_closed_subscription_hears_no_more(graph: Ros2, peer: Process) -> None:
-    ended, goes_on = Heard(), Heard()
+    ended, other = Heard(), Heard()
     subscription = graph.subscribe("/ends", STRING, ended)
-    graph.subscribe("/ends", STRING, goes_on)
+    graph.subscribe("/ends", STRING, other)
     until_heard(lambda: peer.ask("publish", topic="/ends", data="before"), lambda: ended.all)
     subscription.close()
     subscription.close()
-    until_heard(lambda: peer.ask("publish", topic="/ends", data="after"), lambda: "after" in goes_on.texts)
+    until_heard(lambda: peer.ask("publish", topic="/ends", data="after"), lambda: "after" in other.texts)
     assert "after" not in ended.texts
 
 
