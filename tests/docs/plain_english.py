@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SEARCHED = (
     "trade/src", "drivers/src", "gateway/src", "hil-sim/src", "examples", "docs",
-    "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "tests/README.md",
+    "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "tests",
 )  # fmt: skip
 PRODUCT = ("trade/src", "drivers/src", "gateway/src", "hil-sim/src")
 AVOIDED = {
@@ -126,12 +126,12 @@ def _names_of_tests(path: Path) -> Iterator[str]:
 
 
 def files(roots: list[Path]) -> list[Path]:
-    """The modules and pages below some folders; a file is taken as it is."""
+    """The modules and pages below some folders, except the list of avoided words itself and its tests."""
     return sorted(
         path
         for root in roots
         for path in ([root] if root.is_file() else root.rglob("*"))
-        if path.suffix in (".py", ".md")
+        if path.suffix in (".py", ".md") and not path.stem.endswith("plain_english")
     )
 
 
