@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench._links import Link
-from tests.bench._ours import Trade, provider
 from tests.bench._peers import BarePair, bare_link, serve_bare
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
+from tests.bench._trade import Trade, provider
 
 _PASSWORD = ("bench", "secret")
 _NAMESPACE = "bench-bare"

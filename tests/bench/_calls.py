@@ -13,11 +13,11 @@ from typing import Final
 from tests.bench._children import Job, Round, Running, running
 from tests.bench._links import Peer
 from tests.bench._others import Grpc, Pyro5, Rpyc
-from tests.bench._ours import LocalTrade, Trade, TradeThreads
 from tests.bench._peers import BarePair, BareQuery, Tcp
 from tests.bench._places import own_folder
 from tests.bench._report import keep_point, print_skipped, print_target
 from tests.bench._ros1 import Rospy
+from tests.bench._trade import LocalTrade, Trade, TradeThreads
 from tests.bench._viam import Viam
 
 _OTHERS: Final[Sequence[Peer]] = (Rpyc(), Pyro5(), Grpc(), Rospy(), Viam())

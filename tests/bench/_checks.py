@@ -14,8 +14,8 @@ from tests.bench._across import bare_session
 from tests.bench._calls import CPU, P50, Results, measure, print_latency, ratios, up
 from tests.bench._children import Job
 from tests.bench._links import Link
-from tests.bench._ours import Trade
 from tests.bench._peers import BarePair, bare_link, serve_bare
+from tests.bench._trade import Trade
 from tests.support.certificates import Papers
 
 _SIZE: Final = 64

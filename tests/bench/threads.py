@@ -14,8 +14,8 @@ import psutil
 
 from tests.bench._calls import up
 from tests.bench._children import Job, Running
-from tests.bench._ours import Trade, TradeThreads
 from tests.bench._peers import BarePair
+from tests.bench._trade import Trade, TradeThreads
 
 _PEERS: Final = (BarePair(), Trade(), TradeThreads())
 _LEAST_US: Final = 0.5
