@@ -68,7 +68,7 @@ def test_the_page_has_every_target_every_figure_and_what_was_not_measured() -> N
         assert fact in text
 
 
-def test_targets_that_are_missed_for_one_reason_stand_together_and_one_without_any_is_said_to_have_none() -> None:
+def test_targets_missed_for_one_reason_are_listed_together_and_those_without_one_are_marked() -> None:
     text = page.written(a_run(), REASONS)
     _, _, missed = text.partition("### Missed, and why")
     missed, _, _ = missed.partition("\n## ")

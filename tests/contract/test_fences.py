@@ -47,7 +47,7 @@ def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire
     assert not shared.events("motion_started", mark)
 
 
-def test_S11_a_device_on_its_way_is_led_on_no_more_once_its_lock_is_lost(
+def test_S11_a_moving_device_gets_no_further_set_points_once_its_lock_is_lost(
     shared: SafetyRig, planner: Container, operator: Container
 ) -> None:
     device = where(group=shared.resource)
@@ -73,7 +73,9 @@ def test_S11_a_set_point_ends_with_the_lock_it_was_admitted_under(shared: Safety
     assert shared.travelled() < shared.drift
 
 
-def test_S11_who_has_no_lock_writes_nothing(shared: SafetyRig, planner: Container, operator: Container) -> None:
+def test_S11_a_client_without_the_lock_writes_nothing(
+    shared: SafetyRig, planner: Container, operator: Container
+) -> None:
     shared.ready()
     with planner.lock(where(group=shared.resource.rpartition(".")[0])):
         mark = written_now()
@@ -88,7 +90,7 @@ def test_S11_who_has_no_lock_writes_nothing(shared: SafetyRig, planner: Containe
 # --- S13
 
 
-def test_S13_a_lock_is_granted_once_what_was_left_moving_rests(
+def test_S13_a_lock_is_granted_once_devices_that_still_move_are_at_rest(
     shared: SafetyRig, planner: Container, operator: Container
 ) -> None:
     mark = written_now()
@@ -170,7 +172,7 @@ def test_S07_a_stop_needs_no_lock_and_only_the_owner_lets_it_move_again(
         assert shared.moves_back(planner)
 
 
-def test_S08_a_foreign_stop_holds_until_a_client_resumes(
+def test_S08_a_foreign_stop_latches_until_a_client_resumes(
     shared: SafetyRig, run: Any, planner: Container, operator: Container
 ) -> None:
     shared.asked(operator, ("stop",))
@@ -189,7 +191,7 @@ def test_S08_a_foreign_stop_holds_until_a_client_resumes(
 
 
 @pytest.mark.parametrize("used_by_another", [False, True])
-def test_S08_ones_own_stop_does_not_hold(
+def test_S08_a_stop_by_the_owner_does_not_latch(
     shared: SafetyRig, run: Any, planner: Container, operator: Container, used_by_another: bool
 ) -> None:
     if used_by_another:
@@ -199,7 +201,7 @@ def test_S08_ones_own_stop_does_not_hold(
     assert shared.moves_back(planner)
 
 
-def test_S08_a_stop_reaches_what_is_held_up_in_the_queue(
+def test_S08_a_stop_voids_commands_that_wait_in_the_queue(
     shared: SafetyRig, gate: Gate, planner: Container, operator: Container
 ) -> None:
     shared.ready()

@@ -124,7 +124,7 @@ def test_the_contracts_run_on_every_joint_and_group_of_a_robot_file(system: str,
         assert len(events(sim.entries(), "torque_on")) == len(events(sim.entries(), "torque_off")) > 0
 
 
-def test_grippers_are_opened_and_closed_only_after_a_word_of_their_own(system: str, tmp_path: Path) -> None:
+def test_grippers_are_opened_and_closed_only_after_a_separate_confirmation(system: str, tmp_path: Path) -> None:
     file = tmp_path / "hand.toml"
     file.write_text(HAND)
     with SimProcess(file, paced=False) as sim:

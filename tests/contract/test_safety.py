@@ -218,7 +218,7 @@ def test_S08_a_command_admitted_before_a_stop_is_dropped_after_it(rig: SafetyRig
     assert not rig.events("motion_started", mark)
 
 
-def test_S08_a_stop_holds_where_the_joint_is_and_nothing_leads_it_on(rig: SafetyRig) -> None:
+def test_S08_a_stop_holds_the_joint_where_it_is_and_sends_no_further_set_points(rig: SafetyRig) -> None:
     rig.attach()
     moving = rig.set_off()
     rig.device.stop()
@@ -309,7 +309,7 @@ def test_S18_replugging_never_enables_and_never_commands(rig: Any) -> None:
     assert not rig.events("torque_on", mark)
 
 
-def test_S19_leaving_while_moving_stops_first(rig: SafetyRig) -> None:
+def test_S19_shutdown_while_moving_stops_first(rig: SafetyRig) -> None:
     rig.attach()
     moving = rig.set_off()
     rig.robot.close()
@@ -321,7 +321,7 @@ def test_S19_leaving_while_moving_stops_first(rig: SafetyRig) -> None:
         rig.move()
 
 
-def test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing(rig: JointRig) -> None:
+def test_S19_shutdown_holds_the_position_disarms_the_watchdog_and_moves_nothing(rig: JointRig) -> None:
     rig.attach()
     rig.device.move_to(0.3)
     mark = written_now()
@@ -333,7 +333,7 @@ def test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing(r
     assert not rig.events("watchdog_expired", mark)
 
 
-def test_S19_leaving_with_relax_switches_torque_off(rig: JointRig) -> None:
+def test_S19_shutdown_with_relax_switches_torque_off(rig: JointRig) -> None:
     rig.leaves("relax")
     rig.attach()
     rig.device.move_to(0.3)

@@ -87,7 +87,7 @@ def _first_line(room: Path) -> str:
     return said.splitlines()[0].replace("``", "`")
 
 
-def test_paths_and_targets_that_it_names_are_there() -> None:
+def test_paths_and_targets_that_the_page_names_exist() -> None:
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     text = before + rest.partition(MARKS[1])[2]
     paths = re.findall(r"`((?:[\w.-]+/)+[\w.-]*)`", text)

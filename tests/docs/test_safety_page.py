@@ -30,7 +30,7 @@ UNNUMBERED = {
     "test_ctrl_c_on_a_call_stops_the_motion": "S05",
     "test_a_damiao_is_watched_from_attaching_on": "S06",
     "test_an_odrive_without_a_watchdog_is_not_enabled": "S06",
-    "test_an_e_stop_is_not_cleared_by_who_may_not": "S09",
+    "test_an_e_stop_is_not_cleared_without_the_right": "S09",
     "test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery": "S18",
     "test_closing_the_driver_keeps_what_is_held": "S19",
     "test_closing_the_driver_stops_moving_fingers": "S19",

@@ -77,7 +77,7 @@ def test_the_python_that_runs_this_is_found_and_a_program_that_is_none_is_not(
     assert Path("/nowhere") not in found.values()
 
 
-def test_all_that_we_need_may_be_used() -> None:
+def test_all_dependencies_have_an_accepted_licence() -> None:
     """What the lock file has for our packages with all their extras, as far as it is installed here."""
     needed = wheels.needed(wheels.LOCK.read_text(encoding="utf-8"))
     said: list[tuple[str, str]] = []

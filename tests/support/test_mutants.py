@@ -41,6 +41,6 @@ def test_what_is_broken_is_found_by_the_test_of_its_rule(mutant: str) -> None:
     assert re.search(r"^FAILED ", done.stdout, re.MULTILINE), "it may not fail because of what it is based on"
 
 
-def test_a_mutant_there_is_not_is_no_proof_of_anything() -> None:
+def test_a_mutant_that_does_not_exist_proves_nothing() -> None:
     with pytest.raises(KeyError):
         HOW["no-such-mutant"](setattr)

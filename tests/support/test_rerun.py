@@ -70,26 +70,26 @@ def test_a_test_that_is_late_once_reruns_and_is_reported(tmp_path: Path, said: s
     assert f"test_late0.py::test_it: it said: {said}" in reported
 
 
-def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Path) -> None:
+def test_a_test_that_failed_once_without_such_a_reason_passes_and_is_shown(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert not first")
     assert code == 0, said
     assert "test_late0.py::test_it: for no known reason, fix it: " in said
     assert ">       assert not first" in said or ">   assert not first" in said
 
 
-def test_a_third_one_is_not(tmp_path: Path) -> None:
+def test_a_third_failure_does_not_pass(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert not first", 3)
     assert code == 1
     assert "1 failed, 2 passed" in said
 
 
-def test_what_is_wrong_twice_has_failed(tmp_path: Path) -> None:
+def test_a_test_that_fails_twice_has_failed(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert False")
     assert code == 1
     assert "1 failed" in said
 
 
-def test_what_is_late_twice_has_failed(tmp_path: Path) -> None:
+def test_a_test_that_is_late_twice_has_failed(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert False, 'its driver was held up for 0.35 s'")
     assert code == 1
     assert "1 failed" in said
@@ -118,7 +118,7 @@ def test_too_many_of_them_fail_the_run(tmp_path: Path, times: int) -> None:
     assert f"{times} passed" in said
 
 
-def test_a_computer_that_stood_still_is_a_reason(tmp_path: Path) -> None:
+def test_a_computer_that_was_suspended_is_a_reason(tmp_path: Path) -> None:
     """The clock that is asked is stopped for a moment, as the whole computer would be."""
     freeze = (
         "import psutil; clock, = psutil.Process().children()\n"

@@ -27,7 +27,10 @@ WHO: Final = {
 }
 """By the heading of a column, an identity of that kind."""
 _WITHOUT_RULES: Final = ("mallory", "thief")
-_MARKS: Final = ("<!-- rights: made by test_the_table_of_rights_is_what_happens -->\n", "<!-- end of rights -->\n")
+_MARKS: Final = (
+    "<!-- rights: made by test_the_table_of_rights_matches_the_behaviour -->\n",
+    "<!-- end of rights -->\n",
+)
 
 
 class Joint:

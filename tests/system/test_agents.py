@@ -35,7 +35,7 @@ async def _used(session: ClientSession, tool: str, **arguments: Any) -> Any:
     return json.loads(content.text)
 
 
-def test_what_is_tried_on_the_twin_moves_nothing_and_is_what_the_robot_does_then(bench: Bench) -> None:
+def test_a_dry_run_on_the_twin_moves_nothing_and_predicts_what_the_robot_does(bench: Bench) -> None:
 
     async def main() -> None:
         async with (

@@ -72,7 +72,7 @@ def as_arm(attack: Attack) -> Iterator[str]:
 # --- a denied identity tries every verb, and asks no policy but its own
 
 
-def test_who_may_only_read_neither_moves_nor_locks(attack: Attack) -> None:
+def test_a_read_only_client_neither_moves_nor_locks(attack: Attack) -> None:
     before = attack.moved()
     for words in (("move", ARM, "1"), ("lock", ARM), ("hold", ARM)):
         assert attack.dash.refused(*words).startswith("AccessDenied: dash may not")
@@ -83,7 +83,7 @@ def test_who_may_only_read_neither_moves_nor_locks(attack: Attack) -> None:
     assert attack.moved() == [*before, 0, 1]
 
 
-def test_who_may_only_read_takes_no_lock_away_and_resumes_nothing(attack: Attack) -> None:
+def test_a_read_only_client_breaks_no_lock_and_resumes_nothing(attack: Attack) -> None:
     planner = attack.planner
     planner.ask("hold", ARM)
     assert attack.dash.refused("break_lock", ARM).startswith("AccessDenied: dash may not administer")
@@ -104,7 +104,7 @@ def test_who_may_only_read_takes_no_lock_away_and_resumes_nothing(attack: Attack
     assert attack.moved()[-1] == 6
 
 
-def test_who_may_not_administer_switches_nothing_of_others(attack: Attack) -> None:
+def test_a_client_that_may_not_administer_changes_nothing_of_others(attack: Attack) -> None:
     for name in (function for function, verb in FUNCTIONS.items() if verb == "administer"):
         denied = attack.dash.refused("call", name, "trade", "arm")
         assert denied.startswith(f"AccessDenied: dash may not administer trade.{name}")
@@ -142,7 +142,7 @@ def test_services_of_a_container_without_the_right_to_offer_are_invisible(attack
 # --- by other ways
 
 
-def test_a_notification_does_nothing_that_its_owner_may_not(attack: Attack) -> None:
+def test_a_notification_does_nothing_that_its_owner_has_no_right_to(attack: Attack) -> None:
     for member in (attack.dash, attack.planner):
         member.ask("greet_joining", "lab.planner.bell", ARM)
     attack.planner.ask("register_one", "lab.planner.bell")
@@ -152,7 +152,7 @@ def test_a_notification_does_nothing_that_its_owner_may_not(attack: Attack) -> N
     assert attack.arm.ask("greeted", ARM) == ["planner lab.planner.bell.echo"]
 
 
-def test_a_hook_is_attached_by_who_may_instrument(attack: Attack) -> None:
+def test_a_hook_is_attached_only_with_the_right_to_instrument(attack: Attack) -> None:
     denied = attack.dash.refused("watch_moves", ARM, "lab.dash.eye")
     assert denied.startswith("AccessDenied: dash may not instrument rosie.arm.move")
     attack.chief.ask("watch_moves", ARM, "lab.chief.eye")
@@ -161,7 +161,7 @@ def test_a_hook_is_attached_by_who_may_instrument(attack: Attack) -> None:
     attack.chief.ask("watch_no_more")
 
 
-def test_a_notification_elsewhere_may_what_who_asked_for_it_may(attack: Attack) -> None:
+def test_a_notification_elsewhere_has_the_rights_of_its_owner(attack: Attack) -> None:
     """The container that makes the call has the right to; that does not help who asked."""
     denied = attack.dash.refused("once_at", "planner", "move", ARM, "4")
     assert denied.startswith("AccessDenied: dash may not instrument trade.notify")
@@ -186,7 +186,7 @@ def test_a_nested_call_has_the_rights_of_its_container_and_not_of_the_first_call
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
-def test_a_key_in_the_name_of_another_passes_nowhere(attack: Attack, as_planner: str, mode: str) -> None:
+def test_a_key_in_the_name_of_another_identity_is_passed_on_nowhere(attack: Attack, as_planner: str, mode: str) -> None:
     before = attack.moved()
     dash = attack.open("dash", mode)
     for forged in ("planner", "*", "arm", "door"):
@@ -206,7 +206,7 @@ def test_a_key_in_the_name_of_another_passes_nowhere(attack: Attack, as_planner:
     attack.intruder.ask("close", dash)
 
 
-def test_the_session_of_another_in_a_key_of_ones_own_is_dropped(attack: Attack, as_dash: str, as_planner: str) -> None:
+def test_another_identitys_session_in_an_own_key_is_dropped(attack: Attack, as_dash: str, as_planner: str) -> None:
     before, other = attack.moved(), attack.planner.ask("session")
     clock = attack.key("dash", system=True)
     attack.say(as_dash, clock, attack.call(as_dash, "dash", "clock", session=other, channel=f"{as_dash}/forged"))
@@ -217,7 +217,7 @@ def test_the_session_of_another_in_a_key_of_ones_own_is_dropped(attack: Attack, 
     wait_until(lambda: attack.moved() == [*before, 3], "who may speak for it does")
 
 
-def test_a_lock_is_not_used_by_who_knows_its_number(attack: Attack, as_planner: str) -> None:
+def test_knowing_the_number_of_a_lock_does_not_allow_its_use(attack: Attack, as_planner: str) -> None:
     attack.planner.ask("hold", ARM)
     tokens = tuple(Token(*grant) for grant in attack.planner.ask("grants"))
     session = attack.planner.ask("session")
@@ -242,7 +242,7 @@ def test_a_lock_is_not_used_by_who_knows_its_number(attack: Attack, as_planner: 
     attack.intruder.ask("close", porter)
 
 
-def test_an_answer_comes_from_who_was_asked_and_is_heard_by_who_asked(
+def test_an_answer_comes_only_from_the_callee_and_reaches_only_the_caller(
     attack: Attack, as_dash: str, as_arm: str
 ) -> None:
     """Even if the intruder knew the channel and the number of the call."""
@@ -279,7 +279,9 @@ def entry(revision: int) -> str:
     return encode_message(made).hex()
 
 
-def test_an_entry_is_of_who_may_offer_it(attack: Attack, as_dash: str, as_arm: str) -> None:
+def test_a_registry_entry_counts_only_from_a_container_that_may_offer_it(
+    attack: Attack, as_dash: str, as_arm: str
+) -> None:
     real = "/".join(attack.place[:3])
     for owner in (real, f"dash/{as_dash}/e1"):
         attack.intruder.ask("token", as_dash, f"alive/dash/{as_dash}/e1")
@@ -301,7 +303,7 @@ def tally_of(revision: int) -> str:
     return encode_message(Tally(PROTOCOL, revision)).hex()
 
 
-def test_a_sign_of_life_is_of_oneself(attack: Attack, as_dash: str) -> None:
+def test_a_container_can_declare_only_its_own_liveliness(attack: Attack, as_dash: str) -> None:
     ghosts = [f"{who}/ghost/e{next(numbers)}" for who in ("planner", "arm", "door", "dash")]
     for ghost in ghosts:
         attack.intruder.ask("token", as_dash, f"alive/{ghost}")
@@ -334,7 +336,7 @@ def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it
 
 
 @pytest.fixture(scope="module")
-def bad_papers(attack: Attack) -> dict[str, tuple[Path, str]]:
+def bad_certificates(attack: Attack) -> dict[str, tuple[Path, str]]:
     """Folders that no container would start with, and the error for each."""
     folder = attack.site.folder
     strangers = Papers(folder / "elsewhere")
@@ -346,9 +348,11 @@ def bad_papers(attack: Attack) -> dict[str, tuple[Path, str]]:
 
 
 @pytest.mark.parametrize("bad", ["expired", "of another system", "with a wrong key"])
-def test_an_invalid_certificate_is_refused(attack: Attack, bad_papers: dict[str, tuple[Path, str]], bad: str) -> None:
+def test_an_invalid_certificate_is_refused(
+    attack: Attack, bad_certificates: dict[str, tuple[Path, str]], bad: str
+) -> None:
     before = attack.moved()
-    folder, alert = bad_papers[bad]
+    folder, alert = bad_certificates[bad]
     host, _, port = GATEWAY["public"].removeprefix("tls/").partition(":")
     assert alert in attack.intruder.ask("knock", str(folder), host, port).upper()
     assert attack.intruder.ask("knock", str(attack.site.papers.of("planner")), host, port) == ""
@@ -374,7 +378,7 @@ def silent(attack: Attack, name: str, who: str) -> bool:
 
 
 @pytest.mark.parametrize("who", ["mallory", "idle"])
-def test_who_has_no_role_or_is_unknown_says_at_most_stop(attack: Attack, as_planner: str, who: str) -> None:
+def test_an_identity_without_a_role_or_unknown_can_at_most_stop(attack: Attack, as_planner: str, who: str) -> None:
     before = attack.moved()
     name = f"{who}{next(numbers)}"
     attack.intruder.ask("open", name, str(attack.site.papers.of(who)), GATEWAY["public"])
@@ -386,7 +390,7 @@ def test_who_has_no_role_or_is_unknown_says_at_most_stop(attack: Attack, as_plan
     attack.intruder.ask("close", name)
 
 
-def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others_go_on(attack: Attack) -> None:
+def test_an_identity_revoked_while_linked_is_silenced_and_calls_of_others_continue(attack: Attack) -> None:
     before = attack.moved()
     thief = attack.open("thief")
     attack.say(thief, attack.key("thief"), attack.call(thief, "thief", "move", 1))
@@ -404,7 +408,7 @@ def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others
     assert attack.moved() == [*before, 1, 0]
 
 
-def test_the_table_of_rights_is_what_happens(attack: Attack) -> None:
+def test_the_table_of_rights_matches_the_behaviour(attack: Attack) -> None:
     """With WRITE_TABLES=1 in the environment it is written again."""
     attack.revoke("thief")
     page = ROOT / "docs" / "access-control.md"

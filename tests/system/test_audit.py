@@ -44,7 +44,7 @@ def reported(trade_command: Command, folder: Path, *words: str) -> list[dict[str
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_who_called_locked_stopped_and_was_refused_and_why(
+def test_the_record_has_calls_locks_stops_and_refusals_with_client_and_reason(
     rosie: Rosie, start_container: Callable[..., Container], trade_command: Command, tmp_path: Path
 ) -> None:
     folder = tmp_path / "audit"

@@ -171,7 +171,7 @@ def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMemb
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_of_two_bridges_side_by_side_one_may_die_and_no_call_runs_twice(
+def test_when_one_of_two_parallel_bridges_dies_no_call_runs_twice(
     networks: Networks, member: StartMember, linked: bool
 ) -> None:
     networks.lay("net1", first="10.231.1.1", second="10.231.1.2", left="10.231.1.3")

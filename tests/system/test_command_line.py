@@ -61,7 +61,7 @@ def test_the_states_of_all_joints_are_one_stream_of_json_lines(rosie_up, trade_c
     )
 
 
-def test_what_moves_is_no_stream(rosie_up, trade_command: Command) -> None:
+def test_a_service_that_moves_cannot_be_streamed(rosie_up, trade_command: Command) -> None:
     rosie_up()
     refused = trade_command("stream", "rosie.head.move_to")
     assert (refused.returncode, refused.stdout) == (1, "")
@@ -118,7 +118,7 @@ def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
         (["up", ROSIES_HEAD, "--sim-log", "log"], "UsageError: --sim-log: needs --sim: it is the simulator's log"),
     ],
 )
-def test_wrong_words_are_one_line_and_exit_code_2(words: list[str], complaint: str, trade_command: Command) -> None:
+def test_wrong_arguments_are_one_line_and_exit_code_2(words: list[str], complaint: str, trade_command: Command) -> None:
     ended = trade_command(*words)
     assert ended.returncode == 2
     assert complaint in ended.stderr
@@ -223,7 +223,7 @@ def test_help_names_every_command(trade_command: Command) -> None:
     assert all(command in shown for command in ("up", "services", "call", "containers"))
 
 
-def test_nothing_up_says_how_to_bring_something_up(trade_command: Command) -> None:
+def test_an_empty_system_says_how_to_start_a_robot(trade_command: Command) -> None:
     assert "trade up examples/rosie.toml --sim" in trade_command("services").stdout
 
 
@@ -247,7 +247,7 @@ def test_ctrl_c_on_a_call_stops_the_motion(rosie_up, run) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_S19_leaving_holds_the_position_and_moves_nothing(number: int, rosie_up, trade_command: Command) -> None:
+def test_S19_shutdown_holds_the_position_and_moves_nothing(number: int, rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
     assert trade_command("call", "rosie.head.move_to", "[0.3, -0.2]").returncode == 0
     log = rosie.log
@@ -294,7 +294,7 @@ def test_documented_services_keep_their_types(rosie_up, trade_command: Command) 
     assert "positions_rad: list[float]" in trade_command("services", "--group", "rosie.head", "--doc").stdout
 
 
-def test_what_is_left_out_of_a_robot_is_named_and_not_looked_for(run, trade_command: Command) -> None:
+def test_devices_left_out_of_a_robot_are_named_and_not_looked_for(run, trade_command: Command) -> None:
     rosie = ROOT / "examples" / "rosie.toml"
     out = [word for part in ("left_arm", "hand", "right_arm", "legs") for word in ("--without", part)]
     up = run("-m", "trade_gateway", "up", rosie, "--sim", *out)

@@ -50,7 +50,7 @@ def reported(demo: Program, until: str) -> str:
     return story
 
 
-def test_who_fails_on_a_busy_computer_says_so() -> None:
+def test_a_demo_that_fails_on_a_busy_computer_says_so() -> None:
     busy = runpy.run_path(str(DEMO.with_name("demo_busy.py")))["busy"]
     assert busy(40.0, 2).startswith("this computer is busy (load 40 on 2 cores); try again when it is not")
     assert not busy(1.0, 2)

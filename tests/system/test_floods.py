@@ -67,9 +67,7 @@ def lab(tmp_path: Path, system: str) -> Iterator[Lab]:
         yield Lab(tmp_path, stack)
 
 
-def test_who_has_all_threads_of_its_own_busy_leaves_those_of_others_alone(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_uses_all_its_threads_does_not_affect_others(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(channel_workers, "MOST_THREADS", 2)
     room = Room()
     lab.robot.register(room, "lab")
@@ -83,7 +81,7 @@ def test_who_has_all_threads_of_its_own_busy_leaves_those_of_others_alone(
     room.open.set()
 
 
-def test_who_comes_with_another_policy_is_heard(lab: Lab) -> None:
+def test_a_container_with_another_policy_is_heard(lab: Lab) -> None:
     lab.robot.register(Room(), "lab")
     lab.policy.write_text(POLICY + 'guest = ["operator"]\n')
     guest = lab.join("guest")

@@ -66,7 +66,7 @@ def test_S09_an_estop_stops_all_and_says_that_it_is_not_written_down(
     assert kept(disk, system) == [f"{json.loads(again.stdout)['id']}.json"]
 
 
-def test_who_starts_while_it_is_full_works_is_found_and_keeps_its_record_later(
+def test_a_container_started_on_a_full_disk_works_is_found_and_keeps_its_record_later(
     disk: SmallDisk,
     rosie_up: Callable[[], Rosie],
     start_container: Callable[..., Container],
@@ -111,7 +111,7 @@ def test_a_robot_file_is_as_it_was(disk: SmallDisk) -> None:
     assert sorted(disk.folder.iterdir()) == before
 
 
-def test_what_was_learned_before_stays(disk: SmallDisk) -> None:
+def test_an_earlier_learned_model_stays(disk: SmallDisk) -> None:
     file = disk.folder / "usual.json"
     learned = Model(v=1, after={"look": {"grip": 2}})
     write(file, learned)

@@ -61,7 +61,7 @@ def test_an_empty_container_leaves_on_sigterm(run) -> None:
     assert eyes.wait() == 0
 
 
-def test_of_two_empty_containers_of_one_name_the_second_does_not_come_up(run, trade_command: Command) -> None:
+def test_a_second_empty_container_of_one_name_does_not_come_up(run, trade_command: Command) -> None:
     run("-m", "trade_gateway", "container", "--name", "eyes", "--json").json()
     ended = trade_command("container", "--name", "eyes")
     assert ended.returncode == 1

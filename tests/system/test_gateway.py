@@ -69,7 +69,7 @@ def moves(member: Member, times: int) -> Callable[[], bool]:
     return lambda: len(member.ask("moved", "rosie.arm")) == times
 
 
-def test_what_is_exported_is_found_called_locked_and_missed_on_the_other_side(
+def test_an_exported_service_is_found_called_and_locked_on_the_other_side_and_reported_gone(
     site: Site, arm: Member, planner: Member
 ) -> None:
     assert site.ready["networks"] == {"net1": ["rosie.arm"], "net2": []}
@@ -83,9 +83,7 @@ def test_what_is_exported_is_found_called_locked_and_missed_on_the_other_side(
     wait_until(lambda: planner.ask("gone") == ["arm"], "its end crosses, too")
 
 
-def test_what_is_not_exported_is_neither_seen_nor_called_and_comes_with_the_export(
-    site: Site, arm: Member, planner: Member
-) -> None:
+def test_a_service_is_visible_and_callable_only_once_it_is_exported(site: Site, arm: Member, planner: Member) -> None:
     planner.ask("register_one", "lobby")
     assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
     planner.ask("move", "rosie.arm", "1")  # what was said before it has arrived
@@ -115,7 +113,7 @@ def test_an_unauthorized_call_is_refused_by_the_caller_the_callee_and_the_gatewa
     assert arm.ask("moved", "rosie.arm") == [0]
 
 
-def test_a_policy_is_changed_while_calls_run(site: Site, arm: Member, planner: Member) -> None:
+def test_a_policy_can_be_changed_while_calls_run(site: Site, arm: Member, planner: Member) -> None:
     planner.ask("try_move", "rosie.arm", "20")
     site.change(site.policy, 'planner = ["operator"]', "planner = []")
     site.gateway.send_signal(signal.SIGHUP)
@@ -172,7 +170,7 @@ def test_S12_a_gateway_that_reloads_loses_no_client_call_or_lock(site: Site, arm
     assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
 
 
-def test_of_a_stream_so_many_samples_cross_as_its_export_says(site: Site, arm: Member, planner: Member) -> None:
+def test_a_stream_crosses_at_the_rate_of_its_export(site: Site, arm: Member, planner: Member) -> None:
     arm.ask("register_ticker", "rosie.arm")
     near = site.member("left", "chief")
     near.ask("listen", "rosie.arm", "200")

@@ -50,7 +50,7 @@ def pair(system: str, tmp_path: Path, start_container: Callable[..., Container])
     made.base.supervisor.close()
 
 
-def test_P71_what_a_lost_gateway_had_is_where_it_is_stood_in_for_with_its_state_and_goes_back_by_hand(
+def test_P71_containers_of_a_lost_gateway_move_to_the_standby_with_state_and_return_by_hand(
     pair: Pair,
 ) -> None:
     pair.base.go_by(STANDBY + COUNTER)
@@ -74,7 +74,7 @@ def test_P71_what_a_lost_gateway_had_is_where_it_is_stood_in_for_with_its_state_
     assert call("shown") == 3
 
 
-def test_what_is_given_up_where_it_is_leased_is_tried_where_it_is_stood_in_for(pair: Pair) -> None:
+def test_a_container_given_up_where_it_is_leased_is_tried_on_the_standby(pair: Pair) -> None:
     pair.base.go_by(STANDBY + COUNTER)
     pair.rover.go_by(LEASED + 'providers = [{ class = "tiny:Dies", groups = ["hall"] }]\n')
     pair.rover.become("a", "given up")

@@ -98,7 +98,7 @@ def locked(rosie_up):
 
 
 @pytest.fixture
-def nobody_there() -> str:
+def no_container_there() -> str:
     """An endpoint without a listener."""
     return free_endpoint()
 
@@ -194,7 +194,7 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
         (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NoContainerFound: no other container was found in system "),
     ],
 )
-def test_wrong_words_are_answered_in_one_line(
+def test_wrong_arguments_are_answered_in_one_line(
     trade_command: Command, words: list[str], code: int, complaint: str
 ) -> None:
     said = trade_command(*words)
@@ -205,19 +205,22 @@ def test_wrong_words_are_answered_in_one_line(
 
 @pytest.mark.parametrize("words", [["services"], ["containers"], ["locks"], ["resume", "rosie"], ["faults"]], ids=str)
 def test_a_listing_without_containers_is_empty_and_names_the_silent_endpoint(
-    trade_command: Command, nobody_there: str, words: list[str]
+    trade_command: Command, no_container_there: str, words: list[str]
 ) -> None:
-    said = trade_command("--connect", nobody_there, *words)
+    said = trade_command("--connect", no_container_there, *words)
     assert (said.returncode, said.stdout) == (1, "")
     assert said.stderr.startswith("NoContainerFound: no other container was found in system test-")
-    assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+    assert (
+        f"no container answers at {no_container_there} (TRADE_CONNECT): nothing accepts connections there"
+        in said.stderr
+    )
 
 
-def test_a_call_without_containers_names_the_silent_endpoint(trade_command: Command, nobody_there: str) -> None:
-    said = trade_command("--connect", nobody_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
+def test_a_call_without_containers_names_the_silent_endpoint(trade_command: Command, no_container_there: str) -> None:
+    said = trade_command("--connect", no_container_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
     assert said.returncode == 1
     assert said.stderr.startswith("NoSuchService: no service matches")
-    assert f"no container answers at {nobody_there} (TRADE_CONNECT)" in said.stderr
+    assert f"no container answers at {no_container_there} (TRADE_CONNECT)" in said.stderr
     assert "TRADE_SYSTEM" not in said.stderr
 
 
@@ -292,14 +295,17 @@ def test_S09_an_estop_clear_without_containers_reports_the_estop_state_as_unknow
 
 
 def test_S09_an_estop_clear_without_containers_names_the_silent_endpoint(
-    trade_command: Command, nobody_there: str
+    trade_command: Command, no_container_there: str
 ) -> None:
-    said = trade_command("--connect", nobody_there, "estop", "--clear", "--limit", "0.2")
+    said = trade_command("--connect", no_container_there, "estop", "--clear", "--limit", "0.2")
     assert (said.returncode, said.stdout) == (1, "")
-    assert f"no container answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+    assert (
+        f"no container answers at {no_container_there} (TRADE_CONNECT): nothing accepts connections there"
+        in said.stderr
+    )
 
 
-def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Command) -> None:
+def test_S09_a_container_that_does_not_answer_may_have_an_estop_open(rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
     rosie.program.signal(signal.SIGSTOP)
     try:
@@ -312,20 +318,20 @@ def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Comm
 
 
 def test_S09_an_estop_reaches_the_containers_found_and_names_the_silent_endpoint(
-    rosie_up, trade_command: Command, start_container: Callable[..., Container], nobody_there: str
+    rosie_up, trade_command: Command, start_container: Callable[..., Container], no_container_there: str
 ) -> None:
     door = start_container("door", listen=[free_endpoint()])
     rosie_up()
-    both = ["--connect", door.settings.listen[0], "--connect", nobody_there]
+    both = ["--connect", door.settings.listen[0], "--connect", no_container_there]
     said = trade_command(*both, "estop", "--limit", "2")
     assert said.returncode == 1
     assert re.search("stopped: .*rosie", said.stdout)
-    assert f"no container answers at {nobody_there}" in said.stderr
+    assert f"no container answers at {no_container_there}" in said.stderr
     assert "containers there were not stopped" in said.stderr
     said = trade_command(*both, "estop", "--clear", "--limit", "2")
     assert said.returncode == 1
     assert "cleared: " in said.stdout
-    assert f"no container answers at {nobody_there}" in said.stderr
+    assert f"no container answers at {no_container_there}" in said.stderr
     assert "stays open; clear it again when they answer" in said.stderr
     assert move() == pytest.approx(0.05, abs=0.02)
 

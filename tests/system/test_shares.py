@@ -194,7 +194,7 @@ def test_each_system_decides_about_its_own(sites: Sites, arm: Member, anna: Memb
     assert arm.ask("moved", "rosie.arm") == []
 
 
-def test_another_list_is_gone_by_while_calls_run(sites: Sites, arm: Member, anna: Member) -> None:
+def test_a_changed_list_takes_effect_while_calls_run(sites: Sites, arm: Member, anna: Member) -> None:
     arm.ask("register_one", "rosie.arm.p0")
     anna.ask("group", "rosie.arm.p0", "gateway")
     anna.ask("watch")

@@ -34,7 +34,7 @@ def besieged(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
         yield made
 
 
-def test_nothing_moves_that_must_not_whatever_befalls_them(besieged: Stand) -> None:
+def test_nothing_moves_that_must_not_whatever_faults_occur(besieged: Stand) -> None:
     besieged.quiet()
     wrong = besieged.wrong()
     assert not any(wrong.values()), wrong
@@ -230,7 +230,7 @@ def drive_says(t: float, name: str, at: int) -> Entry:
     return Entry(t=t, bus="leg", kind="event", name=name, joint="leg.hip", position_counts=at)
 
 
-def test_who_comes_to_rest_before_it_has_read_its_next_goal_sets_off_once_for_that() -> None:
+def test_a_device_at_rest_before_it_has_read_its_next_goal_starts_once_for_that_goal() -> None:
     """Its log has the bytes as they came, and on a busy host the servo reads them some milliseconds later."""
     before = [begun(2, 2500), reported(3, 2310, 2300, STOP), reported(3.1, 2700, 2309), rest(3.102)]
     [one, two] = motions_of([*before, begun(3.104, 2700, 2310), rest(5)])["pan"]
@@ -285,9 +285,7 @@ def test_motions_of_a_drive_are_derived_from_its_commands_and_events() -> None:
         ([Fault(t=-20, what="kill driver", whom="dora", until=1e12)], 1),
     ],
 )
-def test_a_stop_that_does_not_get_through_is_found_unless_something_is_in_its_way(
-    faults: list[Fault], found: int
-) -> None:
+def test_a_stop_that_does_not_get_through_is_found_unless_a_fault_explains_it(faults: list[Fault], found: int) -> None:
     missed = Rescue(t=10, whom="dora", until=12, through=False, said="no answer")
     assert len(judge([missed, *faults], {}).violations) == found
     assert judge([structs.replace(missed, through=True), *faults], {}).violations == []
@@ -313,5 +311,5 @@ def test_a_motion_that_begins_while_an_estop_is_open_is_found(begins: float, fau
 
 
 @pytest.mark.parametrize("guilty", [{"cut"}, {"cut", "unplug"}, {"kill client", "delay", "disk"}])
-def test_what_a_siege_fails_with_is_found_by_leaving_out(guilty: set[str]) -> None:
+def test_the_cause_of_a_failed_siege_is_found_by_leaving_faults_out(guilty: set[str]) -> None:
     assert set(fewest([*TROUBLES], lambda kinds: guilty <= {*kinds})) == guilty

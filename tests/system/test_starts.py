@@ -55,7 +55,7 @@ def test_it_is_started_on_the_command_line_and_outlives_that(sshd: Sshd, trade_c
         assert trade.find(where(name="clock", container="eyes"), wait_s=30)() > 0
 
 
-def test_of_two_of_one_name_the_second_is_not_started(sshd: Sshd) -> None:
+def test_a_second_container_of_one_name_is_not_started(sshd: Sshd) -> None:
     started = trade.system.start_container("robot", "eyes", command=HERE, ssh_config=sshd.config, wait_s=30)
     with ended("eyes", started.pid):
         with pytest.raises(CannotStart, match="'eyes' is up already") as refused:
@@ -100,7 +100,7 @@ def test_a_host_with_another_key_than_the_known_one_is_not_talked_to(sshd: Sshd)
     assert sshd.known_hosts.read_text() == before
 
 
-def test_who_is_not_let_in_is_asked_for_no_password(sshd: Sshd) -> None:
+def test_a_login_that_is_refused_asks_for_no_password(sshd: Sshd) -> None:
     sshd.write_config(identity="stranger")
     assert refused(sshd).reason == "not let in"
 
@@ -136,19 +136,19 @@ def test_an_unresponsive_host_is_reported_before_the_deadline_of_the_call(
             start.with_(deadline_s=2.0)()
 
 
-def test_where_there_is_no_trade_that_is_said(sshd: Sshd) -> None:
+def test_a_host_without_trade_is_reported(sshd: Sshd) -> None:
     error = refused(sshd, "no-such-trade")
     assert (error.reason, "'no-such-trade' is not found" in error.remedy) == ("no trade there", True)
 
 
 @pytest.mark.parametrize("host", ["-oProxyCommand=touch x", "", "robot; reboot", "robot reboot", "$(reboot)"])
-def test_what_is_no_host_never_reaches_ssh(system: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_host_name_never_reaches_ssh(system: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("it ran"))
     with pytest.raises(ConfigurationError, match="is no host"):
         trade.system.start_container(host, "eyes")
 
 
-def test_words_reach_the_far_shell_as_they_are() -> None:
+def test_arguments_reach_the_remote_shell_unchanged() -> None:
     hostile = "a b; $(reboot) 'x'"
     words = [*ssh._assigned({"TRADE_CONNECT": hostile}), "trade", "--allow", hostile]
     assert shlex.split(ssh.ssh_words("robot", None, words)[-1]) == words

@@ -278,7 +278,7 @@ def sim() -> Iterator[SimProcess]:
         yield running
 
 
-def test_S20_of_two_that_look_after_one_robot_the_second_is_refused_and_gives_up_with_the_reason(
+def test_S20_a_second_supervisor_of_one_robot_is_refused_and_gives_up_with_the_reason(
     keeping: Callable[..., Keeping], sim: SimProcess, tmp_path: Path
 ) -> None:
     robot = at_ports(ROSIES_HEAD, sim, tmp_path)
@@ -425,7 +425,7 @@ def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
     )
 
 
-def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(
+def test_a_wrong_gateway_file_changes_nothing_and_a_corrected_one_takes_effect(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
     there = start_gateway(f"[container.a]\n{COUNTER}")

@@ -108,7 +108,7 @@ def test_a_system_comes_up_over_its_hosts_in_order_is_left_as_it_is_and_goes_dow
     assert home.states("down") == {"lamps": "was down", "eyes": "was down", "rosie": "was down"}
 
 
-def test_what_one_container_lacks_is_made_when_it_is_brought_up_again(home: Deployment) -> None:
+def test_missing_providers_of_a_container_are_made_when_the_system_is_brought_up_again(home: Deployment) -> None:
     home.change('{ class = "lamp:Lamp", groups = ["hall"], args = [0.5] }', "")
     home.change('after = ["eyes"]', 'allow = ["lamp:*"]')
     home.states("up")
@@ -118,7 +118,7 @@ def test_what_one_container_lacks_is_made_when_it_is_brought_up_again(home: Depl
     assert home.states("status")["lamps"] == "up"
 
 
-def test_what_fails_says_why_and_what_was_begun_is_taken_down_again(home: Deployment) -> None:
+def test_a_failed_start_says_why_and_takes_down_what_was_started(home: Deployment) -> None:
     home.change("args = [0.5]", 'args = ["bright", 1]')
     reported, ended = home.say("up")
     assert ended.returncode == 1
@@ -140,7 +140,7 @@ def test_a_container_that_does_not_start_is_reported_with_the_end_of_its_log(hom
     assert home.states("status") == {"eyes": "up", "lamps": "up", "rosie": "down"}
 
 
-def test_what_is_in_use_is_not_ended_unless_by_force(home: Deployment) -> None:
+def test_a_container_in_use_is_ended_only_by_force(home: Deployment) -> None:
     home.states("up")
     with pytest.raises(LockLost), trade.lock(where(group="rosie.head"), purpose="look", wait_s=30):
         _, ended = home.say("down")
@@ -181,7 +181,7 @@ def test_a_host_whose_key_is_not_known_gets_nothing_started(home: Deployment, ss
     assert sshd.known_hosts.read_text() == ""
 
 
-def test_who_is_up_elsewhere_but_not_seen_is_ended_there(home: Deployment) -> None:
+def test_a_container_that_runs_elsewhere_unseen_is_ended_there(home: Deployment) -> None:
     estranged = home.file.parent / "estranged"
     estranged.write_text(f'#!/bin/sh\nTRADE_CREDENTIALS=other:secret exec "{TRADE}" "$@"\n')
     estranged.chmod(0o755)
@@ -218,7 +218,7 @@ def test_robots_and_rules_run_on_another_host_and_gateways_here(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_who_interrupts_has_what_was_begun_taken_down_again(
+def test_an_interrupt_takes_down_what_was_started(
     home: Deployment, sshd: Sshd, run: Run, number: signal.Signals
 ) -> None:
     words = ("-m", "trade_gateway", "system", "up", home.file, "--ssh-config", sshd.config, "--json")

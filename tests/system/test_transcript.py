@@ -15,7 +15,10 @@ from tests.system.conftest import ROOT, Program
 from tests.system.terminals import end_all_but, in_words, normalised
 
 PAGE: Final = ROOT / "docs" / "transcript.md"
-MARKS: Final = ("<!-- transcript: made by test_the_transcript_is_what_happens -->\n", "<!-- end of transcript -->\n")
+MARKS: Final = (
+    "<!-- transcript: made by test_the_transcript_matches_the_behaviour -->\n",
+    "<!-- end of transcript -->\n",
+)
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -90,7 +93,7 @@ def terminal(
         yield Terminal(trade_command, run)
 
 
-def test_the_transcript_is_what_happens(terminal: Terminal) -> None:
+def test_the_transcript_matches_the_behaviour(terminal: Terminal) -> None:
     """With WRITE_TABLES=1 in the environment it is written again."""
     reported = "\n" + "".join(terminal.type(step) for step in STEPS)
     before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
@@ -101,7 +104,7 @@ def test_the_transcript_is_what_happens(terminal: Terminal) -> None:
     assert reported == shown
 
 
-def test_what_differs_from_run_to_run_is_put_in_words_and_the_rest_stays() -> None:
+def test_values_that_differ_between_runs_are_replaced_by_words_and_the_rest_stays() -> None:
     line = "eyes: up 12 after 3.1 s, process 4711 (call 2858444437409759234) 0.300660234425585 -0.19942 0.5\n"
     assert normalised(line) == "eyes: up 12 after TIME, process PID (call CALL) 0.3 -0.2 0.5\n"
     assert normalised("CALL  AT       LAST\na     3.4 ms\n  b   12.4 ms  no\n") == (

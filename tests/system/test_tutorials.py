@@ -67,7 +67,7 @@ def terminal(system: str, tmp_path: Path) -> Iterator[Terminal]:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_is_what_happens(terminal: Terminal, page: Path) -> None:
+def test_a_tutorial_matches_the_behaviour(terminal: Terminal, page: Path) -> None:
     """With WRITE_TABLES=1 in the environment the answers on the page are written again."""
     before = page.read_text(encoding="utf-8")
 

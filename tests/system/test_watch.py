@@ -78,7 +78,7 @@ def test_watch_prints_only_the_requested_group_and_sums_up_a_burst_in_one_line(
     assert "hall.column" not in reported
 
 
-def test_how_busy_it_is_who_is_silent_and_what_is_wrong(
+def test_load_silent_devices_and_problems_are_shown(
     hall: Container, run: Run, start_container: StartContainer, trade_command: Command
 ) -> None:
     frozen = run("-m", "trade_gateway", "container", "--name", "frozen", "--json")

@@ -34,7 +34,7 @@ def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Enable, "steps", strict)
 
 
-def enabling_starts_no_servo_anew(patch: pytest.MonkeyPatch) -> None:
+def enabling_restarts_no_servo(patch: pytest.MonkeyPatch) -> None:
     def as_it_is(bus: Any, job: Any, axis: Any) -> Generator[None, None, Any]:
         yield
         return axis.health
@@ -50,7 +50,7 @@ def the_end_of_a_session_stops_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Deadman, "session_ended", lambda self, session: None)
 
 
-def the_last_speed_holds_for_ever(patch: pytest.MonkeyPatch) -> None:
+def the_last_speed_holds_without_end(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(SetPoint, "watch", lambda self, now_ns: None)
 
 
@@ -91,7 +91,7 @@ def two_motions_have_one_joint(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Exchange, "take_over", take_over)
 
 
-def who_stands_outside_is_refused(patch: pytest.MonkeyPatch) -> None:
+def a_joint_outside_its_limits_is_refused(patch: pytest.MonkeyPatch) -> None:
     check_usable = Axis.check_usable
 
     def strict(self: Axis, now_ns: int, stale_after_ns: int) -> Any:

@@ -23,7 +23,7 @@ def one_thread_serves_all_calls(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(WorkerPool, "_main", main)
 
 
-def who_is_there_is_asked_by_multicast(patch: pytest.MonkeyPatch) -> None:
+def containers_are_searched_by_multicast(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Wifi, "link", Wifi.link_by_multicast)
 
 

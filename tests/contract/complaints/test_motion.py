@@ -25,7 +25,7 @@ def test_torque_drops_at_exit(body: Body) -> None:
 
 @complaint(
     ("dynamixel", mutants.enabling_wants_no_fault, "enable.. ended with DeviceFault.*overload"),
-    ("dynamixel", mutants.enabling_starts_no_servo_anew, "enable.. ended with DeviceFault.*overload"),
+    ("dynamixel", mutants.enabling_restarts_no_servo, "enable.. ended with DeviceFault.*overload"),
     ("feetech", mutants.enabling_wants_no_fault, "enable.. ended with DeviceFault.*overload"),
     ("damiao", mutants.enabling_wants_no_fault, "enable.. ended with DeviceFault.*overload"),
     ("cia402", mutants.enabling_wants_no_fault, "enable.. ended with DeviceFault.*over-current"),
@@ -44,8 +44,8 @@ def test_overload_latched_until_a_power_cycle(body: Body) -> None:
 
 
 @complaint(
-    ("feetech", mutants.the_last_speed_holds_for_ever, "it continued"),
-    ("cia402", mutants.the_last_speed_holds_for_ever, "it continued"),
+    ("feetech", mutants.the_last_speed_holds_without_end, "it continued"),
+    ("cia402", mutants.the_last_speed_holds_without_end, "it continued"),
     also=("dynamixel", "damiao"),
 )
 def test_client_dies_and_the_robot_moves_on_at_its_last_speed(body: Body) -> None:
@@ -125,8 +125,8 @@ def test_two_modes_claim_one_joint(body: Body) -> None:
 
 
 @complaint(
-    ("feetech", mutants.who_stands_outside_is_refused, "the way back was refused: LimitExceeded"),
-    ("cia402", mutants.who_stands_outside_is_refused, "the way back was refused: LimitExceeded"),
+    ("feetech", mutants.a_joint_outside_its_limits_is_refused, "the way back was refused: LimitExceeded"),
+    ("cia402", mutants.a_joint_outside_its_limits_is_refused, "the way back was refused: LimitExceeded"),
     also=("dynamixel", "damiao"),
 )
 def test_a_joint_outside_its_limits_cannot_be_moved_back(body: Body) -> None:

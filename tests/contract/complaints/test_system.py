@@ -57,7 +57,7 @@ def test_a_synchronous_call_inside_a_callback_deadlocks(_: object) -> None:
 
 
 @complaint(
-    ("wifi", mutants.who_is_there_is_asked_by_multicast, "in vain until the planner reaches the robot"),
+    ("wifi", mutants.containers_are_searched_by_multicast, "in vain until the planner reaches the robot"),
     also=("loopback",),
 )
 def test_discovery_fails_on_vpn_or_wifi(hosts: Loopback | Wifi) -> None:

@@ -26,9 +26,9 @@ def test_a_bad_packet_kills_the_loop(body: Body) -> None:
 
 
 @complaint(
-    ("dynamixel", mutants.the_bare_dynamixel_sdk_takes_whoever_obeys, "was taken for the joint"),
-    ("feetech", mutants.nobody_compares_the_model, "was taken for the joint"),
-    ("cia402", mutants.nobody_compares_the_serial_number, "was taken for the joint"),
+    ("dynamixel", mutants.the_bare_dynamixel_sdk_takes_any_device_that_obeys, "was taken for the joint"),
+    ("feetech", mutants.no_driver_compares_the_model, "was taken for the joint"),
+    ("cia402", mutants.no_driver_compares_the_serial_number, "was taken for the joint"),
 )
 def test_wrong_or_duplicate_ids(body: Body) -> None:
     body.ways.confuse(body.rig)
@@ -61,8 +61,8 @@ def test_an_empty_reply_taken_for_success(body: Body) -> None:
 
 
 @complaint(
-    ("dynamixel", mutants.the_last_value_is_told_for_ever, "an old state is reported as the current one"),
-    ("cia402", mutants.the_last_value_is_told_for_ever, "an old state is reported as the current one"),
+    ("dynamixel", mutants.the_last_value_is_reported_without_end, "an old state is reported as the current one"),
+    ("cia402", mutants.the_last_value_is_reported_without_end, "an old state is reported as the current one"),
     also=("feetech", "damiao"),
 )
 def test_stale_state_after_link_loss(body: Body) -> None:

@@ -51,15 +51,15 @@ def a_motors_frame_is_unpacked_unseen(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(DamiaoAxis, "take", unpacked)
 
 
-def nobody_compares_the_model(patch: pytest.MonkeyPatch) -> None:
+def no_driver_compares_the_model(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("trade_drivers.joints.serial._inspect.check_model", lambda *_: None)
 
 
-def nobody_compares_the_serial_number(patch: pytest.MonkeyPatch) -> None:
+def no_driver_compares_the_serial_number(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("trade_drivers.vendors.cia402._inspect._check_fingerprint", lambda *_: iter(()))
 
 
-def the_bare_dynamixel_sdk_takes_whoever_obeys(patch: pytest.MonkeyPatch) -> None:
+def the_bare_dynamixel_sdk_takes_any_device_that_obeys(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Body, "attach", lambda self: _SdkMotor(str(self.rig.sim.port)).enable())
 
 
@@ -116,7 +116,7 @@ def the_bare_dynamixel_sdk(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Body, "motor", lambda self: _SdkMotor(str(self.rig.sim.port)))
 
 
-def the_last_value_is_told_for_ever(patch: pytest.MonkeyPatch) -> None:
+def the_last_value_is_reported_without_end(patch: pytest.MonkeyPatch) -> None:
     state, last = BusMotor.state, {}
 
     def cached(self: BusMotor) -> Any:

@@ -147,7 +147,7 @@ class OdriveRig(CanJointRig):
     lacks: ClassVar = {
         "test_S06_every_enabled_joint_has_its_watchdog_armed": "the motor is configured to watch; unit/drivers/"
         "test_motor.py: an ODrive that does not is not enabled, and a Damiao is watched from attaching on",
-        "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it can only relax: "
+        "test_S19_shutdown_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it can only relax: "
         "without its driver it lets go",
         "test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": _NO_PORT,
     }

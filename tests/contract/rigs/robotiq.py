@@ -40,15 +40,15 @@ class RobotiqRig(SafetyRig):
         "test_S07_a_stop_gets_through_while_another_joint_is_silent": _ONE_DEVICE,
         "test_S08_a_stop_halts_every_joint_of_a_group_that_moves": _ONE_DEVICE,
         "test_S11_a_set_point_ends_with_the_lock_it_was_admitted_under": _NO_SET_POINT,
-        "test_S13_a_lock_is_granted_once_what_was_left_moving_rests": _NO_SET_POINT,
+        "test_S13_a_lock_is_granted_once_devices_that_still_move_are_at_rest": _NO_SET_POINT,
         "test_S16_a_group_with_a_missing_member_is_not_locked": _ONE_DEVICE,
         "test_S16_coupled_joints_are_locked_together": _ONE_DEVICE,
         "test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire": "it is judged in test_fences.py: "
         "a lock is broken while the command waits",
         "test_S18_enabling_aims_at_the_measured_position": _NO_JOINT,
-        "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it keeps what it holds: "
+        "test_S19_shutdown_holds_the_position_disarms_the_watchdog_and_moves_nothing": "it keeps what it holds: "
         "unit/drivers/test_robotiq_attached.py",
-        "test_S19_leaving_with_relax_switches_torque_off": "it keeps what it holds: "
+        "test_S19_shutdown_with_relax_switches_torque_off": "it keeps what it holds: "
         "unit/drivers/test_robotiq_attached.py",
         "test_S22_a_goal_outside_is_refused_with_its_limits": _NO_JOINT,
         "test_S22_the_ends_of_the_range_belong_to_it": _NO_JOINT,

@@ -46,8 +46,8 @@ class UrRig(SafetyRig):
         "test_S18_enabling_aims_at_the_measured_position": "power and brakes are switched by request only",
         "test_S18_replugging_never_enables_and_never_commands": "unit/drivers/test_ur_attach.py: a controller "
         "that comes back is read and not commanded",
-        "test_S19_leaving_holds_the_position_disarms_the_watchdog_and_moves_nothing": "an arm always holds",
-        "test_S19_leaving_with_relax_switches_torque_off": "an arm always holds",
+        "test_S19_shutdown_holds_the_position_disarms_the_watchdog_and_moves_nothing": "an arm always holds",
+        "test_S19_shutdown_with_relax_switches_torque_off": "an arm always holds",
         "test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte": "unit/drivers/test_ur_attach.py "
         "has two drivers of an arm",
         "test_S22_a_goal_outside_is_refused_with_its_limits": _LIMITS,

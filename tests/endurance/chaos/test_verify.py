@@ -43,7 +43,7 @@ TURNS = [
 ]
 
 
-def test_two_who_take_turns_do_nothing_wrong() -> None:
+def test_two_owners_that_take_turns_do_nothing_wrong() -> None:
     assert wrong(TURNS) == []
 
 
@@ -99,13 +99,13 @@ def test_a_grant_that_outlives_its_lease() -> None:
     assert wrong(grant(1, 1.0, 3.5), [Renewed(t=2.0, epoch="e", numbers=(1,))], beats((0, 5))) == []
 
 
-def test_time_that_a_frozen_driver_did_not_have_does_not_count() -> None:
+def test_time_while_a_driver_was_frozen_does_not_count() -> None:
     assert wrong(grant(1, 1.0, 4.5), beats((0, 1.5), (4.0, 5))) == []
     assert wrong(grant(1, 1.0, 4.5), beats((0, 1.5))) == []  # it had to end as it was thawed
     assert wrong(grant(1, 1.0, 4.5), beats((0, 2.0), (2.2, 5))) != []
 
 
-def test_an_ask_that_never_ends_unless_it_was_killed() -> None:
+def test_a_request_that_never_ends_unless_its_process_was_killed() -> None:
     asked: list[AnyRecord] = [Ask(t=1.0, hold="c1-1:2:lock:3", resources=("a",))]
     assert wrong(asked) == ["c1-1:2:lock:3 asked at 1.000000 and never heard anything"]
     assert wrong(asked, [Fault(t=2.0, what="kill", process="c1-1")]) == []

@@ -36,7 +36,7 @@ def test_each_corpus_is_of_a_target() -> None:
 
 
 @EACH
-def test_what_is_almost_right_is_taken_or_refused(target: Target) -> None:
+def test_input_that_is_almost_right_is_accepted_or_refused(target: Target) -> None:
     @FEW
     @hypothesis.given(almost(target, [path.read_bytes() for path in target.corpus]))
     def tried(data: bytes) -> None:
@@ -51,7 +51,7 @@ WITH_PARTS: Final = [
 
 
 @pytest.mark.parametrize("target", WITH_PARTS, ids=lambda target: target.name)
-def test_what_is_wrong_inside_is_taken_or_refused(target: Target) -> None:
+def test_input_that_is_wrong_inside_is_accepted_or_refused(target: Target) -> None:
     values = [value for path in target.corpus for value in understood(path.read_bytes())]
 
     @FEW

@@ -190,7 +190,7 @@ def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers:
     comes_to_rest(bench)
 
 
-def test_who_may_only_look_cannot_act_but_for_the_e_stop(bench: Bench, browsers: Browsers) -> None:
+def test_a_read_only_client_can_act_only_by_the_e_stop(bench: Bench, browsers: Browsers) -> None:
     vera = browsers.view("vera")
     expect(vera.pan.locator(".figures")).to_contain_text("rad/s")
     for jog in (vera.plus, vera.minus):

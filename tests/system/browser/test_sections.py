@@ -58,7 +58,7 @@ def test_finished_calls_are_shown_to_users_who_may_read_the_system(browsers: Bro
     expect(part(chief, "notice")).to_contain_text("Calls are no longer traced in")
 
 
-def test_the_policy_is_for_who_reads_the_system_and_the_audit_for_who_administers_it(browsers: Browsers) -> None:
+def test_readers_of_the_system_see_the_policy_and_only_administrators_see_the_audit(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
     expect(part(vera, "policy-list")).to_contain_text("the right to read the system")
     bert = part(anna, "policy-list").get_by_role("row", name="bert")
@@ -69,7 +69,7 @@ def test_the_policy_is_for_who_reads_the_system_and_the_audit_for_who_administer
     expect(part(chief, "audit-list").get_by_role("row", name="set_tracing").first).to_contain_text("configure")
 
 
-def test_text_can_be_read_against_what_is_behind_it(browsers: Browsers, bench: Bench) -> None:
+def test_text_has_enough_contrast_with_its_background(browsers: Browsers, bench: Bench) -> None:
     """As WCAG 2 computes it, of all that is shown, in both schemes; what cannot be pressed is exempt."""
     bench.sim.control.hardware_fault(OVERLOAD, [1])
     chief = browsers.view("chief")
@@ -92,7 +92,7 @@ def test_text_can_be_read_against_what_is_behind_it(browsers: Browsers, bench: B
     assert len(papers) == 2  # both were there
 
 
-def test_a_button_can_be_read_while_it_is_held(browsers: Browsers) -> None:
+def test_a_button_has_enough_contrast_while_it_is_held(browsers: Browsers) -> None:
     """Under the pointer, too, which is where it is then."""
     anna = browsers.view("anna")
     anna.hold(anna.plus)

@@ -72,7 +72,7 @@ def test_a_container_of_this_project_passes_every_check() -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("broken", NOTICED_BY)
-def test_who_breaks_a_rule_fails_its_check(broken: str) -> None:
+def test_a_container_that_breaks_a_rule_fails_its_check(broken: str) -> None:
     only = ("--only", "presence", "--only", NOTICED_BY[broken])
     ended = conformance("--peer", start(broken), "--motion", *only, "--json")
     assert list(failed(reported(ended))) == [NOTICED_BY[broken]], ended.stdout
@@ -107,7 +107,7 @@ peer.main()
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("arm", ["Noting", "Armless"])
-def test_without_motion_the_arm_is_never_turned_and_need_not_be_there(arm: str, tmp_path: Path) -> None:
+def test_without_motion_the_arm_is_never_turned_and_need_not_exist(arm: str, tmp_path: Path) -> None:
     program, note = tmp_path / "noting.py", tmp_path / "turned"
     program.write_text(NOTING.format(here=str(PEER.parent), note=str(note), arm=arm), encoding="utf-8")
     ended = conformance("--peer", f"{sys.executable} {program}", "--json")
@@ -145,7 +145,7 @@ def test_a_shell_that_starts_it_leaves_nothing_behind(signs: str, tmp_path: Path
     assert bool(failed(reported(ended))) == (signs == "none"), ended.stdout
 
 
-def test_a_command_that_ends_fails_what_it_is_asked_and_says_what_it_said() -> None:
+def test_a_command_that_ends_fails_its_checks_and_its_output_is_shown() -> None:
     ended = conformance("--peer", f"{sys.executable} -c 'raise SystemExit(\"no robot today\")'", "--only", "presence")
     assert ended.returncode == 1
     assert "no robot today" in " ".join(ended.stdout.split())
@@ -165,7 +165,7 @@ def test_a_command_that_cannot_be_started_is_an_error(words: list[str], said: st
     assert said in " ".join(ended.stderr.split())
 
 
-def test_an_unknown_check_and_a_missing_command_are_mistakes_of_the_words() -> None:
+def test_an_unknown_check_and_a_missing_command_are_usage_errors() -> None:
     assert conformance("--peer", "true", "--only", "no-such-check").returncode == 2
     assert conformance().returncode == 2
 

@@ -23,14 +23,14 @@ from tests.unit.drivers.legs import PATIENT, Leg
 from tests.unit.drivers.test_cia402_attach import test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second
 from tests.unit.drivers.test_cia402_motor import (
     test_a_set_point_has_an_edge_and_the_edge_is_taken_back_when_it_was_taken,
-    test_the_way_to_enabled_is_one_state_after_the_other_and_ends_halted_where_it_is,
+    test_enabling_passes_one_state_after_the_other_and_ends_halted_at_the_current_position,
 )
 from tests.unit.drivers.test_cia402_safety import (
     test_S06_the_watchdog_of_every_drive_is_armed_at_attach_and_fed_from_then_on,
     test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire,
     test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled,
     test_S18_attaching_commands_nothing,
-    test_S19_leaving_while_moving_stops_first_and_disarms_what_holds,
+    test_S19_shutdown_while_moving_stops_first_and_disarms_what_holds,
 )
 
 

@@ -63,7 +63,7 @@ def test_a_port_that_is_not_there_is_named(head: Rig) -> None:
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "device"])
-def test_what_is_no_serial_port_is_named_with_its_key(head: Rig, tmp_path: Path, kind: str) -> None:
+def test_a_path_that_is_no_serial_port_is_named_with_its_key(head: Rig, tmp_path: Path, kind: str) -> None:
     (tmp_path / "file").touch()
     port = {"file": tmp_path / "file", "folder": tmp_path, "device": Path("/dev/null")}[kind]
     text = refused(head, ports={"neck": str(port)})
@@ -97,7 +97,7 @@ def test_a_port_for_a_bus_that_is_not_in_the_file_is_refused(head: Rig) -> None:
     ],
     ids=str,
 )
-def test_a_setting_that_is_wrong_for_us_is_named_with_the_right_one(
+def test_a_setting_that_the_driver_cannot_use_is_named_with_the_right_one(
     rig: Rig, registers: dict[str, int], remedy: str
 ) -> None:
     rig.plug(prepare=settings(**registers))
@@ -122,7 +122,7 @@ def test_a_servo_on_a_can_bus_is_refused(head: Rig) -> None:
     assert "bus.neck: driver dynamixel needs a serial bus" in refused(head)
 
 
-def test_a_gear_is_refused_where_it_would_not_be_heeded(head: Rig) -> None:
+def test_a_gear_is_refused_where_it_would_be_ignored(head: Rig) -> None:
     head.configure(("reversed = true", "gear = 2"))
     assert 'joint."neck.tilt": counts_per_rev and gear are for other devices' in refused(head)
 

@@ -160,7 +160,7 @@ def test_S07_a_stop_ends_a_c_function_that_is_under_way(hand: Hand) -> None:
     assert hand.widths_m[-1] > 0.05
 
 
-def test_S03_what_its_caller_moves_stops_when_he_is_gone(hand: Hand) -> None:
+def test_S03_what_its_caller_moves_stops_when_the_caller_is_gone(hand: Hand) -> None:
     hand("move_to").start(0.0, speed_m_s=0.01)
     wait_until(lambda: len(hand.widths_m) > 3)
     hand.system.kill("caller")
@@ -224,7 +224,7 @@ def test_numbers_texts_structs_and_arrays(lib: CLibrary, example: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [256, -1, 1.5, "x"])
-def test_what_c_cannot_hold_is_refused_and_never_cut(lib: CLibrary, value: Any) -> None:
+def test_a_value_that_c_cannot_hold_is_refused_and_never_truncated(lib: CLibrary, value: Any) -> None:
     def next_(self: object, n: int) -> int: ...
 
     with pytest.raises(InvalidArgument):

@@ -87,7 +87,7 @@ def test_a_port_that_is_not_open_is_lost() -> None:
     port.close()
 
 
-def test_frames_go_out_and_in_and_others_kinds_of_frames_are_none(channel: str) -> None:
+def test_frames_are_sent_and_received_and_frames_of_other_kinds_are_ignored(channel: str) -> None:
     port = CanPort(f"virtual:{channel}", 1_000_000)
     port.open()
     with can.Bus(interface="virtual", channel=channel) as peer:
@@ -231,7 +231,7 @@ def test_a_statusword_gives_the_state_whatever_its_other_bits(statusword: int, s
     assert state_of(statusword) is state
 
 
-def test_the_way_up_ends_halted_and_a_fault_is_no_part_of_it() -> None:
+def test_the_enabling_sequence_ends_halted_and_never_passes_a_fault() -> None:
     way = {state: command_towards_enabled(state) for state in (*State, None)}
     assert (way[State.SWITCH_ON_DISABLED], way[State.READY]) == (0x06, 0x07)
     assert {way[State.SWITCHED_ON], way[State.QUICK_STOP], way[State.ENABLED]} == {0x10F}

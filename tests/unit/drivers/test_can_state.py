@@ -24,7 +24,7 @@ _numbers = itertools.count()
 # --- the service
 
 
-def test_a_bus_that_is_well_says_so(leg: Leg) -> None:
+def test_a_healthy_bus_says_so(leg: Leg) -> None:
     state = leg.attach().monitor("legs").bus_state()
     assert (state.name, state.port, state.up) == ("rosie.bus.legs", leg.sim.port, True)
     assert (state.state, state.error_frames, state.bus_offs) == ("error-active", 0, 0)
@@ -58,7 +58,7 @@ def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     assert not leg.goals(HIP)
 
 
-def test_it_is_a_service_of_the_robot_that_anybody_can_call(
+def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call(
     leg: Leg, start_container: Callable[..., Container]
 ) -> None:
     driver, asker = start_container("driver"), start_container("asker")
@@ -72,7 +72,7 @@ def test_it_is_a_service_of_the_robot_that_anybody_can_call(
 # --- health
 
 
-def test_joints_groups_and_the_bus_tell_that_the_bus_is_not_well_and_that_it_is_again(leg: Leg) -> None:
+def test_joints_groups_and_the_bus_report_that_the_bus_is_unhealthy_and_healthy_again(leg: Leg) -> None:
     reported: list[tuple[object, str]] = []
     robot = leg.attach(set_health=lambda provider, health: reported.append((provider, health)))
     providers = set(robot.providers.values())

@@ -143,7 +143,7 @@ with Container(Settings.read(system=sys.argv[1], container="caller")) as caller:
 
 
 @pytest.mark.parametrize("how", ["look", "look_async", "look_apart", "look_about"])
-def test_S05_the_death_of_who_asked_ends_what_the_service_moves_elsewhere(
+def test_S05_the_death_of_the_caller_ends_what_the_service_moves_elsewhere(
     head: Rig, mind: Mind, system: str, how: str, request: pytest.FixtureRequest
 ) -> None:
     with subprocess.Popen([sys.executable, "-c", CALLER, system, *asked(request, how)]) as caller:

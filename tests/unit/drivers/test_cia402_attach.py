@@ -51,7 +51,7 @@ def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -
     ],
     ids=str,
 )
-def test_a_setting_that_is_wrong_for_us_is_named(rig: Leg, values: dict[str, int], complaint: str) -> None:
+def test_a_setting_that_the_driver_cannot_use_is_named(rig: Leg, values: dict[str, int], complaint: str) -> None:
     rig.plug()
     objects(**values)(rig.sim)
     assert complaint in refused(rig)
@@ -112,6 +112,6 @@ def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
     assert rig.attach().group("legs").move_to(goal) == pytest.approx(goal, abs=0.01)
 
 
-def test_on_a_virtual_bus_without_anybody_the_drive_is_absent(rig: Leg) -> None:
+def test_on_an_empty_virtual_bus_the_drive_is_absent(rig: Leg) -> None:
     with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:empty"):
         rig.attach(ports={"legs": "virtual:empty"})

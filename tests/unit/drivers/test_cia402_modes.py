@@ -338,7 +338,7 @@ def test_positions_that_jump_are_followed_at_the_joints_own_speed_and_accelerati
     assert max(way) <= 6000 + 20
 
 
-def test_a_smooth_way_is_followed_to_the_count_and_after_a_gap_again() -> None:
+def test_a_smooth_path_is_followed_to_the_count_and_again_after_a_gap() -> None:
     stream = Following(1, 0, speed=20_000, accel=100_000, period_s=0.01)
     way = [round(5 * k * k) for k in range(15)] + [980 + 140 * k for k in range(1, 200)]
     way[80:95] = [way[80]] * 15  # the bus thread was held up: nothing new was due

@@ -15,7 +15,7 @@ from trade_drivers.vendors.cia402._motor import Drive
 __all__ = ["leg", "rig"]
 
 
-def test_the_way_to_enabled_is_one_state_after_the_other_and_ends_halted_where_it_is(leg: Leg) -> None:
+def test_enabling_passes_one_state_after_the_other_and_ends_halted_at_the_current_position(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     mark = written_now()
     hip.enable()

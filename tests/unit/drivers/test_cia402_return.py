@@ -203,7 +203,7 @@ def test_all_drives_come_back_by_themselves_from_a_silence_and_nothing_moves(
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1, 3])
-def test_a_driver_process_that_stood_still_finds_its_drives_again_and_moves_nothing(
+def test_a_driver_process_that_was_suspended_finds_its_drives_again_and_moves_nothing(
     stand: Stand, seconds: float
 ) -> None:
     script = str(Path(__file__).with_name("driver_process.py"))

@@ -76,7 +76,7 @@ def test_a_stop_halts_every_joint_of_a_group_that_moves(leg: Leg) -> None:
         leg.wait_for("at_rest", joint, started.t)
 
 
-def test_a_halted_drive_does_not_go_on_to_its_old_goal_when_it_is_moved_again(leg: Leg) -> None:
+def test_a_halted_drive_does_not_continue_to_its_old_goal_when_it_is_moved_again(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     moving = Outcome(lambda: hip.move_to(0.9, 0.3))
     leg.wait_for("motion_started", HIP)
@@ -159,7 +159,7 @@ def test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled(leg: Le
     assert not leg.events("motion_started", HIP, rest.t)
 
 
-def test_S19_leaving_while_moving_stops_first_and_disarms_what_holds(leg: Leg) -> None:
+def test_S19_shutdown_while_moving_stops_first_and_disarms_what_holds(leg: Leg) -> None:
     robot = leg.attach()
     hip = robot.motor("leg.hip")
     moving = Outcome(lambda: hip.move_to(0.9, 0.3))

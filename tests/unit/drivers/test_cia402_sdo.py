@@ -63,7 +63,7 @@ def test_numbers_are_read_in_one_frame_and_texts_in_several(server: Server) -> N
 
 
 @pytest.mark.parametrize(("index", "data"), [(0x6060, b"\x06"), (0x6040, b"\x10\x27"), (0x1000, b"\x01\x02\x03\x04")])
-def test_what_was_written_is_read(server: Server, index: int, data: bytes) -> None:
+def test_a_written_value_is_read_back(server: Server, index: int, data: bytes) -> None:
     assert server.run(download(index, 0, data)) == b""
     assert server.run(upload(index, 0)) == data
 
@@ -90,7 +90,7 @@ def first(transfer: Transfer) -> Request:
         "0000000000000000",  # a segment
     ],
 )
-def test_what_belongs_to_another_request_is_no_answer(frame: str) -> None:
+def test_a_frame_of_another_request_is_no_answer(frame: str) -> None:
     request = first(upload(0x6060, 0))
     assert request.is_answered_by(bytes.fromhex("4f60600006000000"))
     assert request.is_answered_by(bytes.fromhex("8060600000000206"))

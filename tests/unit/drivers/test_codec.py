@@ -185,7 +185,7 @@ def test_a_joint_alone_uses_its_limits() -> None:
 # --- names
 
 
-def test_the_public_names_are_there() -> None:
+def test_the_public_names_exist() -> None:
     assert len(trade_drivers.__all__) == len(set(trade_drivers.__all__))
     for name in trade_drivers.__all__:
         assert getattr(trade_drivers, name).__doc__

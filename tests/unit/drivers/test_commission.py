@@ -76,7 +76,7 @@ def line(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Line]:
         yield Line(MAKES[request.param], tmp_path, undo)
 
 
-def test_a_scan_names_who_answers_and_writes_nothing(line: Line) -> None:
+def test_a_scan_names_the_devices_that_answer_and_writes_nothing(line: Line) -> None:
     line.plug(1, 3)
     first, second = line.scan()
     make = line.make
@@ -94,7 +94,7 @@ def test_a_scan_reports_after_each_rate_what_it_found(line: Line) -> None:
     assert reported == [(rates[0], 1), (rates[1], 1)]
 
 
-def test_two_of_one_id_are_one_finding_with_its_remedy(line: Line) -> None:
+def test_two_devices_of_one_id_are_one_finding_with_its_remedy(line: Line) -> None:
     line.plug(1, 1)
     [found] = line.scan()
     assert found.id == 1
@@ -156,7 +156,7 @@ def test_an_id_is_not_changed_while_torque_is_on(line: Line) -> None:
 @pytest.mark.parametrize(
     ("device_id", "to", "complaint"), [(1, 2, "id 2 is taken"), (3, 4, "no device answers"), (1, 999, "999 is not")]
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(
+def test_an_impossible_change_is_refused_before_anything_is_written(
     line: Line, device_id: int, to: int, complaint: str
 ) -> None:
     line.plug(1, 2)

@@ -108,7 +108,7 @@ def test_every_driver_of_a_bus_has_its_loop_here() -> None:
     assert {point.name for point in ours if issubclass(point.load(), Driver)} == set(LOOPS)
 
 
-def test_a_turn_sends_so_much_and_no_more(running: Running) -> None:
+def test_a_bus_cycle_sends_a_bounded_number_of_bytes(running: Running) -> None:
     before, missed, seen = running.turns, running.measured("bus_missed_answers"), len(running.rig.log)
     running.turn(TURNS)
     new = running.rig.log[seen:]
@@ -131,7 +131,7 @@ def is_answer(one: Entry) -> bool:
     return one.kind == "sent" or (one.kind == "frame" and one.direction == "out")
 
 
-def test_turns_keep_nothing(running: Running) -> None:
+def test_bus_cycles_keep_no_memory(running: Running) -> None:
     """But for the last seconds, which faults are reported with: so it is looked at until that has grown no more.
 
     Of memory that the driver's own lines ask for: the simulator is in this process, too, and its log grows.

@@ -66,7 +66,7 @@ def test_servos_with_different_tables_are_read_in_one_exchange(rig: Rig, fast: b
 
 
 @pytest.mark.parametrize("model", ["XL430-W250", "XH430-W350", "XC330-M288", "XM540-W270"])
-def test_straining_with_all_it_has_is_full_load_for_each_model(rig: Rig, model: str) -> None:
+def test_the_greatest_effort_is_full_load_for_each_model(rig: Rig, model: str) -> None:
     plug(rig, model, model)
     pan = rig.attach().motor("neck.pan")
     pan.enable()

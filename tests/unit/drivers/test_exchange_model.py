@@ -274,7 +274,7 @@ TestModel = Model.TestCase
 TestModel.settings = hypothesis.settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_what_is_handed_in_while_all_of_it_is_ended_is_ended_or_still_there() -> None:
+def test_a_job_submitted_while_all_are_ended_is_ended_or_still_pending() -> None:
     """Else a service would wait for a lost job."""
     inbox: deque[int] = deque()
     many = 200_000

@@ -24,7 +24,7 @@ class TestFakeJointGroup(JointGroupContract):
     test_a_move_takes_over_from_a_trajectory = None  # type: ignore[assignment]
 
 
-def test_it_is_a_joint_group_to_those_who_look_for_one_and_an_e_stop_holds_it() -> None:
+def test_it_is_found_as_a_joint_group_and_an_e_stop_holds_it() -> None:
     group = FakeJointGroup(JOINTS)
     with memory_system() as system:
         robot, mind = system.container("robot"), system.container("mind")

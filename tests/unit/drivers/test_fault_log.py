@@ -176,7 +176,7 @@ def test_what_a_device_reports_in_one_text_is_taken_apart(prefix: str) -> None:
         ("fault 0x0e, which the manual does not know", "fault 0x0b, which the manual does not know", False),
     ],
 )
-def test_numbers_make_no_other_kind_but_codes_do(one: str, other: str, same: bool) -> None:
+def test_different_numbers_do_not_make_another_fault_and_different_codes_do(one: str, other: str, same: bool) -> None:
     kinds = {found_in(PAN, DeviceFault(device=PAN, bus="x", fault=text))[0].kind for text in (one, other)}
     assert (len(kinds) == 1) is same
 
@@ -194,7 +194,7 @@ def test_a_fault_shows_its_latest_message_with_the_numbers(bench: Bench) -> None
     assert len(log.faults()) == 2
 
 
-def test_who_acknowledges_is_noted_and_a_fault_that_begins_again_is_unseen_again(bench: Bench) -> None:
+def test_the_acknowledging_client_is_recorded_and_a_recurring_fault_is_unacknowledged_again(bench: Bench) -> None:
     log = bench.open()
     bench.begin()
     seen = log.acknowledge(only(log).id)
@@ -283,7 +283,7 @@ def test_an_open_fault_that_is_not_found_again_is_closed_and_can_reopen(bench: B
     assert (only(log).open, only(log).count) == (True, 2)
 
 
-def test_samples_and_evidence_are_there_for_the_next_process(bench: Bench) -> None:
+def test_samples_and_evidence_are_available_to_the_next_process(bench: Bench) -> None:
     log = bench.open()
     bench.begin(moments=[state(0.1, 99.5)])
     log.add_evidence(only(log).id, "a picture")
@@ -292,7 +292,7 @@ def test_samples_and_evidence_are_there_for_the_next_process(bench: Bench) -> No
     assert bench.open().fault(before.id) == before
 
 
-def test_faults_with_more_to_them_than_this_version_knows_are_read(bench: Bench) -> None:
+def test_faults_with_fields_of_a_later_version_are_read(bench: Bench) -> None:
     bench.open()
     bench.begin()
     bench.close()
@@ -323,7 +323,7 @@ def test_a_file_that_is_corrupt_is_moved_aside_and_faults_are_kept_in_a_new_one(
     assert ["is corrupt" in text for text in bench.reported] == [True]
 
 
-def test_without_a_disk_all_is_known_and_said_once_and_written_when_it_is_back(bench: Bench) -> None:
+def test_without_a_disk_faults_are_kept_in_memory_reported_once_and_written_later(bench: Bench) -> None:
     bench.path.parent.write_text("a file, where a folder should be")
     log = bench.open()
     bench.begin(LOAD)

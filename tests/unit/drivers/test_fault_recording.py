@@ -104,7 +104,7 @@ def test_a_thread_of_a_bus_that_fails_is_a_fault_of_its_devices(head: Rig, monke
     assert info.open
 
 
-def test_who_looks_on_and_fails_ends_no_motion(
+def test_an_observer_that_fails_ends_no_motion(
     head: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = head.attach()
@@ -164,7 +164,7 @@ def test_a_gripper_reports_its_faults(hand: HandRig) -> None:
     assert {"width_m", "current_a", "force_n"} <= set(robot.faults.fault(info.id).latest[-1].values)
 
 
-def test_they_are_services_that_anybody_may_ask_and_to_acknowledge_names_who_did(
+def test_faults_are_services_for_any_client_and_an_acknowledgement_names_the_client(
     head: Rig, start_container: Callable[..., Container]
 ) -> None:
     driver, asker = start_container("driver"), start_container("asker")
@@ -258,7 +258,7 @@ def test_a_device_of_another_driver_is_asked_and_its_mistakes_are_faults_too() -
     }
 
 
-def test_a_sensor_is_silent_and_well_again_and_what_it_measured_before_is_kept() -> None:
+def test_a_sensor_is_silent_and_healthy_again_and_earlier_measurements_are_kept() -> None:
     sensor, log = create_autospec(Sensor, instance=True), FaultLog("rosie")
     silent = DeviceSilent(device="rosie.scale", bus="/dev/ttyUSB0", waited_s=1.2)
     sensor.read.return_value = Reading(name="rosie.scale", value=[1.0, 2.5], unit="kg", stamp_ns=1, age_s=0.0)
@@ -277,7 +277,7 @@ def test_a_sensor_is_silent_and_well_again_and_what_it_measured_before_is_kept()
     assert log.fault(info.id).first[-1].values == {"value.0": 1.0, "value.1": 2.5}
 
 
-def test_a_camera_is_not_asked_for_pictures_to_see_whether_it_is_well() -> None:
+def test_a_camera_is_not_asked_for_pictures_to_see_whether_it_is_healthy() -> None:
     camera, motor, log = (
         create_autospec(Camera, instance=True),
         create_autospec(Motor, instance=True),

@@ -46,7 +46,7 @@ def test_S06_no_servo_has_a_watchdog_so_no_goal_is_farther_ahead_than_the_joint_
         assert abs(goal_of(write) - measured_before(log, write)) <= lead_counts(1.0)
 
 
-def test_S06_nor_is_one_of_a_set_point(tail: TailRig) -> None:
+def test_S06_no_set_point_is_farther_ahead_than_the_joint_gets_until_the_next(tail: TailRig) -> None:
     root = tail.root()
     root.enable()
     mark = written_now()

@@ -194,7 +194,7 @@ def test_S06_held_up_in_a_cycle_it_sends_no_joint_farther_than_its_watchdog_lets
     assert "held up for 1." in str(error)
 
 
-def test_S06_nor_does_a_stop_that_came_meanwhile(joint: Joint) -> None:
+def test_S06_held_up_in_a_cycle_a_stop_that_came_meanwhile_sends_no_joint_farther_either(joint: Joint) -> None:
     moving = joint.set_off(joint.move)
     with joint.held_up():
         stopping = Outcome(joint.motor.stop)
@@ -205,7 +205,7 @@ def test_S06_nor_does_a_stop_that_came_meanwhile(joint: Joint) -> None:
 
 
 @pytest.mark.parametrize("act", [Joint.move, Joint.follow, Joint.turn])
-def test_S06_what_moved_when_its_host_was_suspended_does_not_go_on(
+def test_S06_what_moved_when_its_host_was_suspended_does_not_continue(
     joint: Joint, act: Callable[[Joint], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The clock of everything else does not run meanwhile: it is as if nothing had happened."""

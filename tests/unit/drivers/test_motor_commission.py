@@ -86,7 +86,7 @@ def test_a_motor_under_torque_ends_the_scan(wag: MotorRig) -> None:
         look(wag)
 
 
-def test_what_is_no_model_known_here_is_named_as_it_is(wag: MotorRig) -> None:
+def test_an_unknown_model_is_shown_with_its_number(wag: MotorRig) -> None:
     wag.sim.do(WrongModel(ids=(ROOT,), number=77))
     root = look(wag, ids=[ROOT])[0]
     assert "77" in root.model + root.problem
@@ -156,11 +156,11 @@ def test_what_a_canopen_node_measures_is_no_heartbeat_of_an_odrive() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\0" * 7, struct.pack("<IBBBB", 0, 1, 0, 0, 1), struct.pack("<IBBBx", 0, 99, 0, 0)])
-def test_other_bytes_are_no_heartbeat(data: bytes) -> None:
+def test_other_bytes_are_not_read_as_a_heartbeat(data: bytes) -> None:
     assert Talk({5 << 5 | 1: [data, data]}).odrives == {}
 
 
-def test_one_frame_alone_proves_nothing() -> None:
+def test_one_frame_alone_identifies_no_device() -> None:
     assert Talk({5 << 5 | 1: [struct.pack("<IBBBx", 0, 1, 0, 0)]}).odrives == {}
 
 

@@ -12,7 +12,7 @@ __all__ = ["motor_rig", "wag"]
 # --- attaching and leaving
 
 
-def test_S19_leaving_while_moving_stops_first_and_relaxes(wag: MotorRig) -> None:
+def test_S19_shutdown_while_moving_stops_first_and_relaxes(wag: MotorRig) -> None:
     robot = wag.attach()
     root = robot.motor("tail.root")
     root.enable()

@@ -49,7 +49,7 @@ def test_an_answer_is_complete_once_all_its_bytes_arrived() -> None:
     assert parse_answer(whole) == parse_answer(whole + b"more") == Answer(200, "OK", b"abcd")
 
 
-def test_what_is_no_http_is_refused() -> None:
+def test_an_answer_that_is_not_http_is_refused() -> None:
     for bad in (b"SSH-2.0\r\nContent-Length: 0\r\n\r\n", b"HTTP/1.0 fine\r\nContent-Length: 0\r\n\r\n"):
         with pytest.raises(ValueError, match="no HTTP"):
             parse_answer(bad)

@@ -127,7 +127,7 @@ def test_one_that_cannot_be_measured_is_not_attached_and_its_wire_is_free(kind: 
     scale.close()
 
 
-def test_closing_lets_go_of_the_wire(scale: Scale) -> None:
+def test_closing_releases_the_wire(scale: Scale) -> None:
     scale.close()
     assert not scale.is_open
     scale.close()

@@ -82,7 +82,7 @@ def test_a_stop_keeps_what_is_held_and_follows_it_no_more(hand: HandRig) -> None
     assert not hand.truth.moving
 
 
-def test_a_stop_of_standing_fingers_writes_nothing(hand: HandRig) -> None:
+def test_a_stop_of_resting_fingers_writes_nothing(hand: HandRig) -> None:
     gripper = hand.active()
     mark = written_now()
     gripper.stop()

@@ -138,7 +138,7 @@ def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand
     assert hand.truth.width_m > 0.03
 
 
-def test_S08_a_stop_of_a_silent_gripper_is_sent_blind_and_cannot_activate_it(hand: HandRig) -> None:
+def test_S08_a_stop_of_a_silent_gripper_is_sent_without_a_reading_and_cannot_activate_it(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
     hand.under_way()

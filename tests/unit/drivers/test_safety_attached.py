@@ -69,7 +69,7 @@ def test_S18_replugging_never_enables_and_never_commands(head: Rig) -> None:
 # --- S19 leaving
 
 
-def test_S19_leaving_with_hold_keeps_torque_on_and_disarms_the_watchdog(head: Rig) -> None:
+def test_S19_shutdown_with_hold_keeps_torque_on_and_disarms_the_watchdog(head: Rig) -> None:
     with head.attach() as robot:
         robot.motor("neck.pan").move_to(0.3)
         mark = written_now()
@@ -80,7 +80,7 @@ def test_S19_leaving_with_hold_keeps_torque_on_and_disarms_the_watchdog(head: Ri
     assert not head.events("watchdog_expired")
 
 
-def test_S19_leaving_with_relax_switches_torque_off(rig: Rig) -> None:
+def test_S19_shutdown_with_relax_switches_torque_off(rig: Rig) -> None:
     rig.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nleave = "relax"'))
     rig.plug()
     with rig.attach() as robot:
@@ -88,7 +88,7 @@ def test_S19_leaving_with_relax_switches_torque_off(rig: Rig) -> None:
     assert not rig.truth(1).torque
 
 
-def test_S19_leaving_while_moving_stops_first(head: Rig) -> None:
+def test_S19_shutdown_while_moving_stops_first(head: Rig) -> None:
     robot = head.attach()
     moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.2))
     head.wait_for("motion_started", 1)

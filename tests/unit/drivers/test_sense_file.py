@@ -30,7 +30,7 @@ def test_a_robot_may_have_sensors_only() -> None:
     assert robot.buses == robot.joints == []
 
 
-def test_what_moves_nothing_is_no_member_of_a_group_that_is_locked() -> None:
+def test_a_device_that_moves_nothing_is_no_member_of_a_lockable_group() -> None:
     assert parse(HEAD + EYE, "head.toml").members() == parse(HEAD, "head.toml").members()
 
 

@@ -201,7 +201,7 @@ def test_a_picture_that_trickles_in_is_given_up_in_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", [Truncate(missing=20), Garbage(hex="00" * 8)], ids=["truncated", "garbage"])
-def test_what_is_no_whole_picture_is_never_handed_out(stage: Stage, camera: Camera, fault: faults.Command) -> None:
+def test_an_incomplete_picture_is_never_returned(stage: Stage, camera: Camera, fault: faults.Command) -> None:
     stage.sims["eye"].do(fault)
     with pytest.raises((DeviceFault, DeviceSilent)):
         camera.image()
@@ -209,7 +209,7 @@ def test_what_is_no_whole_picture_is_never_handed_out(stage: Stage, camera: Came
     assert camera.image().data
 
 
-def test_a_frozen_camera_shows_what_was(stage: Stage, robot: AttachedRobot, camera: Camera) -> None:
+def test_a_frozen_camera_shows_an_old_picture(stage: Stage, robot: AttachedRobot, camera: Camera) -> None:
     stage.sims["eye"].do(Freeze())
     before = camera.image().data
     robot.motor("neck.pan").move_to(1.2)
@@ -218,7 +218,7 @@ def test_a_frozen_camera_shows_what_was(stage: Stage, robot: AttachedRobot, came
     assert camera.image().data != before
 
 
-def test_an_order_a_camera_has_not_got_is_refused(stage: Stage) -> None:
+def test_a_command_that_a_camera_does_not_have_is_refused(stage: Stage) -> None:
     with pytest.raises(SimulationError, match="camera eye has no such thing as Jam"):
         stage.sims["eye"].do(faults.Jam())
 
@@ -290,7 +290,7 @@ def test_the_camera_has_its_group_and_no_other_kind_of_provider_does(robot: Atta
         robot.camera("neck.pan")
 
 
-def test_arguments_are_none_of_its_services(camera: Camera) -> None:
+def test_its_services_take_no_arguments(camera: Camera) -> None:
     from trade import where
     from trade.testing import memory_system
 

@@ -80,7 +80,7 @@ def test_a_port_that_is_closed_or_unplugged_is_lost(kind: type[SerialWire], pair
     wire.close()
 
 
-def test_what_the_gate_keeps_in_never_leaves_and_its_error_is_not_the_ports(pair: Pair) -> None:
+def test_bytes_that_the_gate_blocks_are_never_sent_and_its_error_is_not_one_of_the_port(pair: Pair) -> None:
     def late() -> NoReturn:
         raise DeadlineExceeded(service="move_to", deadline_s=0.1)  # a TimeoutError, so an OSError
 

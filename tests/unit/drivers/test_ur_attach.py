@@ -32,7 +32,7 @@ def elsewhere(rig: ArmRig) -> str:
 # --- S19, S20
 
 
-def test_S19_leaving_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> None:
+def test_S19_shutdown_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> None:
     moving = rig.set_off()
     mark = written_now()
     rig.robot.close()

@@ -117,7 +117,7 @@ def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchd
 
 
 @pytest.mark.parametrize("how", ["move_joints", "servo", "follow"])
-def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_go_on(
+def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_continue(
     rig: ArmRig, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     joints = [limit.name for limit in rig.arm.limits().joints]

@@ -35,7 +35,7 @@ def test_half_a_turn_is_made_in_steps() -> None:
     assert [pose[5] for pose in poses] == pytest.approx([pi * k / len(poses) for k in range(1, len(poses) + 1)])
 
 
-def test_what_comes_late_is_as_old_as_it_is() -> None:
+def test_late_data_has_its_true_age() -> None:
     age = Age()
     for k in range(100):
         assert age.measured_ns(10**9 + k * 2_000_000, k * 2_000_000) == pytest.approx(10**9 + k * 2_000_000, abs=2_000)

@@ -19,7 +19,7 @@ def test_nothing_left_out_is_the_whole_robot(rosie: Robot) -> None:
     assert without(rosie, []) == (rosie, [])
 
 
-def test_with_a_bus_go_its_devices_and_the_groups_they_are_in(rosie: Robot) -> None:
+def test_leaving_out_a_bus_leaves_out_its_devices_and_their_groups(rosie: Robot) -> None:
     rest, gone = without(rosie, ["legs", "left_arm"])
     assert [bus.name for bus in rest.buses] == ["neck", "hand", "right_arm", "tail"]
     assert gone == [*(joint.name for joint in rosie.joints_on("legs")), "left.arm", "legs"]
@@ -48,7 +48,7 @@ def test_what_cannot_be_left_out_is_refused(rosie: Robot, names: list[str], comp
         without(rosie, names)
 
 
-def test_who_is_coupled_stays_or_goes_together() -> None:
+def test_coupled_joints_are_kept_or_left_out_together() -> None:
     text = (EXAMPLES / "dora.toml").read_text(encoding="utf-8")
     robot = parse(text, "dora.toml")
     one, other = (robot.joints_on(bus.name)[0].name for bus in robot.buses[:2])

@@ -55,7 +55,7 @@ def talk(memory: MemorySystem, robot: Container) -> Talk:
     return made
 
 
-def test_P58_a_dialogue_about_what_there_is(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+def test_P58_a_dialogue_about_the_services_that_exist(talk: Talk, robot: Container, memory: MemorySystem) -> None:
     host = robot.containers()[0].host
     dialogue = [
         ("Which computers are there?", f"There is one host: {host}."),
@@ -78,7 +78,7 @@ def test_P58_a_dialogue_about_what_there_is(talk: Talk, robot: Container, memory
         assert talk.say(asked).text == answered
 
 
-def test_P58_what_is_new_is_what_came_and_went_since_one_asked(
+def test_P58_new_services_are_those_that_came_and_went_since_the_last_question(
     talk: Talk, robot: Container, memory: MemorySystem
 ) -> None:
     talk.say("what is new")
@@ -125,7 +125,7 @@ def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory:
         ("", "I do not understand that"),
     ],
 )
-def test_what_is_not_understood_is_said_with_what_is(talk: Talk, sentence: str, said: str) -> None:
+def test_a_question_that_is_not_understood_lists_those_that_are(talk: Talk, sentence: str, said: str) -> None:
     with pytest.raises(NotUnderstood) as wrong:
         talk.say(sentence)
     assert said in str(wrong.value)
@@ -202,7 +202,7 @@ def test_a_lexicon_that_is_wrong_is_refused_with_what_would_be_right(
     assert said in str(wrong.value)
 
 
-def test_on_the_command_line_what_is_new_is_since_it_was_asked_last(start_container, system: str) -> None:
+def test_on_the_command_line_new_means_since_the_last_question(start_container, system: str) -> None:
     robot = start_container("robot")
     robot.register(Eyes(), "rosie.eyes")
 

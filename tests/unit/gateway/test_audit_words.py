@@ -105,11 +105,11 @@ def test_the_folder_of_the_containers_is_the_one_that_is_meant(folder: Path, mon
         (["--since", "90m", "--service", "*.grip", "--kind", "call"], 1),
     ],
 )
-def test_one_asks_for_some_of_them(folder: Path, words: list[str], found: int) -> None:
+def test_records_can_be_filtered(folder: Path, words: list[str], found: int) -> None:
     assert len(whats(folder, *words)) == found
 
 
-def test_all_that_came_of_a_call_is_found_by_its_id_and_by_that_of_what_came_of_it(folder: Path) -> None:
+def test_everything_a_call_led_to_is_found_by_its_id_and_by_the_ids_of_nested_calls(folder: Path) -> None:
     write(folder / "mind.sqlite", [row("rosie.mind.plan", time.time() - 50, call_id=30, outer_id=30)])
     write(folder / "neck.sqlite", [row("rosie.neck.turn", time.time() - 49, call_id=41, outer_id=30)])
     assert whats(folder, "--call", "30") == ["rosie.mind.plan", "rosie.neck.turn"]
@@ -118,7 +118,7 @@ def test_all_that_came_of_a_call_is_found_by_its_id_and_by_that_of_what_came_of_
     assert "(call 41 of 30)" in said
 
 
-def test_a_moment_that_is_none_is_refused(folder: Path) -> None:
+def test_an_invalid_time_is_refused(folder: Path) -> None:
     done = trade("audit", folder, "--since", "yesterday")
     assert isinstance(done.exception, UsageError)
     assert "yesterday" in str(done.exception)
@@ -217,7 +217,7 @@ def test_a_noted_head_that_was_dropped_since_is_said_to_prove_nothing(folder: Pa
     assert "cannot be compared" in later.stdout
 
 
-def test_notes_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_an_invalid_file_of_saved_heads_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "heads").write_text("arm 3\n")
     done = trade("audit", "verify", folder, "--against", tmp_path / "heads")
     assert isinstance(done.exception, UsageError)

@@ -244,7 +244,7 @@ def test_an_existing_backup_is_not_overwritten(config: Path, state: Path, out: P
         (lambda text: text.replace('"lab"', "3"), r"gateway.toml: cannot be read: .*system"),
     ],
 )
-def test_what_could_not_be_put_back_is_not_backed_up(
+def test_a_file_that_could_not_be_restored_is_not_backed_up(
     config: Path, state: Path, out: Path, change: Callable[[str], str], said: str
 ) -> None:
     file = config / "gateway.toml"
@@ -256,7 +256,7 @@ def test_what_could_not_be_put_back_is_not_backed_up(
     assert not list(out.parent.glob(".trade*"))
 
 
-def test_a_backup_is_not_put_into_what_it_is_of(config: Path, state: Path) -> None:
+def test_a_backup_is_not_written_into_a_folder_that_it_backs_up(config: Path, state: Path) -> None:
     with pytest.raises(ConfigurationError, match="is in the folder for state"):
         back_up(config, state / "lab" / "trade.tar.gz", state)
 
@@ -273,7 +273,9 @@ def test_nothing_is_overwritten_unless_by_force(config: Path, state: Path, out: 
     assert (to / "policy.toml").read_bytes() == (config / "policy.toml").read_bytes()
 
 
-def test_who_was_revoked_since_stays_revoked(config: Path, state: Path, out: Path, tmp_path: Path) -> None:
+def test_an_identity_revoked_after_the_backup_stays_revoked(
+    config: Path, state: Path, out: Path, tmp_path: Path
+) -> None:
     (config / "revoked.toml").write_text('revoked = ["old"]')
     back_up(config, out, state)
     (config / "revoked.toml").write_text('revoked = ["new"]')
@@ -282,7 +284,7 @@ def test_who_was_revoked_since_stays_revoked(config: Path, state: Path, out: Pat
     assert "new stays revoked" in reported.stderr
 
 
-def test_nothing_is_put_back_beneath_a_container_that_runs(config: Path, state: Path, out: Path) -> None:
+def test_nothing_is_restored_while_a_container_runs(config: Path, state: Path, out: Path) -> None:
     back_up(config, out, state)
     before = content(state)
     with alone(lock_of(state / "lab", "door", "rosie")), pytest.raises(ConfigurationError, match="stop its gateway"):

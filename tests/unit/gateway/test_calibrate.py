@@ -41,7 +41,7 @@ def test_a_range_alone_is_measured_from_the_zero_that_the_file_has() -> None:
     assert measured(joint(), 0.0, None) == {"offset_rad": 0.0}
 
 
-def test_what_was_hardly_moved_has_no_range() -> None:
+def test_a_joint_that_was_hardly_moved_gets_no_range() -> None:
     with pytest.raises(ConfigurationError, match="from one end to the other"):
         measured(joint(), None, Ends(0.0, 0.05, 0.0))
 
@@ -88,7 +88,7 @@ def test_answers_that_are_missed_for_a_moment_throw_nothing_away() -> None:
     assert ends == Ends(-2.0, 1.0, -2.0)
 
 
-def test_who_answers_no_more_is_named_with_its_port_and_once() -> None:
+def test_a_device_that_stops_answering_is_named_once_with_its_port() -> None:
     with pytest.raises(ConfigurationError) as gone:
         Sweep(Loose([], inf), 1, PLACE, patience_s=0.05).read()  # type: ignore[arg-type]
     said = f"{PLACE}: did not answer within 51 ms, asked for 0.05 s; check its cable. Nothing was written"
@@ -162,7 +162,7 @@ def test_zero_is_the_current_position_and_nothing_is_written_to_the_device(rosie
     assert not writes(list(rosie.sim.log.entries))
 
 
-def test_who_says_no_keeps_the_file_as_it_was(rosie: Rosie) -> None:
+def test_answering_no_leaves_the_file_unchanged(rosie: Rosie) -> None:
     rosie.sim.devices[0].place(2148, 0.0)
     said = rosie.calibrate("neck.pan", "--zero-here", says="n\n")
     assert said.exit_code == 1

@@ -9,7 +9,7 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli.services._call import parse_arguments
 
 
-def test_words_are_json_by_place_or_by_name() -> None:
+def test_arguments_are_json_by_position_or_by_name() -> None:
     assert parse_arguments(["[0.3, -0.2]", '"left"', "speed=0.5", "deep={}"]) == (
         [[0.3, -0.2], "left"],
         {"speed": 0.5, "deep": {}},
@@ -48,7 +48,7 @@ MEANT = [
 
 
 @pytest.mark.parametrize(("words", "remedy"), MEANT, ids=str)
-def test_a_word_that_is_no_json_is_answered_with_what_was_meant(words: list[str], remedy: str) -> None:
+def test_an_argument_that_is_no_json_is_answered_with_a_suggestion(words: list[str], remedy: str) -> None:
     with pytest.raises(UsageError) as refused:
         parse_arguments(words)
     assert remedy in str(refused.value)

@@ -136,7 +136,7 @@ LEGS = CanBus(name="legs", driver="cia402", interface="socketcan", channel="can0
         (Link(True, None), "ok", ""),
     ],
 )
-def test_a_can_interface_is_up_at_the_rate_of_the_file_and_well(link: Link, level: str, fix: str) -> None:
+def test_a_can_interface_is_up_at_the_rate_of_the_file_and_healthy(link: Link, level: str, fix: str) -> None:
     found = robots.judged(LEGS, link)
     assert (found.level, fix in found.fix) == (level, True)
 
@@ -168,14 +168,14 @@ def test_devices_that_answer_are_named(robot_file: Path) -> None:
         assert [found.level for found in of_devices(robot_file)] == ["ok", "ok"]
 
 
-def test_who_does_not_answer_is_an_error(robot_file: Path) -> None:
+def test_a_device_that_does_not_answer_is_an_error(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].absent = True
         pan, tilt = of_devices(robot_file)
     assert (pan.level, pan.text, tilt.level) == ("error", "does not answer at 1000000 baud", "ok")
 
 
-def test_who_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
+def test_a_device_that_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.do(Mute(ids=(1,), instruction="ping", skip=3, count=2))
         pan, _ = of_devices(robot_file)

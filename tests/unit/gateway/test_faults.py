@@ -46,7 +46,7 @@ def test_each_change_is_reported_once_in_both_directions(
     assert reported(capsys) == [("rosie.pan", "")]
 
 
-def test_of_a_gripper_that_is_said_which_is_enough(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_remedy_of_a_gripper_is_to_activate_it(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
     watch = FaultWatch(log, {"rosie.pan": create_autospec(Gripper, instance=True)})
     log.begin("rosie.pan", OVERLOAD, 0.0, 0.0)
     watch.report(Output(as_json=True))

@@ -65,7 +65,7 @@ def test_a_child_that_does_not_end_on_request_is_killed(staying: Staying) -> Non
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
 
-def test_S20_one_that_is_frozen_is_ended_while_it_is(staying: Staying) -> None:
+def test_S20_a_frozen_process_is_ended_while_it_is_frozen(staying: Staying) -> None:
     staying.until(0.0, 2.0)
     assert staying.says() == "asked to leave"  # so it has heard of both
     staying.process.send_signal(signal.SIGSTOP)

@@ -180,7 +180,7 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ('[container.rosie]\nrobot = "missing.toml"\n', 5, "there is no such file"),
     ],
 )
-def test_what_is_wrong_with_a_container_is_named_with_its_line(tmp_path: Path, text: str, line: int, said: str) -> None:
+def test_each_mistake_in_a_container_is_named_with_its_line(tmp_path: Path, text: str, line: int, said: str) -> None:
     file = tmp_path / "gateway.toml"
     file.write_text(f"{ALONE}{EYES}{text}")
     with pytest.raises(ConfigurationError) as wrong:
@@ -272,7 +272,7 @@ def test_a_limit_that_would_not_hold_is_refused(file: Path, limit: str, said: st
         ("[network.lab]", "[network", r"not valid TOML"),
     ],
 )
-def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) -> None:
+def test_each_mistake_is_named(file: Path, before: str, after: str, said: str) -> None:
     change(file, before, after)
     with pytest.raises(ConfigurationError, match=said):
         read_gateway_file(file)
@@ -367,7 +367,7 @@ def test_a_host_that_has_the_address_nowhere_or_twice_says_nothing(file: Path, m
     assert "is an address" not in checked(file)
 
 
-def test_loopback_is_of_the_first_network_and_everywhere_of_all(
+def test_loopback_belongs_to_the_first_network_and_a_wildcard_to_all_networks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     has(monkeypatch, eth0="192.168.7.1", eth1="10.0.0.7")
@@ -458,7 +458,7 @@ def test_what_is_not_listed_is_not_shared(sharing: Path) -> None:
     assert (share.export, share.import_) == ([], [])
 
 
-def test_who_only_shares_joins_no_networks(sharing: Path) -> None:
+def test_a_gateway_that_only_shares_joins_no_networks(sharing: Path) -> None:
     text = sharing.read_text()
     sharing.write_text(text[: text.index("[network.lab]")] + text[text.index("[share.clinic]") :])
     with pytest.raises(ConfigurationError, match=r"network.robot.export: there is no other network"):
@@ -488,7 +488,7 @@ def test_who_only_shares_joins_no_networks(sharing: Path) -> None:
         ('tls = "clinic/door"', 'credentials = "a:b"', r"share.clinic.credentials: is for laboratories"),
     ],
 )
-def test_what_is_wrong_with_a_share_is_named(sharing: Path, before: str, after: str, said: str) -> None:
+def test_each_mistake_in_a_share_is_named(sharing: Path, before: str, after: str, said: str) -> None:
     change(sharing, before, after)
     with pytest.raises(ConfigurationError, match=said):
         read_gateway_file(sharing)

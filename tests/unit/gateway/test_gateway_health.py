@@ -18,7 +18,7 @@ def running(system: str, tmp_path: Path) -> Iterator[Gateway]:
     made.close()
 
 
-def test_it_is_well_until_it_takes_no_calls_any_more(running: Gateway) -> None:
+def test_a_gateway_is_healthy_until_it_takes_no_calls_any_more(running: Gateway) -> None:
     assert running.healthy
     running.container.close()
     assert not running.healthy

@@ -184,7 +184,7 @@ def test_S03_what_a_session_moves_stops_with_it_and_nothing_of_another_does(serv
     assert (gone.status, gone.title) == (404, "NoSuchSession")
 
 
-def test_S05_a_session_of_which_nothing_is_heard_ends_and_one_that_is_heard_of_does_not(served: Opened) -> None:
+def test_S05_a_silent_session_ends_and_an_active_one_does_not(served: Opened) -> None:
     heard, silent = served.client("anna").opened(lease_s=2), served.client("bert").opened(lease_s=2)
     heard.call("robot.a.go_on", 1.0)
     silent.call("robot.b.go_on", 1.0)
@@ -196,7 +196,7 @@ def test_S05_a_session_of_which_nothing_is_heard_ends_and_one_that_is_heard_of_d
     assert silent.ask("GET", "/session").title == "NoSuchSession"
 
 
-def test_S05_who_hangs_up_during_a_call_has_it_ended(served: Opened) -> None:
+def test_S05_hanging_up_during_a_call_ends_it(served: Opened) -> None:
     served["a"].hold.clear()
     request = served.client().begin("POST", "/call/robot.a/move", {"args": [1.0], "deadline_s": 300})
     assert served["a"].entered.wait(20)
@@ -207,7 +207,7 @@ def test_S05_who_hangs_up_during_a_call_has_it_ended(served: Opened) -> None:
     assert served["a"].written == []
 
 
-def test_S05_who_hangs_up_during_a_call_of_a_session_has_that_call_ended_and_not_the_session(served: Opened) -> None:
+def test_S05_hanging_up_during_a_call_of_a_session_ends_that_call_and_not_the_session(served: Opened) -> None:
     session = served.client().opened(lease_s=60)
     session.call("robot.b.go_on", 1.0)
     request = session.begin("POST", "/call/robot.axis/move_to", {"args": [1.0], "deadline_s": 300})
@@ -220,7 +220,7 @@ def test_S05_who_hangs_up_during_a_call_of_a_session_has_that_call_ended_and_not
     assert served["axis"].resource.moving
 
 
-def test_a_session_is_its_clients_alone(served: Opened) -> None:
+def test_a_session_belongs_to_its_client_alone(served: Opened) -> None:
     session = served.client("anna").opened(lease_s=60)
     thief = served.client("bert")
     thief.session = session.session
@@ -229,7 +229,7 @@ def test_a_session_is_its_clients_alone(served: Opened) -> None:
     assert session.call("robot.a.move", 2.0).status == 200
 
 
-def test_a_lock_is_its_sessions_and_falls_with_it(served: Opened) -> None:
+def test_a_lock_belongs_to_its_session_and_ends_with_it(served: Opened) -> None:
     anna, bert = served.client("anna"), served.client("bert")
     refused = anna.ask("POST", "/locks", {"group": "robot.a"})
     assert (refused.status, refused.title) == (400, "NeedsSession")
@@ -313,7 +313,7 @@ def test_S09_an_http_gateway_names_unreached_containers_and_calls_the_e_stop_inc
     assert set(reported["confirmed"]) >= {"tester/a", "tester/b"}
 
 
-def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(served: Opened) -> None:
+def test_S07_under_overload_some_calls_are_refused_and_a_stop_is_not(served: Opened) -> None:
     anna, bert = served.client("anna"), served.client("bert")
     under_way: list[HTTPConnection] = []
 

@@ -32,7 +32,7 @@ def test_a_client_has_its_own_rights_and_not_those_of_the_http_gateway(served: O
     assert served["a"].written == [1.0]
 
 
-def test_what_a_client_may_not_know_of_it_does_not_see(served: Opened) -> None:
+def test_a_client_does_not_see_what_it_may_not_read(served: Opened) -> None:
     anna, stranger = served.client("anna"), served.client("carl")
     assert {one["group"] for one in anna.ask("GET", "/services").body} == {"robot.a"}
     assert anna.call("robot.b.move", 1.0).title == "NoSuchService"
@@ -52,7 +52,7 @@ def test_what_a_client_may_not_know_of_it_does_not_see(served: Opened) -> None:
         assert heard(page)["service"]["group"] == "robot.a.again"
 
 
-def test_who_has_no_role_reads_nothing_of_the_system(served: Opened) -> None:
+def test_a_client_without_a_role_reads_nothing_of_the_system(served: Opened) -> None:
     bert, stranger = served.client("bert"), served.client("carl")
     for path in ("/containers", "/loads", "/sight", "/estops"):
         assert bert.ask("GET", path).status == 200
@@ -84,7 +84,7 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(served: Opened) 
     assert chief.ask("POST", "/estop/clear", {"ids": [given["id"]]}).body["complete"]
 
 
-def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
+def test_refusals_and_the_client_that_cleared_an_e_stop_are_on_record(
     served: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reported: list[Event] = []
@@ -115,7 +115,7 @@ def test_a_client_learns_its_identity_and_rights(served: Opened) -> None:
     assert all(one["allowed"] for one in anna.ask("GET", "/services").body)
 
 
-def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(served: Opened) -> None:
+def test_readers_request_locks_and_administrators_break_them(served: Opened) -> None:
     anna, bert, carl, chief = (served.client(name).opened(lease_s=60) for name in ("anna", "bert", "carl", "chief"))
     asked: list[tuple[str, str]] = []
     own = served.robot.me.lock([served.robot.find("a")], on_request=lambda who, why: asked.append((who, why))).acquire()
@@ -237,7 +237,7 @@ def test_streams_are_the_clients_rights_too_and_end_with_them(served: Opened, tm
         assert denied["problem"]["title"] == "NoSuchService"
 
 
-def test_who_is_revoked_is_let_in_no_more_and_what_it_moves_stops(served: Opened, tmp_path: Path) -> None:
+def test_a_revoked_client_is_not_let_in_and_what_it_moves_stops(served: Opened, tmp_path: Path) -> None:
     anna = served.client("anna")
     with anna.socket() as page:
         ask(page, do="call", id=1, group="robot.a", name="go_on", args=[1.0])

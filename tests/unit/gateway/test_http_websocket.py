@@ -86,7 +86,7 @@ def test_a_call_reports_its_progress(served: Opened) -> None:
         assert reported[:-1]
 
 
-def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(served: Opened) -> None:
+def test_a_result_that_json_cannot_express_ends_one_call_and_nothing_else(served: Opened) -> None:
     served.robot.system.container("walker").register(Walker(), "walker")
     served.robot.system.settle()
     with served.client().socket() as page:
@@ -117,7 +117,7 @@ def test_S04_set_points_leave_in_the_order_in_which_they_came(served: Opened) ->
     assert left == wanted
 
 
-def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(served: Opened) -> None:
+def test_S08_a_call_made_before_a_stop_never_begins_after_it(served: Opened) -> None:
     """All of it is sent at once: the stop overtakes what has not begun."""
     with served.client().socket() as page:
         ask(page, **go_on(number=0))
@@ -133,7 +133,7 @@ def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(served: Open
         assert served["a"].resource.moving
 
 
-def test_what_cannot_be_read_is_answered_and_ends_nothing(served: Opened) -> None:
+def test_an_unreadable_message_is_answered_and_ends_nothing(served: Opened) -> None:
     with served.client().socket() as page:
         for nonsense in ("[", '{"do": "dance", "id": 1}', '{"do": "call", "id": 1}', '{"do":"estop","id":1,"x":2}'):
             page.send(nonsense)
@@ -231,7 +231,7 @@ def test_a_call_is_cancelled_by_its_id(served: Opened) -> None:
         assert ask(page, do="cancel", id=3, which="nothing")["result"] == {"cancelled": False}
 
 
-def test_a_lock_is_the_pages_and_falls_with_it(served: Opened) -> None:
+def test_a_lock_belongs_to_its_page_and_ends_with_it(served: Opened) -> None:
     bert = served.client("bert")
     with served.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot", purpose="walk")["result"]
@@ -333,7 +333,7 @@ def test_a_page_of_another_site_is_not_let_in(served: Opened) -> None:
     assert b"WrongOrigin" in why.value.response.body
 
 
-def test_a_token_that_is_taken_back_ends_what_it_let_in(served: Opened) -> None:
+def test_revoking_a_token_ends_its_connections(served: Opened) -> None:
     with served.client().socket() as page:
         ask(page, **go_on())
         served.tokens.write_text("[tokens]\n")

@@ -143,7 +143,7 @@ def test_what_the_service_may_not_find_is_warned_of(file: Path, root: Path, tmp_
     assert f"warning file {file} lies in /" in reported
 
 
-def test_what_lies_where_it_lasts_is_not_warned_of(root: Path, tmp_path: Path) -> None:
+def test_files_in_permanent_places_cause_no_warning(root: Path, tmp_path: Path) -> None:
     there = root / "etc" / "trade" / "gateway.toml"
     there.parent.mkdir(parents=True)
     there.write_text(FILE)
@@ -217,7 +217,7 @@ def test_a_port_that_stays_where_it_is_is_allowed_by_its_name(tmp_path: Path) ->
     assert needs_of([load(legs)]) == Needs(serial=True, devices=("char-ttyUSB", "char-ttyACM"))
 
 
-def test_of_what_the_unit_hides_it_shows_what_is_needed_and_cannot_be_written() -> None:
+def test_the_unit_exposes_needed_paths_in_hidden_folders_read_only() -> None:
     named = ["/home/anna/trade", "/home/anna/trade/lib", "/opt/trade", "/home/anna/tradex", "/home/a $5"]
     text = a_unit(folders=map(Path, named))
     assert said_of(text, "ProtectHome") == ["tmpfs"]

@@ -47,7 +47,7 @@ def test_it_is_asked_for_again_in_time_for_several_answers_to_be_lost() -> None:
     assert asked >= 3
 
 
-def test_what_it_is_given_by_an_old_answer_is_neither_a_longer_lease_nor_another_state() -> None:
+def test_an_old_answer_gives_neither_a_longer_lease_nor_another_state() -> None:
     holder = Holder(0.0, "base")
     holder.answered(20.0, "", Lease("a", LEASE_S, states=b"first"))
     holder.answered(10.0, "a", Lease("a", LEASE_S))
@@ -78,7 +78,7 @@ def test_a_refusal_says_why_and_ends_nothing() -> None:
     assert holder.held(2.0)
 
 
-def test_a_stand_in_serves_once_the_last_lease_is_certainly_over() -> None:
+def test_a_standby_serves_once_the_last_lease_is_certainly_over() -> None:
     arbiter = free(0.0)
     assert arbiter.due == waits_s(LEASE_S)
     granted(arbiter, 5.0)
@@ -89,7 +89,7 @@ def test_a_stand_in_serves_once_the_last_lease_is_certainly_over() -> None:
     assert not arbiter.asked(100.0, "", LEASE_S)
 
 
-def test_a_stand_in_grants_nothing_until_leases_of_an_earlier_boot_have_ended() -> None:
+def test_a_standby_grants_nothing_until_leases_of_an_earlier_boot_have_ended() -> None:
     arbiter = Arbiter("rover", "boot")
     assert not arbiter.asked(0.0, "", LEASE_S)
     assert not arbiter.looked(1e6)
@@ -109,7 +109,7 @@ def test_a_child_handed_back_returns_here_if_no_other_gateway_takes_it() -> None
     assert arbiter.asked(54.0, "", LEASE_S)
 
 
-def test_who_has_a_turn_keeps_it_and_who_names_another_one_has_a_new_one() -> None:
+def test_a_gateway_keeps_its_turn_and_gets_a_new_one_when_it_names_another() -> None:
     arbiter = free(0.0)
     first = granted(arbiter, 1.0).turn
     assert granted(arbiter, 2.0, first).turn == first

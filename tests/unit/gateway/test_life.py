@@ -23,7 +23,7 @@ def up(**terms: Any) -> Life:
     return made
 
 
-def test_one_that_is_up_is_asked_again_and_again_and_stays_up() -> None:
+def test_a_child_that_answers_its_health_checks_stays_up() -> None:
     child, asked = up(), []
     while len(asked) < 5:
         now = child.deadline
@@ -35,7 +35,7 @@ def test_one_that_is_up_is_asked_again_and_again_and_stays_up() -> None:
     assert child.state is State.UP
 
 
-def test_those_of_the_same_terms_are_asked_at_the_same_moments() -> None:
+def test_children_with_the_same_settings_are_asked_at_the_same_moments() -> None:
     early, late = life(), life()
     for child, now in ((early, 10.1), (late, 10.8)):
         child.start(0.0)
@@ -48,7 +48,7 @@ def test_those_of_the_same_terms_are_asked_at_the_same_moments() -> None:
     assert early.deadline == late.deadline == 12.0
 
 
-def test_one_that_misses_a_question_is_asked_again_at_once_and_misses_all_in_the_time_given() -> None:
+def test_a_child_that_misses_a_health_check_is_asked_again_at_once_until_it_has_missed_all() -> None:
     child, asked = up(), []
     for _ in range(child.terms.misses):
         asked.append(child.deadline)
@@ -58,7 +58,7 @@ def test_one_that_misses_a_question_is_asked_again_at_once_and_misses_all_in_the
     assert child.state is State.STOPPING  # at 15 s: four after it was asked first
 
 
-def test_one_that_misses_a_question_is_silent_and_up_again_with_the_next_answer() -> None:
+def test_a_child_that_misses_a_health_check_is_silent_and_up_again_with_the_next_answer() -> None:
     child = up()
     for _ in range(10):
         child.due(now := child.deadline)
@@ -85,7 +85,7 @@ def test_a_child_that_never_answers_is_asked_to_end_then_killed_and_restarted() 
     assert child.restarts == 1
 
 
-def test_a_supervisor_that_slept_counts_no_question_that_it_did_not_ask() -> None:
+def test_a_supervisor_that_was_suspended_counts_no_health_check_that_it_did_not_make() -> None:
     child = up()
     assert child.due(100_000.0) is Transition.ASK
     child.missed(100_000.0)
@@ -125,7 +125,7 @@ def test_ends_beyond_the_window_are_forgotten_and_the_wait_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("how", ["given up", "waiting", "stopped"])
-def test_who_asks_by_hand_has_it_started_at_once_with_a_clean_slate(how: str) -> None:
+def test_a_start_by_hand_is_immediate_and_resets_the_counters(how: str) -> None:
     child = life(restarts=0 if how == "given up" else 1, restart="never" if how == "stopped" else "always")
     child.start(0.0)
     child.ended(1.0, "signal 9")
@@ -155,7 +155,7 @@ def test_a_save_that_does_not_end_delays_no_shutdown() -> None:
     assert child.due(child.deadline) is Transition.KILL
 
 
-def test_one_that_is_stopped_stays_stopped_wherever_it_was() -> None:
+def test_a_stopped_child_stays_stopped_whatever_its_state_was() -> None:
     waiting = life()
     waiting.start(0.0)
     waiting.ended(1.0, "signal 9")
@@ -170,7 +170,7 @@ def test_one_that_is_stopped_stays_stopped_wherever_it_was() -> None:
     assert starting.state is State.STOPPED
 
 
-def test_who_asks_last_says_what_becomes_of_one_that_is_ending() -> None:
+def test_the_last_request_decides_what_becomes_of_a_child_that_is_ending() -> None:
     child = up()
     child.start(20.0)
     assert child.stop(21.0, "not wanted after all") is None
@@ -179,7 +179,7 @@ def test_who_asks_last_says_what_becomes_of_one_that_is_ending() -> None:
     assert child.state is State.STOPPED
 
 
-def test_one_that_is_not_up_in_time_is_ended_and_tried_again() -> None:
+def test_a_child_that_is_not_up_in_time_is_ended_and_started_again() -> None:
     child = life()
     child.start(0.0)
     assert child.due(child.deadline) is Transition.LEAVE
@@ -187,7 +187,7 @@ def test_one_that_is_not_up_in_time_is_ended_and_tried_again() -> None:
     assert (child.state, child.why) == (State.WAITING, "it was not up within 60 s; it ended (exit code 0)")
 
 
-def test_one_that_takes_too_much_memory_is_saved_ended_and_tried_again() -> None:
+def test_a_child_that_takes_too_much_memory_is_saved_ended_and_started_again() -> None:
     child = up()
     assert child.fail(20.0, "it took 600 MB of memory") is Transition.SAVE
     child.saved(20.0)

@@ -37,7 +37,7 @@ def _runtime() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _threads_of_the_runtime_are_not_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def _ignore_threads_of_the_runtime(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log record that asks for its thread's name would have Python keep one of the runtime's as its own."""
     monkeypatch.setattr(logging, "logThreads", False)
 
@@ -104,7 +104,7 @@ def test_nothing_comes_in_from_a_viewer(live: Live) -> None:
             assert "does not support" in said["message"]
 
 
-def test_who_speaks_another_protocol_is_turned_away_and_that_is_said(live: Live) -> None:
+def test_a_viewer_with_another_protocol_is_rejected_and_reported(live: Live) -> None:
     with pytest.raises(InvalidStatus):
         connect(live.url, subprotocols=[Subprotocol("foxglove.websocket.v1")]).__enter__()
     said: list[str] = []
@@ -169,7 +169,7 @@ def test_a_viewer_that_does_not_read_misses_messages_and_delays_no_other(live: L
     assert any("too slow and misses messages" in line for line in live.notices())
 
 
-def test_where_something_listens_already_is_said(live: Live) -> None:
+def test_a_port_that_is_in_use_is_reported(live: Live) -> None:
     port = int(live.url.rpartition(":")[2])
     with pytest.raises(ConfigurationError, match=f"127.0.0.1:{port}: cannot be used: .*in use"):
         Live("127.0.0.1", port, "other")

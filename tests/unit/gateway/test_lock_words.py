@@ -47,7 +47,7 @@ def test_names_are_alternatives_within_the_group() -> None:
         _wanted(None, [])
 
 
-def test_what_helps_is_said_in_words_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_remedies_are_given_as_commands(capsys: pytest.CaptureFixture[str]) -> None:
     say_error(LockedByOther(resources=("rosie.pan",), owner="anna/desk"))
     say_error(LockLost(resources=("rosie.pan",), reason="its lease ended"))
     say_error(ServiceGone(service="rosie.pan.move_to"))
@@ -58,7 +58,7 @@ def test_what_helps_is_said_in_words_of_the_command_line(capsys: pytest.CaptureF
     assert "trade.find(" not in reported
 
 
-def test_what_a_device_needs_is_said_as_it_is_typed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_remedy_of_a_device_is_given_as_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     remedy = "remove the cause, then call power_on() and release_brakes()"
     say_error(DeviceFault(device="rosie.arm", bus="/dev/x", fault="overload", remedy=remedy))
     say_error(Stopped(resource="rosie.pan", by="anna/desk", reason="stop"))
@@ -71,7 +71,7 @@ def test_what_a_device_needs_is_said_as_it_is_typed(capsys: pytest.CaptureFixtur
     assert "--deadline SECONDS gives it more" in ended
 
 
-def test_every_remedy_that_is_put_in_other_words_is_one_of_an_error() -> None:
+def test_every_translated_remedy_belongs_to_an_error() -> None:
     errors = (
         LockedByOther(resources=("a",), owner="b"),
         LockLost(resources=("a",), reason="b"),

@@ -90,7 +90,7 @@ def test_a_joint_that_was_not_measured_while_the_others_moved_stays_where_it_was
     assert part.duration_s == pytest.approx(1.5, abs=0.03)
 
 
-def test_what_never_moved_stays_as_it_is() -> None:
+def test_a_joint_that_never_moved_stays_unchanged() -> None:
     motion = motion_of("rosie.head", states(scale=0.01))
     assert moving(motion) == motion
 
@@ -127,7 +127,7 @@ def test_a_measurement_that_was_read_twice_counts_once() -> None:
     assert all(after > before for before, after in pairwise(motion.tracks[0].times_s))
 
 
-def test_a_gap_in_which_a_joint_moved_is_refused_and_one_in_which_it_stood_is_none() -> None:
+def test_a_gap_in_which_a_joint_moved_is_refused_and_one_in_which_it_rested_is_no_gap() -> None:
     whole = states(seconds=4)
     moved = [state for number, state in enumerate(whole) if not 20 < number < 60]
     with pytest.raises(ConfigurationError, match=r"rosie.neck.pan was not measured from 0.4 to 1.2 s, while it moved"):
@@ -151,7 +151,7 @@ def test_motions_are_compared_at_the_delay_at_which_they_fit(late_s: float) -> N
     assert found.greatest_rad[0] < 0.02
 
 
-def test_a_motion_that_was_another_one_shows() -> None:
+def test_a_different_motion_is_detected() -> None:
     motion = motion_of("rosie.head", states())
     found, _ = deviation(motion, 1.0, motion_of("rosie.head", states(scale=0.9, seconds=4)))
     assert found.greatest_rad[0] == pytest.approx(0.12, abs=0.01)

@@ -139,13 +139,13 @@ def test_what_a_name_was_given_for_outlives_its_files(authority: Authority) -> N
     assert (listed.purpose, listed.until) == ("gateway", None)
 
 
-def test_what_others_leave_in_the_folder_is_no_name(authority: Authority) -> None:
+def test_files_of_other_programs_in_the_folder_are_no_names(authority: Authority) -> None:
     authority.issue("door")
     (authority.folder / "names" / ".DS_Store").write_text("")
     assert [one.name for one in authority.issued()] == ["door"]
 
 
-def test_a_damaged_mark_is_taken_for_a_gateways(authority: Authority) -> None:
+def test_a_name_with_a_damaged_purpose_counts_as_a_gateway(authority: Authority) -> None:
     authority.issue("door")
     (authority.folder / "names" / "door").write_text("contai")
     with pytest.raises(NameTaken):
@@ -172,9 +172,7 @@ def test_the_list_of_revoked_names_is_one_that_programs_read(authority: Authorit
     assert 'revoked = ["arm", "leg"]' in (authority.folder / "revoked.toml").read_text().splitlines()
 
 
-def test_of_two_that_revoke_at_the_same_time_neither_is_forgotten(
-    authority: Authority, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_revocations_at_the_same_time_are_both_kept(authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("arm", "leg"):
         authority.issue(name)
     replace, others = _authority.replace, iter([lambda: Authority(authority.folder).revoke("leg")])
@@ -190,7 +188,7 @@ def test_of_two_that_revoke_at_the_same_time_neither_is_forgotten(
     assert authority.revoked() == {"arm", "leg"}
 
 
-def test_who_was_revoked_is_not_issued_again_though_the_list_be_lost(authority: Authority) -> None:
+def test_a_revoked_name_is_not_issued_again_even_if_the_list_is_lost(authority: Authority) -> None:
     for name in ("arm", "leg"):
         authority.issue(name)
     authority.revoke("arm")
@@ -223,14 +221,14 @@ def test_a_damaged_list_forgets_no_revoked_identity(authority: Authority, text: 
     assert (authority.folder / "revoked.toml").read_text() == text
 
 
-def test_revoking_who_was_never_issued_says_who_was(authority: Authority) -> None:
+def test_revoking_a_name_that_was_never_issued_lists_the_issued_names(authority: Authority) -> None:
     authority.issue("arm")
     with pytest.raises(ConfigurationError, match="amr: was never issued; there is arm"):
         authority.revoke("amr")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", ".arm", "a/b", "a b", "*", "$x", "a" * 65, "../arm"])
-def test_what_is_no_identity_is_not_issued(authority: Authority, name: str) -> None:
+def test_an_invalid_identity_is_not_issued(authority: Authority, name: str) -> None:
     with pytest.raises(ConfigurationError, match="is no identity"):
         authority.issue(name)
     assert authority.issued() == []
@@ -246,7 +244,7 @@ def test_what_is_no_identity_is_not_issued(authority: Authority, name: str) -> N
         ({"hosts": [""]}, "is no name of a host"),
     ],
 )
-def test_what_is_no_host_is_refused_and_gives_no_name(authority: Authority, wrong: dict[str, Any], said: str) -> None:
+def test_an_invalid_host_is_refused_and_uses_up_no_name(authority: Authority, wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         authority.issue("arm", **wrong)
     assert authority.issued() == []
@@ -315,7 +313,7 @@ def test_a_host_without_address_is_advised_to_dial_and_not_to_listen(folder: Pat
 
 
 @pytest.mark.parametrize("purpose", ["container", "gateway"])
-def test_the_commands_that_it_advises_are_there(folder: Path, purpose: str) -> None:
+def test_the_commands_that_the_output_advises_exist(folder: Path, purpose: str) -> None:
     said("init", folder)
     issued = said("issue", "ada", "--for", purpose, "--address", "10.0.0.5", "--ca", folder).stdout
     advised = re.findall(r"(?:^ *|or )trade ([a-z]+)", issued, re.MULTILINE)
@@ -342,7 +340,7 @@ def test_of_the_next_certificate_only_the_files_to_copy_are_listed(folder: Path)
     assert "key.pem" in said("issue", "arm", "--force", "--ca", folder).stdout  # another key has to be taken along
 
 
-def test_the_commands_list_who_there_is(folder: Path) -> None:
+def test_the_commands_list_the_issued_names(folder: Path) -> None:
     said("init", folder)
     assert "no identity was issued yet" in said("list", "--ca", folder).stdout
     said("issue", "door", "--for", "gateway", "--ca", folder)

@@ -41,7 +41,7 @@ def test_a_call_both_sides_noted_counts_once_as_it_was_served() -> None:
         assert (move.calls, move.max_s) == (2, 0.25)
 
 
-def test_of_one_call_every_rank_is_that_call() -> None:
+def test_with_one_call_every_percentile_is_that_call() -> None:
     [only] = statistics([span(1, "move", took_s=0.125)])
     assert (only.p50_s, only.p99_s, only.max_s) == (0.125, 0.125, 0.125)
 
@@ -62,19 +62,19 @@ def test_callers_do_not_mix_and_what_a_call_makes_is_a_sequence_of_its_own() -> 
     assert found == [["lock"], ["lock", "move"], ["look", "look"], ["sing"]]
 
 
-def test_what_comes_after_what_is_counted_and_kept(tmp_path: Path) -> None:
+def test_the_order_of_calls_is_counted_and_kept(tmp_path: Path) -> None:
     model = learn(played("a", "b", "a", "b", "a", "c"))
     assert model.after == {"a": {"b": 2, "c": 1}, "b": {"a": 2}}
     write(tmp_path / "usual.json", model)
     assert read(tmp_path / "usual.json") == model
 
 
-def test_as_usual_nothing_deviates() -> None:
+def test_usual_behaviour_shows_no_deviation() -> None:
     spans = played(*["a", "b"] * 50)
     assert deviations(spans, learn(spans)) == []
 
 
-def test_what_never_came_before_is_new_with_its_call() -> None:
+def test_a_transition_never_seen_before_is_new_with_its_call() -> None:
     usual = learn(played(*["a", "b"] * 5))
     [to, back] = deviations(played("a", "b", "x", "a"), usual)
     assert (to.kind, to.before, to.after, to.call_id, to.usual) == ("new", "b", "x", 3, 0.0)
@@ -89,12 +89,12 @@ def test_a_sequence_that_became_rare_is_reported_with_what_replaced_it() -> None
     assert gone.call_id == 80
 
 
-def test_what_has_become_a_little_rarer_is_not() -> None:
+def test_a_call_that_has_become_a_little_rarer_is_not_reported() -> None:
     usual = learn(played(*["a", "b", "a", "c"] * 20))
     assert deviations(played(*["a", "b", "a", "b", "a", "c"] * 15), usual) == []
 
 
-def test_what_was_seen_seldom_says_nothing_when_it_is_missing() -> None:
+def test_a_rarely_seen_call_that_is_missing_is_not_reported() -> None:
     usual = learn(played(*["a", "b", "a", "c"] * 20))
     assert deviations(played(*["a", "b"] * 10), usual) == []
     assert deviations(played(*["a", "b"] * 40), learn(played("a", "c", "a", "b", "a"))) == []

@@ -276,7 +276,9 @@ def test_the_fault_of_a_joint_is_reported_once_and_so_is_its_end(record: Record,
     ]
 
 
-def test_what_leaves_and_comes_back_is_recorded_on(record: Record, robot: Container, head: JointGroup) -> None:
+def test_a_provider_that_leaves_and_comes_back_is_recorded_again(
+    record: Record, robot: Container, head: JointGroup
+) -> None:
     record(lambda sink: bool(sink.by_topic["/rosie.head/joints"]))
     robot.deregister(head)
     seen = record(lambda sink: any(fault["kind"] == "gone" for fault in sink.by_topic["/faults"]))

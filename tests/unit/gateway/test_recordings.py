@@ -186,7 +186,7 @@ def test_on_a_full_disk_the_file_ends_with_its_last_whole_chunk(tmp_path: Path) 
         assert len(list(NonSeekingReader(stream, validate_crcs=True).iter_messages())) == flushed
 
 
-def test_the_ring_lets_go_of_what_is_too_old() -> None:
+def test_the_ring_drops_what_is_too_old() -> None:
     ring = Ring(3, 1_000_000)
     for second in range(10):
         ring.write(joints(second))
@@ -241,7 +241,7 @@ def test_a_fault_saves_what_came_before_it_and_says_why(kept: Kept) -> None:
         assert next(iter(make_reader(stream).iter_metadata())).metadata == {"fault": why}
 
 
-def test_what_goes_wrong_right_after_is_the_same_event(kept: Kept) -> None:
+def test_a_further_fault_right_after_is_the_same_event(kept: Kept) -> None:
     kept.sink.write(fault(1))
     kept.now += HOLD_OFF_S / 2
     kept.sink.write(fault(2, "stopped", kind="e-stop"))
@@ -252,7 +252,7 @@ def test_what_goes_wrong_right_after_is_the_same_event(kept: Kept) -> None:
 
 
 @pytest.mark.parametrize("message", [fault(1, ""), fault(1, new=False), fault(1, kind="gone"), joints(1)])
-def test_nothing_else_saves_anything(kept: Kept, message: Message) -> None:
+def test_only_a_fault_saves_a_recording(kept: Kept, message: Message) -> None:
     kept.sink.write(message)
     assert kept.saved == []
 

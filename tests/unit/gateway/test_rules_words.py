@@ -97,7 +97,7 @@ def trade(*words: str) -> Any:
     return CliRunner().invoke(app, list(words))
 
 
-def test_rules_run_tell_of_firings_are_listed_and_leave(
+def test_rules_run_report_their_firings_are_listed_and_leave(
     run: Callable[..., Any], desk: Desk, file: Path, start_container: StartContainer
 ) -> None:
     audit = file.parent / "audit.jsonl"
@@ -155,7 +155,7 @@ def test_a_wrong_file_is_said_before_anything_is_done(file: Path, system: str) -
         assert "rule.x: when is missing" in str(said.exception)
 
 
-def test_nothing_standing_is_said(desk: Desk) -> None:
+def test_an_empty_list_of_rules_is_reported(desk: Desk) -> None:
     assert "no rules run" in trade("rules", "list").stdout
     assert json.loads(trade("rules", "list", "--json").stdout) == []
 

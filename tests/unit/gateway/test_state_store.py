@@ -89,7 +89,7 @@ def test_the_last_save_is_available_to_the_next_process(opened: Callable[[], Sta
     assert reported == []
 
 
-def test_a_table_that_a_later_version_gave_a_column_more_is_gone_on_with(
+def test_a_table_with_an_extra_column_of_a_later_version_is_still_used(
     opened: Callable[[], StateStore], path: Path, reported: list[str]
 ) -> None:
     assert opened().save("a", {"lamp": 1})

@@ -106,7 +106,7 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         ('[system]\nname = "ho me"\n[container.a]\nproviders = []\n', 1, "is no name for a system"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_line(folder: Path, text: str, line: int, said: str) -> None:
+def test_each_mistake_is_named_with_its_line(folder: Path, text: str, line: int, said: str) -> None:
     path = write(folder, text)
     with pytest.raises(ConfigurationError) as wrong:
         read_system_file(path)

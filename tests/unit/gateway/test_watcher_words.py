@@ -71,7 +71,7 @@ def test_hooks_are_listed_and_detached(base: Container) -> None:
     [(("notifications", "--cancel", "x.1"), NoSuchNotification), (("hooks", "--detach", "x.h1"), NoSuchHook)],
     ids=["notification", "hook"],
 )
-def test_what_does_not_stand_is_said(base: Container, words: tuple[str, ...], error: type[Exception]) -> None:
+def test_an_unknown_id_is_reported(base: Container, words: tuple[str, ...], error: type[Exception]) -> None:
     said = trade(*words)
     assert isinstance(said.exception, error)
     assert f"`trade {words[0]}` lists them" in str(said.exception)

@@ -37,7 +37,7 @@ def test_fast_sync_read(client: Any, bus: DynamixelBus) -> None:
     assert [e.name for e in bus.log.entries if e.kind == "instruction"] == ["fast_sync_read"]
 
 
-def test_what_looks_like_a_header_passes_in_both_directions(client: Any) -> None:
+def test_data_that_looks_like_a_header_passes_in_both_directions(client: Any) -> None:
     """FF FF FD 00 as data; stuffed by both ends."""
     for k, byte in enumerate((0xFF, 0xFF, 0xFD, 0x00)):
         client.write_raw_data(1, 224 + k, [byte])

@@ -84,7 +84,7 @@ def test_torque_is_on_while_operation_is_enabled(bench: Bench) -> None:
     assert [name for name in bench.names() if name.startswith("torque")] == ["torque_on", "torque_off"]
 
 
-def test_the_mode_is_shown_when_it_has_changed_and_not_before(bench: Bench) -> None:
+def test_the_displayed_mode_changes_only_once_the_mode_has_changed(bench: Bench) -> None:
     bench.put(0x6060, Mode.PROFILE_VELOCITY, 1)
     assert bench.get(0x6061) == 0
     bench.run(0.01)

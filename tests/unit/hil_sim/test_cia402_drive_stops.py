@@ -211,7 +211,7 @@ def test_a_frozen_sensor_shows_the_same_while_the_shaft_turns() -> None:
     assert bench.position > shown[0]
 
 
-def test_power_lost_is_everything_forgotten_but_the_shaft_stays() -> None:
+def test_losing_power_clears_all_registers_and_keeps_the_shaft_position() -> None:
     bench = enabled(Mode.PROFILE_POSITION)
     move(bench, 3000)
     bench.run(2.0)
@@ -239,7 +239,7 @@ def test_a_drive_that_goes_bus_off_stops() -> None:
     assert bench.drive.state(bench.t).velocity_rad_s == 0
 
 
-def test_a_shaft_turned_by_hand_goes_back_if_it_is_driven_and_not_else(bench: Bench) -> None:
+def test_a_shaft_turned_by_hand_goes_back_only_if_it_is_driven(bench: Bench) -> None:
     bench.drive.do(Place(counts=500), bench.t)
     bench.run(1.0)
     assert bench.position == 500

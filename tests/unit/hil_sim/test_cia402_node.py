@@ -31,7 +31,7 @@ def test_it_boots_once_and_is_then_pre_operational(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("command", "state"), [("01", "05"), ("02", "04"), ("80", "7f")])
-def test_heartbeats_tell_the_state_that_was_commanded(bench: Bench, command: str, state: str) -> None:
+def test_heartbeats_show_the_state_that_was_commanded(bench: Bench, command: str, state: str) -> None:
     bench.put(0x1017, 100, 2)
     for whom in ("06", "05", "00"):
         bench.hear(0, "0105")
@@ -187,7 +187,7 @@ def test_an_acyclic_synchronous_pdo_comes_at_sync_after_a_change(running: Bench)
     assert running.frames(0x185) == ["7002", "3102"]
 
 
-def test_an_event_driven_pdo_comes_on_change_and_not_else(running: Bench) -> None:
+def test_an_event_driven_pdo_is_sent_only_on_change(running: Bench) -> None:
     running.run(1.0)
     assert running.frames() == []
     running.control(0x06)

@@ -186,7 +186,7 @@ def test_an_overload_ends_with_torque_off_or_a_goal_away_from_it(rig: Rig, clear
     assert rig.servo.status == 0
 
 
-def test_too_hot_it_lets_go_and_cooled_down_it_goes_back_by_itself(rig: Rig) -> None:
+def test_too_hot_it_releases_torque_and_cooled_down_it_goes_back_by_itself(rig: Rig) -> None:
     rig.write(TORQUE, 1)
     rig.servo.set_supply(rig.clock(), temperature_c=80)
     assert (rig.servo.status, rig.read(65), rig.read(TORQUE)) == (Status.TEMPERATURE, Status.TEMPERATURE, 1)

@@ -170,7 +170,7 @@ def test_a_late_answer_lets_others_pass(port: serial.Serial, parrot: Parrot) -> 
     assert port.read(2) == b"ba"
 
 
-def test_pacing_charges_ten_bits_a_byte_both_ways_and_the_return_delay(
+def test_pacing_takes_ten_bits_a_byte_in_both_directions_and_the_return_delay(
     tmp_path: Path, parrot: Parrot, log: ByteLog
 ) -> None:
     parrot.line = SerialLine(tmp_path / "slow", parrot, log=log, paced=True)
@@ -194,7 +194,7 @@ def test_closing_twice_is_once_and_a_closed_line_says_so(tmp_path: Path, parrot:
         line.open()
 
 
-def test_a_line_never_opened_closes_without_ado(tmp_path: Path, parrot: Parrot) -> None:
+def test_a_line_that_was_never_opened_closes_without_an_error(tmp_path: Path, parrot: Parrot) -> None:
     SerialLine(tmp_path / "tty", parrot).close()
 
 

@@ -91,13 +91,13 @@ def test_a_joined_answer_ends_each_block_with_the_crc_of_all_before_it() -> None
 
 
 @given(st.binary())
-def test_what_is_stuffed_is_unstuffed(body: bytes) -> None:
+def test_stuffing_and_unstuffing_are_inverse(body: bytes) -> None:
     assert unstuff(stuff(body)) == body
     assert b"\xff\xff\xfd\x00" not in stuff(body)
 
 
 @given(PACKETS)
-def test_what_is_encoded_is_read_back(packet: Packet) -> None:
+def test_encoding_and_decoding_are_inverse(packet: Packet) -> None:
     assert PacketReader().feed(encode(packet.device_id, packet.instruction, packet.params)) == [packet]
 
 

@@ -9,7 +9,7 @@ from trade_hil_sim import DynamixelBus, SimulationError
 from trade_hil_sim.robot._robot import buses_of, find_simulator, read_robot
 
 
-def test_each_joint_is_a_servo_standing_at_the_joints_zero(robot_file: Path, tmp_path: Path) -> None:
+def test_each_joint_is_a_servo_at_the_joints_zero(robot_file: Path, tmp_path: Path) -> None:
     neck, arm = buses_of(read_robot(robot_file), tmp_path)
     pan, tilt = neck.state().devices
     [elbow] = arm.state().devices

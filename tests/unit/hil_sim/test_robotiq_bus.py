@@ -74,7 +74,7 @@ def truth(line: RobotiqBus) -> sim.GripperTruth:
 # --- pymodbus
 
 
-def test_pymodbus_activates_grips_and_lets_go(line: RobotiqBus, pymodbus: ModbusSerialClient) -> None:
+def test_pymodbus_activates_grips_and_releases(line: RobotiqBus, pymodbus: ModbusSerialClient) -> None:
     line.do(sim.Put(width_m=0.04))
     pymodbus.write_registers(COMMAND, [0x0100, 0, 0], device_id=9)
     wait_until(lambda: pymodbus.read_holding_registers(STATUS, count=1, device_id=9).registers == [0x3100])

@@ -135,7 +135,7 @@ def test_an_object_that_goes_lets_the_fingers_close(hand: Hand) -> None:
     assert (hand.contact, hand.status[3]) == (3, 230)
 
 
-def test_without_go_the_fingers_stand(hand: Hand) -> None:
+def test_without_go_the_fingers_rest(hand: Hand) -> None:
     hand.tell(0x0900, 255, 0x00FF, s=0.5)
     hand.tell(0x0100, 255, 0x00FF)
     stood = hand.status[3]

@@ -113,7 +113,7 @@ def test_what_does_not_exist_and_what_another_has_are_refused(controller: UrBus)
         wait_until(lambda: third.ask("I", b"input_int_register_5") == b"\x01INT32", "the register is free again")
 
 
-def test_what_is_no_packet_ends_the_connection(controller: UrBus) -> None:
+def test_an_invalid_packet_ends_the_connection(controller: UrBus) -> None:
     with client(controller) as rtde:
         rtde.socket.sendall(b"\x00\x01V")
         with pytest.raises(ConnectionResetError):
@@ -130,7 +130,7 @@ def test_what_is_no_packet_ends_the_connection(controller: UrBus) -> None:
     ],
     ids=["a line", "a program", "an answer longer than a packet"],
 )
-def test_what_has_no_end_ends_the_connection_and_nothing_else(controller: UrBus, port: int, sent: bytes) -> None:
+def test_an_endless_packet_ends_the_connection_and_nothing_else(controller: UrBus, port: int, sent: bytes) -> None:
     with closing(socket.create_connection((controller.port, port), PATIENCE_S)) as one:
         with suppress(ConnectionError):
             one.sendall(sent)
@@ -309,7 +309,7 @@ def test_a_controller_of_the_older_series_is_slower_and_knows_less() -> None:
         assert "could not understand" in dashboard(controller, "is in remote control")[0]
 
 
-def test_what_an_arm_has_not_got_is_refused(controller: UrBus) -> None:
+def test_a_fault_that_an_arm_does_not_have_is_refused(controller: UrBus) -> None:
     with pytest.raises(SimulationError, match="no device"):
         controller.do(Mute(ids=(3,)))
     with pytest.raises(SimulationError, match="safety mode"):

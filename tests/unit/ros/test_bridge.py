@@ -17,7 +17,7 @@ LOCKS = '[[to_ros.lock]]\ngroup = "rosie.head"\n'
 NO_GRACE = "[ros]\nversion = 2\ngrace_s = 0\n"
 
 
-def test_all_services_of_a_group_that_a_type_fits_are_there(stand: Stand) -> None:
+def test_all_services_of_a_group_that_a_type_fits_are_offered(stand: Stand) -> None:
     stand.up(TRIGGERS + SWITCHES)
     node = stand.node()
     assert set(stand.ros.services) == {
@@ -147,7 +147,7 @@ def test_an_unidentified_node_cannot_take_a_lock(stand: Stand) -> None:
     assert stand.trigger(stand.node(), "/rosie/head/state")["success"]
 
 
-def test_S03_a_node_that_ros_does_not_list_counts_as_gone_soon(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_S03_a_node_that_ros_does_not_list_soon_counts_as_gone(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trade_gateway.ros._nodes._UNSEEN_S", 0.2)
     stand.up(LOCKS)
     ghost = stand.ros.graph("/ghost", seen=False)
@@ -156,7 +156,7 @@ def test_S03_a_node_that_ros_does_not_list_counts_as_gone_soon(stand: Stand, mon
     assert stand.set_bool(stand.node(), "/rosie/head/lock", True)["success"]
 
 
-def test_nodes_that_ros_does_not_tell_apart_are_one_client(stand: Stand) -> None:
+def test_nodes_that_ros_does_not_distinguish_are_one_client(stand: Stand) -> None:
     bridge = stand.up(TRIGGERS + SWITCHES)
     stand.ros.anonymous = True
     assert stand.set_bool(stand.node("/one"), "/rosie/head/power", True)["success"]
@@ -256,7 +256,7 @@ def test_a_short_loss_within_the_grace_ends_nothing(stand: Stand) -> None:
     assert len(stand.container.locks()) == 1
 
 
-def test_of_two_that_want_one_name_the_first_has_it_and_that_is_said(stand: Stand) -> None:
+def test_of_two_mappings_with_one_name_the_first_gets_it_and_a_warning_says_so(stand: Stand) -> None:
     stand.up(TRIGGERS + TRIGGERS.replace('"rosie"', '"rosie.head"'))
     wait_until(lambda: any("rosie.head.stop cannot be mapped to /rosie/head/stop" in line for line in stand.said))
     assert stand.trigger(stand.node(), "/rosie/head/stop")["success"]

@@ -72,7 +72,7 @@ def test_a_service_of_ros_that_is_not_there_says_so(stand: Stand) -> None:
         found(stand, "lab", "door")(True)
 
 
-def test_S03_what_a_caller_moves_in_ros_is_stopped_when_he_is_gone(stand: Stand) -> None:
+def test_S03_what_a_caller_moves_in_ros_is_stopped_when_the_caller_is_gone(stand: Stand) -> None:
     lab = Lab(stand)
     lab.waits = True
     stand.up(DOOR)

@@ -62,7 +62,7 @@ def test_a_topic_is_no_way_to_a_stop(stand: Stand) -> None:
     wait_until(lambda: any("Use [[to_ros.service]]" in line for line in stand.said))
 
 
-def test_S14_what_stops_is_owed_while_ros_is_lost_and_what_it_moves_counts_as_moving(stand: Stand) -> None:
+def test_S14_while_ros_is_lost_stops_stay_pending_and_its_devices_count_as_moving(stand: Stand) -> None:
     bridge = stand.up(DRIVE)
     heard: list[Any] = []
     stand.node("/base").subscribe("/cmd_vel", TWIST, lambda message, _who: heard.append(message["linear"]["x"]))

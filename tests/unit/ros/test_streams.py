@@ -77,7 +77,7 @@ def test_joint_states_have_names_values_and_the_time_of_their_measurement(stand:
     assert message["effort"] == []
 
 
-def test_joint_states_are_not_published_while_they_are_silent_or_not_well(stand: Stand) -> None:
+def test_joint_states_are_not_published_while_they_are_silent_or_unhealthy(stand: Stand) -> None:
     arm = FakeJoints("rosie.arm.a")
     stand.robot.container.register(arm, "rosie.arm")
     stand.memory.settle()

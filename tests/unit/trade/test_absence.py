@@ -21,7 +21,9 @@ def absences(reported: "queue.SimpleQueue[str]") -> Iterator[GracePeriods]:
     made.close()
 
 
-def test_S12_who_does_not_come_back_is_gone_once(absences: GracePeriods, reported: "queue.SimpleQueue[str]") -> None:
+def test_S12_a_container_that_does_not_come_back_is_reported_gone_once(
+    absences: GracePeriods, reported: "queue.SimpleQueue[str]"
+) -> None:
     absences.begin("me/arm/1")
     absences.begin("me/arm/1")
     absences.begin("me/leg/1")
@@ -30,7 +32,7 @@ def test_S12_who_does_not_come_back_is_gone_once(absences: GracePeriods, reporte
     assert reported.empty()
 
 
-def test_S12_who_is_back_in_time_was_never_gone(reported: "queue.SimpleQueue[str]") -> None:
+def test_S12_a_container_that_is_back_in_time_is_never_reported_gone(reported: "queue.SimpleQueue[str]") -> None:
     patient = GracePeriods(reported.put, lambda: True, grace_s=3600.0)
     patient.begin("me/arm/1")
     assert patient.end("me/arm/1")
@@ -39,7 +41,9 @@ def test_S12_who_is_back_in_time_was_never_gone(reported: "queue.SimpleQueue[str
     assert reported.empty()
 
 
-def test_who_went_without_any_bridge_is_gone_as_soon_as_that_is_sure(reported: "queue.SimpleQueue[str]") -> None:
+def test_a_container_lost_without_any_bridge_is_gone_as_soon_as_that_is_certain(
+    reported: "queue.SimpleQueue[str]",
+) -> None:
     absences = GracePeriods(reported.put, lambda: False, grace_s=3600.0)
     absences.begin("me/arm/1")
     assert reported.get(timeout=60) == "me/arm/1"

@@ -110,7 +110,7 @@ def test_without_a_policy_a_service_asks_for_no_role(memory: MemorySystem) -> No
     assert (move.verb, move.roles) == ("call", ())
 
 
-def test_S07_a_stop_needs_no_role_but_one_must_not_be_revoked(member: Member, neck: Neck) -> None:
+def test_S07_a_stop_needs_no_role_but_an_identity_that_is_not_revoked(member: Member, neck: Neck) -> None:
     find(member("stranger"), "stop")()
     assert neck.stops == 1
     with pytest.raises(AccessDenied, match="thief is revoked"):
@@ -126,7 +126,7 @@ def test_a_denied_call_sends_nothing(member: Member, neck: Neck, monkeypatch: py
         move(0.1)
 
 
-def test_one_calls_ones_own_services_by_the_same_rules(member: Member, neck: Neck) -> None:
+def test_calls_to_own_services_follow_the_same_rules(member: Member, neck: Neck) -> None:
     drv = member("drv")
     with pytest.raises(AccessDenied, match=r"drv may not call rosie.neck.move"):
         find(drv, "move")(0.1)
@@ -168,7 +168,7 @@ def test_a_look_up_says_that_the_policy_hides_it(member: Member, neck: Neck, mon
         dash.find(where(group="cellar", name="light"), wait_s=0)
 
 
-def test_breaking_a_lock_resuming_and_clearing_are_for_who_administers(
+def test_breaking_a_lock_resuming_and_clearing_need_the_right_to_administer(
     member: Member, memory: MemorySystem, neck: Neck
 ) -> None:
     planner, dash, chief = member("planner"), member("dash"), member("chief")
@@ -188,7 +188,7 @@ def test_breaking_a_lock_resuming_and_clearing_are_for_who_administers(
     assert chief.estop_clear([report.id]).complete
 
 
-def test_the_system_is_changed_by_who_administers_it(member: Member, policy: Path) -> None:
+def test_changing_the_system_needs_the_right_to_administer(member: Member, policy: Path) -> None:
     planner, chief, drv = member("planner"), member("chief"), member("drv")
     load = where(name="load_policy", container=drv.name)
     with pytest.raises(AccessDenied, match=r"planner may not administer trade.load_policy"):
@@ -212,7 +212,7 @@ def careless(memory: MemorySystem, neck: Neck) -> Container:
     return container
 
 
-def test_a_provider_refuses_who_did_not_ask_the_policy(careless: Container, neck: Neck) -> None:
+def test_a_provider_refuses_a_caller_that_bypasses_the_policy(careless: Container, neck: Neck) -> None:
     with pytest.raises(AccessDenied) as denied:
         find(careless, "move")(0.1)
     assert (denied.value.who, denied.value.verb, denied.value.what) == ("dash", "call", "rosie.neck.move")
@@ -223,7 +223,9 @@ def test_a_provider_refuses_who_did_not_ask_the_policy(careless: Container, neck
     find(careless, "stop")()
 
 
-def test_a_provider_refuses_locks_and_switches_to_who_did_not_ask(careless: Container, policy: Path) -> None:
+def test_a_provider_refuses_locks_and_switches_to_a_caller_that_bypasses_the_policy(
+    careless: Container, policy: Path
+) -> None:
     with (
         pytest.raises(AccessDenied, match=r"dash may not lock rosie.neck.pan"),
         careless.lock(where(group="rosie.neck")),
@@ -236,7 +238,7 @@ def test_a_provider_refuses_locks_and_switches_to_who_did_not_ask(careless: Cont
             careless.call(where(name=name, container="of-drv"), argument)
 
 
-def test_a_lock_is_not_broken_by_who_did_not_ask(careless: Container, member: Member) -> None:
+def test_a_lock_is_not_broken_by_a_caller_that_bypasses_the_policy(careless: Container, member: Member) -> None:
     planner = member("planner")
     with planner.lock(where(group="rosie.neck")):
         with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.pan"):
@@ -244,7 +246,7 @@ def test_a_lock_is_not_broken_by_who_did_not_ask(careless: Container, member: Me
         assert find(planner, "move")(0.1) == 0.1
 
 
-def test_who_only_says_that_it_acts_for_the_owner_of_a_lock_resumes_nothing(
+def test_a_claim_to_act_for_the_owner_of_a_lock_resumes_nothing(
     careless: Container, member: Member, neck: Neck
 ) -> None:
     """Whom a call is made for is what its caller says; who makes it, the transport pins."""
@@ -270,7 +272,7 @@ def call_for(container: Container, session: str, handle: Handle, *args: object) 
         running.reset(token)
 
 
-def test_an_e_stop_is_not_cleared_by_who_may_not(careless: Container, member: Member, memory: MemorySystem) -> None:
+def test_an_e_stop_is_not_cleared_without_the_right(careless: Container, member: Member, memory: MemorySystem) -> None:
     report = careless.estop("smoke")
     memory.settle()
     assert not careless.estop_clear([report.id], limit_s=0.3).complete
@@ -391,7 +393,7 @@ def test_a_lock_that_may_no_longer_be_held_is_lost(member: Member, neck: Neck, p
             find(planner, "move")(0.1)
 
 
-def test_who_waits_for_a_lock_gets_none_that_it_may_no_longer_hold(
+def test_a_waiting_client_gets_no_lock_that_it_may_no_longer_hold(
     member: Member, memory: MemorySystem, neck: Neck, policy: Path, eventually: Callable[[Callable[[], bool]], bool]
 ) -> None:
     drv, chief = member("drv"), memory.container("unchecked", identity="chief")

@@ -188,12 +188,12 @@ PUTS: Final = {
 
 
 @pytest.mark.parametrize(("actor", "receiver", "key", "passes"), PUTS.values(), ids=list(PUTS))
-def test_what_passes_is_what_the_policy_allows(star: Star, actor: str, receiver: str, key: str, passes: bool) -> None:
+def test_the_rules_pass_what_the_policy_allows(star: Star, actor: str, receiver: str, key: str, passes: bool) -> None:
     fresh = key.replace("/e1", f"/e{next(star.numbers)}")  # what comes twice may still wait from the test before
     assert bool(star.put(actor, receiver, fresh)) is passes
 
 
-def test_a_sign_of_life_is_given_for_oneself_only(star: Star) -> None:
+def test_a_session_declares_only_its_own_liveliness(star: Star) -> None:
     signs: queue.SimpleQueue[str] = queue.SimpleQueue()
     reader, forger = star.sessions["planner"].liveliness(), star.sessions["mallory"].liveliness()
     watch = reader.declare_subscriber("alive/**", lambda sample: signs.put(str(sample.key_expr)), history=True)
@@ -249,7 +249,7 @@ def test_only_the_container_itself_answers_for_what_it_offers(star: Star) -> Non
         assert asked(star, "dash", drv) == entries[2:]  # nor may that one see the second
 
 
-def test_who_has_no_role_or_a_revoked_one_has_no_rules(policy: Policy) -> None:
+def test_an_identity_without_a_role_or_revoked_has_no_rules(policy: Policy) -> None:
     rules = acl(policy, namespace=SYSTEM, identities=[*STAR, "thief"])["access_control"]
     assert rules["default_permission"] == "deny"
     assert [subject["id"] for subject in rules["subjects"]] == list(STAR)
@@ -328,7 +328,7 @@ def test_without_certificates_only_what_crosses_is_looked_at() -> None:
     assert keys_of(rules, "* eth0", "reply", "egress") == {"registry/*/*/*/*/*"}
 
 
-def test_calls_at_once_all_pass_and_go_on_behind_stops(star: Star) -> None:
+def test_calls_sent_at_once_all_pass_and_follow_behind_stops(star: Star) -> None:
     heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
     hear = zenoh.handlers.Callback(
         lambda sample: heard.put((str(sample.key_expr), str(sample.priority))), indirect=False

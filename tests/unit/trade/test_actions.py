@@ -110,7 +110,7 @@ def test_a_run_shows_what_it_is_and_how_far(offer: Any, walk: Walk) -> None:
     assert repr(run) == "<Run of robot.walk, ended>"
 
 
-def test_what_is_said_last_comes_before_the_answer(offer: Any, walk: Walk) -> None:
+def test_the_last_progress_report_comes_before_the_answer(offer: Any, walk: Walk) -> None:
     walk.open.set()
     tell = offer(walk)("tell")
     for _ in range(20):
@@ -126,7 +126,7 @@ def test_a_call_that_says_nothing_has_no_progress(offer: Any, walk: Walk) -> Non
     assert run.result(20) == "arrived"
 
 
-def test_progress_costs_a_call_that_is_waited_for_nothing(offer: Any, walk: Walk) -> None:
+def test_progress_costs_a_blocking_call_nothing(offer: Any, walk: Walk) -> None:
     walk.open.set()
     assert offer(walk)("tell")([1, 2, 3]) == "arrived"
 

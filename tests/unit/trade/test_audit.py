@@ -155,7 +155,7 @@ def test_wrong_arguments_are_a_refusal(here: Container, there: Container, folder
     assert reported(there, folder) == [("refused", "rosie.arm.reach", "InvalidArgument")]
 
 
-def test_who_locks_what_and_who_is_refused_for_it(
+def test_grants_and_refusals_of_locks_are_written_down(
     here: Container, there: Container, start_container: Start, folder: Path
 ) -> None:
     other = start_container("other")
@@ -253,7 +253,7 @@ def test_changes_of_the_set_up_are_written_down_with_what_was_changed(
     ]
 
 
-def test_who_may_not_is_in_the_record_of_who_refuses_with_the_rule(
+def test_a_refusal_is_in_the_record_of_the_refusing_container_with_its_rule(
     start_container: Start, there: Container, folder: Path, tmp_path: Path
 ) -> None:
     here = start_container("here", audit=folder)

@@ -48,7 +48,7 @@ def links(path: Path) -> list[Link]:
         return list(found)
 
 
-def test_a_record_that_a_later_version_gave_a_column_more_is_gone_on_with(store: AuditStore, path: Path) -> None:
+def test_a_record_with_an_extra_column_of_a_later_version_is_still_used(store: AuditStore, path: Path) -> None:
     tamper(path, "ALTER TABLE record ADD COLUMN room TEXT")
     store.add([row("rosie.step21")])
     assert (verdict(path).problem, verdict(path).rows) == ("", 21)

@@ -141,7 +141,7 @@ def test_the_deadline_calls_what_ends_a_call_that_does_not_end_by_itself(
     assert leaf.stopped.wait(20)
 
 
-def test_the_end_of_who_asked_ends_what_a_service_waits_for(
+def test_the_end_of_the_caller_ends_what_a_service_waits_for(
     here: Container, outer: Outer, leaf: Leaf, start_container: Any
 ) -> None:
     """Also where nothing is known of who asked: the service in between sees it."""

@@ -174,7 +174,7 @@ def _refuse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threading.Thread, "start", refuse)
 
 
-def test_what_is_due_while_there_can_be_no_thread_is_done_with_the_next_thing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_due_while_no_thread_can_start_runs_with_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scheduler, first, second = Scheduler("few-clock"), threading.Event(), threading.Event()
     with monkeypatch.context() as few:
         _refuse(few)
@@ -186,7 +186,7 @@ def test_what_is_due_while_there_can_be_no_thread_is_done_with_the_next_thing(mo
     scheduler.close()
 
 
-def test_a_thread_that_can_have_none_beside_it_does_one_thing_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_single_thread_runs_tasks_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     scheduler = Scheduler("few-clock")
     scheduler.begin(lambda: None, 2**62)
     wait_until(lambda: scheduler._leading)

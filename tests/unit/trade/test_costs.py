@@ -294,7 +294,7 @@ def entries(here: Container, count: int) -> list[bytes]:
     return [encode_message(structs.replace(said, groups=(f"robot.p{number}",))) for number in range(count)]
 
 
-def test_equal_services_are_one_object_however_many_tell_of_them(here: Container) -> None:
+def test_equal_services_are_one_object_however_many_announce_them(here: Container) -> None:
     first, second = map(decode_provider, entries(here, 2))
     assert first.groups != second.groups
     assert all(one is other for one, other in zip(first.services, second.services, strict=True))

@@ -31,7 +31,7 @@ def peers(container: Container) -> int:
 
 @pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])
 @pytest.mark.parametrize("credentials", OTHERS, ids=str)
-def test_who_has_other_credentials_is_not_linked_and_sees_nothing(
+def test_a_container_with_other_credentials_is_not_linked_and_sees_nothing(
     start_container: Any, credentials: tuple[str, str] | None, first: int
 ) -> None:
     settings = [{"credentials": ALICE}, {"credentials": credentials}]
@@ -45,7 +45,7 @@ def test_who_has_other_credentials_is_not_linked_and_sees_nothing(
         assert peers(container) == 0
 
 
-def test_who_has_the_same_credentials_is_linked(start_container: Any) -> None:
+def test_a_container_with_the_same_credentials_is_linked(start_container: Any) -> None:
     one, other = (start_container(name, credentials=ALICE) for name in ("one", "other"))
     one.register(Echo(), "robot")
     assert other.find(where(name="echo"), wait_s=20)(3) == 3
@@ -124,7 +124,7 @@ LAN = ["tcp/192.168.1.5:7450"]
 
 
 @pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ALICE}, {}], ids=str)
-def test_S21_a_laboratory_network_needs_a_system_and_credentials_as_well(missing: dict[str, Any]) -> None:
+def test_S21_a_laboratory_network_needs_a_system_and_also_credentials(missing: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN needs an explicit system id and credentials"):
         Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, **missing)
 

@@ -352,7 +352,7 @@ def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: py
             run.result(20)
 
 
-def test_of_a_caller_that_is_gone_no_reply_key_is_kept(here: Container, there: Container, crowd: Crowd) -> None:
+def test_no_reply_key_is_kept_of_a_caller_that_is_gone(here: Container, there: Container, crowd: Crowd) -> None:
     there.register(crowd, "robot")
     crowd.open.set()
     repliers = there._parts.dispatcher._repliers

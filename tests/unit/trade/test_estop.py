@@ -204,7 +204,7 @@ def test_S09_it_is_repeated_until_it_gets_through_a_network_that_loses_most(seed
         assert caller.estops() == []
 
 
-def test_S09_who_cannot_be_reached_is_missing_and_takes_it_over_once_it_is_back(
+def test_S09_an_unreachable_container_is_missing_and_latches_once_it_is_back(
     system: MemorySystem, eventually: Eventually
 ) -> None:
     away, _ = drivers(system, "away", "near")
@@ -248,7 +248,7 @@ def test_S09_a_driver_restarted_while_one_is_open_stays_latched(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("text", [b"half of", b'["abc", "\xbb", "", 0.0]'], ids=["broken off", "no text"])
-def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path, text: bytes) -> None:
+def test_S09_an_unreadable_estop_note_counts_as_open(tmp_path: Path, text: bytes) -> None:
     folder = tmp_path / "memory" / "estop"
     folder.mkdir(parents=True)
     (folder / "abc.json").write_bytes(text)
@@ -259,7 +259,7 @@ def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path, text: byte
         assert "cannot be read" in estop.reason
 
 
-def test_S09_who_is_down_during_a_clearing_is_latched_when_it_starts_again(tmp_path: Path) -> None:
+def test_S09_a_container_that_is_down_during_a_clearing_is_latched_when_it_starts_again(tmp_path: Path) -> None:
     """Others of its host heard the clearing; its own note is its own."""
     with memory_system(state_dir=tmp_path) as system:
         drivers(system, "one", "other")
@@ -304,7 +304,7 @@ def test_S09_estop_files_of_the_previous_release_latch_every_container_until_cle
             call(system.container("one"), "move_to", "two", 0.1)
 
 
-def test_S09_who_cannot_write_it_down_stops_and_says_so(tmp_path: Path) -> None:
+def test_S09_a_container_that_cannot_write_the_estop_to_disk_stops_and_says_so(tmp_path: Path) -> None:
     (tmp_path / "memory").write_text("a file where a folder should be")
     with memory_system(state_dir=tmp_path) as system:
         [axis] = drivers(system, "one")
@@ -313,7 +313,7 @@ def test_S09_who_cannot_write_it_down_stops_and_says_so(tmp_path: Path) -> None:
         assert axis.stopped == 1
 
 
-def test_S09_who_has_nothing_to_stop_writes_nothing(tmp_path: Path) -> None:
+def test_S09_a_container_with_nothing_to_stop_writes_nothing(tmp_path: Path) -> None:
     with memory_system(state_dir=tmp_path) as system:
         system.container("caller").estop(limit_s=0.2)
         assert list(tmp_path.rglob("*.json")) == []
@@ -321,7 +321,7 @@ def test_S09_who_has_nothing_to_stop_writes_nothing(tmp_path: Path) -> None:
         assert len(list(tmp_path.rglob("*.json"))) == 1
 
 
-def test_S09_two_at_once_are_cleared_one_by_one(system: MemorySystem) -> None:
+def test_S09_two_open_estops_are_cleared_one_by_one(system: MemorySystem) -> None:
     drivers(system, "one", "two")
     reports: list[EstopReport] = []
 
@@ -460,7 +460,7 @@ def test_S09_after_clearing_nothing_moves_by_itself(system: MemorySystem) -> Non
     assert call(mover, "move_to", "one", 0.1) == 0.1
 
 
-def test_S09_who_was_away_during_clearing_needs_another_one(system: MemorySystem) -> None:
+def test_S09_a_container_that_was_unreachable_during_clearing_needs_another_clearing(system: MemorySystem) -> None:
     away, _ = drivers(system, "away", "near")
     caller = system.container("caller")
     report = caller.estop(limit_s=GENEROUS_S)
@@ -583,7 +583,7 @@ def test_S09_an_estop_causes_only_small_announcements_between_containers(system:
     assert max(reported.values()) <= others * changes * MOST_BYTES_OF_ESTOPS
 
 
-def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:
+def test_S09_orders_reach_a_container_that_is_busy_with_calls(system: MemorySystem) -> None:
     [axis] = drivers(system, "one")
     caller = system.container("caller")
     run = caller.find(where(name="run"), wait_s=20).with_(deadline_s=GENEROUS_S)

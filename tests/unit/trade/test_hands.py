@@ -64,7 +64,7 @@ def test_one_thread_does_what_comes_one_after_the_other(
     assert started == ["work-0"]
 
 
-def test_what_comes_at_once_is_done_at_once_and_few_threads_stay(hands: ThreadPool, eventually: Eventually) -> None:
+def test_simultaneous_work_runs_at_once_and_few_threads_stay(hands: ThreadPool, eventually: Eventually) -> None:
     inside, leave = threading.Semaphore(0), threading.Event()
 
     def work() -> None:
@@ -92,7 +92,7 @@ def test_what_fails_is_logged_and_harms_nothing(
     done_by(hands)
 
 
-def test_who_waits_too_long_ends_and_others_come(
+def test_a_thread_that_idles_too_long_ends_and_new_ones_start(
     monkeypatch: pytest.MonkeyPatch, hands: ThreadPool, eventually: Eventually
 ) -> None:
     monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.01)

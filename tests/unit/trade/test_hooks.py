@@ -177,7 +177,7 @@ def test_a_constraint_covers_containers_that_join_later(
     assert observer.next().args == {"goal": "later"}
 
 
-def test_who_no_longer_matches_is_no_longer_watched(
+def test_a_service_that_no_longer_matches_is_no_longer_watched(
     here: Container, there: Container, planner: Planner, plan: Handle, watch: Callable[[str], Handle]
 ) -> None:
     hook = here.after_service(where(group="mind"), watch("see"))
@@ -328,7 +328,7 @@ def test_a_slow_hook_is_cut_off(
     assert observer.times == 3
 
 
-def test_a_slow_hook_in_the_same_container_is_cut_off_as_well(here: Container, observer: Observer) -> None:
+def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, observer: Observer) -> None:
     [plan, *_] = here.register(Planner(), "mind")
     here.register(observer, "eye")
     hook = here.before_service(plan, here.find(where(name="dawdle")))
@@ -348,7 +348,7 @@ def test_what_is_too_late_after_its_hooks_does_not_run(
     assert planner.ran == []
 
 
-def test_the_gates_are_looked_at_after_the_hooks(
+def test_the_gates_are_checked_after_the_hooks(
     here: Container, there: Container, plan: Handle, planner: Planner, start_container: Any
 ) -> None:
     other = start_container("other")

@@ -119,7 +119,7 @@ def test_only_what_has_all_that_is_asked_is_looked_at(many: Index[Record], const
     assert len(many.candidates(constraint)) == count
 
 
-def test_one_by_name_and_group_is_found_by_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_by_name_and_group_is_found_by_one_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
     address = Address("me", "driver", "e1")
     registry = Registry(address)
     services = tuple(ServiceInfo(name=f"move_{number}", signature="()") for number in range(10))
@@ -135,7 +135,7 @@ def test_one_by_name_and_group_is_found_by_one_look(monkeypatch: pytest.MonkeyPa
         asked.clear()
 
 
-def test_what_left_leaves_nothing_behind() -> None:
+def test_removed_services_leave_nothing_in_the_index() -> None:
     index: Index[Record] = Index()
     entry = record(1, groups=["a.b"], uses=["c.d"], achieves=["see(x)"])
     index.put(entry)

@@ -102,7 +102,9 @@ def test_load_readings_less_than_a_second_apart_cover_a_longer_period() -> None:
     assert reported == [0.5, 2.5, 3.0, 1.0, 1.0]
 
 
-def test_what_a_system_does_not_tell_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_figure_that_the_operating_system_does_not_have_is_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delattr("os.getloadavg")
     monkeypatch.setattr(module, "_STATUS", tmp_path / "status")
     monkeypatch.setattr(module, "_STAT", tmp_path / "stat")

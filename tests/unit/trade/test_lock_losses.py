@@ -75,7 +75,7 @@ def test_S12_a_partition_ends_the_lock_on_both_sides(robot: Robot) -> None:
     assert robot["b"].written == []
 
 
-def test_S12_on_waking_what_could_not_be_renewed_is_lost_before_anything_is_done(
+def test_S12_on_waking_locks_that_could_not_be_renewed_are_lost_before_anything_runs(
     robot: Robot,
 ) -> None:
     lock, handle = robot.me.lock([robot.find("a")], lease_s=60).acquire(), robot.find("a")
@@ -94,7 +94,7 @@ def test_S12_a_short_lease_is_renewed_in_time_beside_a_long_one(robot: Robot) ->
         assert short.held
 
 
-def test_renewals_go_on_after_one_to_a_container_that_left(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_renewals_continue_after_one_to_a_container_that_left(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     keeper, gone = robot.me.locking.lease_client, []
     real = keeper._service
 
@@ -131,7 +131,7 @@ class _Answered:
         return self._live
 
 
-def test_what_is_lost_while_it_waits_for_the_rest_is_no_lock(robot: Robot) -> None:
+def test_a_part_lost_while_waiting_for_the_rest_makes_no_lock(robot: Robot) -> None:
     taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
     lock, outcome = robot.me.lock(WHOLE, wait_s=30, lease_s=60), list[BaseException]()
 

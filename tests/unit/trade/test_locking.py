@@ -223,7 +223,7 @@ def test_S15_a_plain_python_call_has_no_lock_even_on_behalf_of_its_owner(robot: 
     robot["a"].move(0.5)
 
 
-def test_S15_what_a_provider_leaves_running_has_no_permit_any_more() -> None:
+def test_S15_a_thread_that_a_provider_leaves_running_has_no_permit_any_more() -> None:
     class Lingering(Joint):
         later: Callable[[], None]
 
@@ -264,7 +264,7 @@ def test_request_release_reaches_the_owner(robot: Robot) -> None:
     assert robot.other.request_release(WHOLE, "again") == []
 
 
-def test_P52_of_two_that_wait_the_one_with_the_higher_priority_comes_first(robot: Robot) -> None:
+def test_P52_of_two_waiting_clients_the_one_with_the_higher_priority_comes_first(robot: Robot) -> None:
     turns = list[str]()
 
     def take(whose: Container, priority: int) -> None:
@@ -282,7 +282,7 @@ def test_P52_of_two_that_wait_the_one_with_the_higher_priority_comes_first(robot
     assert turns == ["high", "middle", "low"]
 
 
-def test_two_who_want_the_same_in_opposite_order_both_get_it(robot: Robot) -> None:
+def test_two_clients_that_want_the_same_locks_in_opposite_order_both_get_them(robot: Robot) -> None:
     turns = list[str]()
 
     def take(container: Container, names: str) -> None:

@@ -26,7 +26,7 @@ def table() -> Iterator[Table]:
 # --- turns
 
 
-def test_who_waits_is_served_in_order_of_arrival(table: Table) -> None:
+def test_waiting_clients_are_served_in_order_of_arrival(table: Table) -> None:
     token = table.take("ab")
     waiting = [table.ask(names, f"s{index}") for index, names in enumerate(["a", "ab", "b", "a"])]
     table.table.release(token.number, "tester")
@@ -82,7 +82,7 @@ def test_turn_and_emptying_together_last_no_longer_than_was_asked(table: Table) 
         asking.result(60)
 
 
-def test_since_is_the_time_of_the_grant_not_of_the_question(table: Table, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_since_is_the_time_of_the_grant_not_of_the_request(table: Table, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.time", lambda: 1000.0)
     token = table.take("a")
     asking = table.ask("a", "other")
@@ -96,7 +96,7 @@ def test_since_is_the_time_of_the_grant_not_of_the_question(table: Table, monkey
 
 
 @pytest.mark.parametrize("use", ["renew", "call", "gate"])
-def test_S12_what_outlived_its_lease_is_over_even_before_anybody_looked(table: Table, use: str) -> None:
+def test_S12_what_outlived_its_lease_is_over_even_before_any_check(table: Table, use: str) -> None:
     """A provider that was frozen wakes: the first access must not find a lock that holds."""
     token = table.take("a", lease_s=2.0)
     permitted = table.call("a", [token])
@@ -139,7 +139,7 @@ def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longe
     real.close()
 
 
-def test_leases_go_on_ending_after_a_stop_that_raised(table: Table) -> None:
+def test_leases_continue_to_end_after_a_stop_that_raised(table: Table) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -196,7 +196,7 @@ def test_S14_a_client_waiting_for_an_unstoppable_device_is_refused_at_once_until
     table.acquire("ab")
 
 
-def test_S14_who_waits_for_rest_does_not_get_what_could_not_be_stopped_meanwhile(table: Table) -> None:
+def test_S14_a_client_that_waits_for_rest_does_not_get_what_could_not_be_stopped(table: Table) -> None:
     resource = table.resources["a"]
     resource.moving = True  # for a client without a lock, which is gone then
     asking = table.ask("a", "other")
@@ -219,7 +219,7 @@ def _could_not_be_stopped(table: Table, names: str) -> Resource:
     return resource
 
 
-def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> None:
+def test_S14_a_later_stop_that_succeeds_frees_nothing(table: Table) -> None:
     resource = _could_not_be_stopped(table, "a")
     resource.stop_ended("")
     with pytest.raises(NotStopped):
@@ -315,7 +315,7 @@ def test_S13_a_motion_that_a_call_left_running_is_waited_for(table: Table) -> No
     asking.result(60)
 
 
-def test_S11_equal_is_asked_for_not_at_least(table: Table) -> None:
+def test_S11_the_number_of_a_grant_must_match_exactly_and_a_greater_one_is_refused(table: Table) -> None:
     old = table.take("a")
     admitted = table.call("a", [old])
     table.table.release(old.number, "tester")
@@ -342,7 +342,7 @@ def test_S08_a_stop_voids_commands_admitted_before_it_whatever_the_locks(table: 
         table.call("a", [token], call_id=2)
 
 
-def test_S08_what_is_let_in_while_a_strangers_stop_is_under_way_is_void(table: Table) -> None:
+def test_S08_a_call_admitted_while_a_foreign_stop_is_under_way_is_void(table: Table) -> None:
     let_in: list[Permit] = []
 
     def asking() -> Iterator[str]:

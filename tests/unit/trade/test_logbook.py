@@ -37,7 +37,7 @@ def test_lines_of_other_processes_are_gathered(here: Container, start_program: C
     assert babbler.ends() == 0
 
 
-def test_containers_of_one_process_tell_a_line_once(here: Container, there: Container) -> None:
+def test_containers_of_one_process_report_a_line_once(here: Container, there: Container) -> None:
     here.find(where(name="log_lines", container="there"), wait_s=20)
     _log.warning("only once")
     assert [line.text for line in here.logs()].count("only once") == 1

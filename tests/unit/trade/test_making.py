@@ -161,7 +161,7 @@ def test_an_object_is_made_elsewhere_and_its_services_are_called(
     assert (kind.container, kind.groups, kind()) == ("maker", ("hall",), lamp)
 
 
-def test_without_a_word_in_its_settings_a_container_makes_nothing(memory: MemorySystem, events: list[str]) -> None:
+def test_a_container_makes_only_what_its_settings_allow(memory: MemorySystem, events: list[str]) -> None:
     with pytest.raises(NotInstantiable, match=r"It allows no class\. Start it with `trade container --allow"):
         memory.container("plain").system.instantiate("workshop:Lamp")
 
@@ -279,7 +279,7 @@ def test_what_is_to_end_only_at_rest_is_left_while_it_moves_or_is_locked(
     wait_until(lambda: not maker.healthy())
 
 
-def test_to_end_it_twice_is_to_end_it_once(maker: Container) -> None:
+def test_terminating_twice_is_like_terminating_once(maker: Container) -> None:
     for _ in range(2):
         assert maker.system.terminate_container() == []
     wait_until(lambda: not maker.healthy())
@@ -300,7 +300,7 @@ def governed(memory: MemorySystem, maker: Container, asker: Container, tmp_path:
 STATEFUL = "workshop:Clock"
 
 
-def test_what_is_made_with_a_state_has_it_before_anybody_can_call_it(
+def test_a_provider_made_with_a_state_has_it_before_any_client_can_call_it(
     asker: Container, memory: MemorySystem, events: list[str]
 ) -> None:
     seen: list[str] = []
@@ -328,7 +328,7 @@ def test_S18_what_does_not_take_its_state_or_moves_by_it_is_not_offered_and_clos
         asker.find(where(kind="Clock"), wait_s=0)
 
 
-def test_who_administers_makes_and_ends(governed: Path, asker: Container) -> None:
+def test_making_and_terminating_need_the_right_to_administer(governed: Path, asker: Container) -> None:
     [kind] = ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
     ask(asker, "terminate", kind)
     assert list(ask(asker, "terminate_container", "")) == []
@@ -342,7 +342,7 @@ def test_who_administers_makes_and_ends(governed: Path, asker: Container) -> Non
         ("start_container", ("robot", "eyes")),
     ],
 )
-def test_who_does_not_administer_is_refused_by_who_is_asked(
+def test_the_asked_container_refuses_a_client_that_may_not_administer(
     governed: Path, memory: MemorySystem, maker: Container, events: list[str], name: str, args: tuple[str, ...]
 ) -> None:
     dash = memory.container("careless", identity="dash")
@@ -353,7 +353,9 @@ def test_who_does_not_administer_is_refused_by_who_is_asked(
     assert events == []
 
 
-def test_who_has_lost_the_role_meanwhile_is_refused(governed: Path, maker: Container, memory: MemorySystem) -> None:
+def test_a_client_that_has_lost_the_role_meanwhile_is_refused(
+    governed: Path, maker: Container, memory: MemorySystem
+) -> None:
     careless = memory.container("careless", identity="chief")
     memory.settle()
     [kind] = ask(careless, "instantiate", "workshop:Lamp", (), ["hall"])

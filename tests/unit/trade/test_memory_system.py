@@ -145,7 +145,7 @@ def test_a_joining_container_is_informed_by_answers_only(lamp: Lamp) -> None:
         assert system.sent(Kind.ANNOUNCE) == before + 1
 
 
-def test_who_has_nothing_new_says_ever_more_seldom_how_far_it_is(lamp: Lamp) -> None:
+def test_an_unchanged_container_reports_its_revision_ever_less_often(lamp: Lamp) -> None:
     with memory_system() as system:
         system.container("a")
         b = system.container("b")
@@ -347,7 +347,7 @@ def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_of
         ghost.close()
 
 
-def test_who_asks_in_vain_still_takes_signs_of_life(lamp: Lamp, eventually: Eventually) -> None:
+def test_a_container_that_asks_in_vain_still_receives_signs_of_life(lamp: Lamp, eventually: Eventually) -> None:
     with memory_system() as system:
         a = system.container("a")
         ghost = MemoryTransport(system.network, "ghost")

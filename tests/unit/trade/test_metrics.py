@@ -203,6 +203,6 @@ def test_without_the_extra_the_remedy_is_named(start_container: Start, monkeypat
         ("192.168.1.2:9464", "put a proxy"),
     ],
 )
-def test_places_that_would_tell_a_network_are_refused(place: str, says: str) -> None:
+def test_places_that_would_expose_metrics_to_a_network_are_refused(place: str, says: str) -> None:
     with pytest.raises(ConfigurationError, match=f"TRADE_METRICS.*{says}"):
         Settings.read(environment={"TRADE_METRICS": place})

@@ -74,7 +74,7 @@ def test_it_is_withdrawn_before_it_is_offered_there(scene: Scene) -> None:
     assert seen == [["new"]]
 
 
-def test_it_can_go_on_and_on(scene: Scene) -> None:
+def test_a_provider_can_migrate_repeatedly(scene: Scene) -> None:
     scene.counter()
     for to in ("new", "old", "new"):
         scene.asker.migrate(where(name="count"), to=to)
@@ -160,7 +160,7 @@ def test_a_call_that_runs_ends_first(scene: Scene) -> None:
         [(None, 50.0, 0.0), (None, 20.0, 7.0), (None, 30.0, 3.0)],  # by their own CPU, where hosts do not tell
     ],
 )
-def test_of_several_that_fit_it_goes_to_the_least_busy(
+def test_a_provider_moves_to_the_least_busy_of_several_matching_containers(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, busy: list[tuple[float | None, float, float]]
 ) -> None:
     for number, (host, own, calls) in enumerate(busy, 1):
@@ -172,7 +172,7 @@ def test_of_several_that_fit_it_goes_to_the_least_busy(
     assert count.container == "new-2"
 
 
-def test_who_does_not_tell_how_busy_it_is_comes_last(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_container_that_does_not_report_its_load_comes_last(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_departing, "_ASK_S", 0.2)
     for name in ("new-1", "new-2", "new-3"):
         scene.memory.container(name, instantiable=["migrants_there:*"])
@@ -194,7 +194,7 @@ class Ear:
         self.heard.append(call.service.container)
 
 
-def test_hooks_by_constraint_are_there_before_anybody_calls_and_those_by_handle_end(scene: Scene) -> None:
+def test_hooks_by_constraint_are_attached_before_any_call_and_those_by_handle_end(scene: Scene) -> None:
     count, _ = scene.counter()
     by_constraint, by_handle = Ear(), Ear()
     [all_of, one_of] = [scene.asker.register(ear)[0] for ear in (by_constraint, by_handle)]

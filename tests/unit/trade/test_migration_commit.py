@@ -97,7 +97,7 @@ def test_a_death_before_the_offer_leaves_the_decision_to_a_user(scene: Scene) ->
     assert scene.asker.call(where(name="count")) == 4
 
 
-def test_who_dies_before_it_is_offered_there_takes_it_along_and_what_was_prepared_ends(
+def test_a_source_that_dies_before_the_offer_loses_the_provider_and_the_prepared_one_ends(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade._migration.target.TICKET_S", 0.2)

@@ -186,7 +186,9 @@ def test_S18_what_is_commanded_while_state_is_restored_is_refused(scene: Scene) 
         scene.asker.restore_state(services["turn"], None)
 
 
-def test_S18_who_is_given_up_may_not_command_later_either(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_S18_a_provider_that_was_given_up_may_not_command_later_either(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(quiesce, "BUDGET_S", 0.05)
     leave, outcomes = threading.Event(), list[Exception]()
 
@@ -204,7 +206,7 @@ def test_S18_who_is_given_up_may_not_command_later_either(scene: Scene, monkeypa
     wait_until(lambda: outcomes)
 
 
-def test_S18_who_sets_it_moving_past_all_permits_is_closed(scene: Scene) -> None:
+def test_S18_a_provider_that_starts_a_motion_past_all_permits_is_closed(scene: Scene) -> None:
     def move(self: Any, _state: object) -> None:
         self.resources[0].moving = True
 
@@ -263,7 +265,7 @@ def test_a_class_that_is_another_version_there_is_not_made(scene: Scene, old: st
     assert continues(scene, count)
 
 
-def test_other_words_in_a_docstring_are_no_other_version(scene: Scene) -> None:
+def test_a_changed_docstring_makes_no_other_version(scene: Scene) -> None:
     count, _ = scene.counter()
     imported(scene.folder, MODULE.replace("def count(self) -> int:", 'def count(self) -> int:\n        """Count."""'))
     [moved, _] = scene.asker.migrate(count, to="new")
@@ -330,7 +332,7 @@ def test_state_that_cannot_be_sent_stays_with_its_provider(scene: Scene) -> None
 # --- who may
 
 
-def test_who_does_not_administer_the_group_is_refused(scene: Scene) -> None:
+def test_a_client_that_may_not_administer_the_group_is_refused(scene: Scene) -> None:
     count, _ = scene.counter()
     scene.policy(chief="member")
     for attempt in (
@@ -343,13 +345,13 @@ def test_who_does_not_administer_the_group_is_refused(scene: Scene) -> None:
     assert scene.module.events == []
 
 
-def test_who_administers_the_group_moves_it(scene: Scene) -> None:
+def test_migrating_needs_the_right_to_administer_the_group(scene: Scene) -> None:
     scene.policy()
     [moved, _] = scene.asker.migrate(scene.counter()[0], to="new")
     assert moved() == 4
 
 
-def test_who_loses_the_role_while_it_is_prepared_is_refused(scene: Scene) -> None:
+def test_a_client_that_loses_the_role_during_preparation_is_refused(scene: Scene) -> None:
     scene.policy()
     count, _ = scene.counter()
     scene.module.before["restore"] = lambda: scene.old.load_policy(scene.policy(chief="member", load=False))
@@ -401,7 +403,7 @@ def test_an_unfetched_prepared_provider_is_closed_with_its_container(scene: Scen
     assert scene.module.events == ["made 1", "close 0"]
 
 
-def test_a_ticket_is_good_once_and_for_whom_it_was_made(scene: Scene) -> None:
+def test_a_ticket_is_valid_once_and_only_for_its_container(scene: Scene) -> None:
     ticket = prepare(scene).ticket
     stranger = scene.asker.find(where(name="arrive", group="trade", container="new"))
     assert not scene.asker.find(where(name="arrived", group="trade", container="new"))(ticket)
@@ -415,7 +417,7 @@ def test_a_ticket_is_good_once_and_for_whom_it_was_made(scene: Scene) -> None:
     assert len(scene.asker.services(where(name="count"))) == 1
 
 
-def test_who_asks_whether_it_arrived_has_prevented_it_if_it_has_not(scene: Scene) -> None:
+def test_asking_whether_a_provider_arrived_prevents_a_later_arrival(scene: Scene) -> None:
     ticket = prepare(scene).ticket
     assert not ask(scene, "arrived")(ticket)
     assert scene.module.events == ["made 1", "close 0"]
@@ -423,7 +425,7 @@ def test_who_asks_whether_it_arrived_has_prevented_it_if_it_has_not(scene: Scene
         ask(scene, "arrive")(ticket)
 
 
-def test_who_waits_no_more_gets_nothing_moved(scene: Scene) -> None:
+def test_a_migration_whose_caller_gave_up_moves_nothing(scene: Scene) -> None:
     count, _ = scene.counter()
     migrate = scene.asker.find(where(name="migrate", group="trade", container="old"))
     scene.module.before["save"] = lambda: time.sleep(0.3)

@@ -77,7 +77,7 @@ def only(keeper: Container) -> NotificationInfo:
 
 
 @pytest.mark.parametrize("careless", [False, True], ids=["asks its policy", "asks no policy"])
-def test_who_may_not_instrument_gets_no_notification_elsewhere(
+def test_a_client_without_the_right_to_instrument_gets_no_notification_elsewhere(
     keeper: Container, policy: Path, base: Base, start_program: Any, careless: bool
 ) -> None:
     asker = start_program(ASKER, "stranger", "" if careless else str(policy), "0.02")
@@ -85,7 +85,7 @@ def test_who_may_not_instrument_gets_no_notification_elsewhere(
     assert keeper.notifications() == []
 
 
-def test_who_may_not_make_the_call_is_refused_at_every_firing(
+def test_a_notification_without_the_right_to_its_call_is_refused_at_every_firing(
     keeper: Container, policy: Path, base: Base, start_program: Any
 ) -> None:
     asker = start_program(ASKER, "watcher", str(policy), "0.02")
@@ -97,7 +97,7 @@ def test_who_may_not_make_the_call_is_refused_at_every_firing(
     assert (only(keeper).fired, base.went) == (0, 0)
 
 
-def test_who_loses_the_role_meanwhile_is_refused_from_then_on_and_served_when_it_has_it_again(
+def test_a_notification_is_refused_while_its_owner_lacks_the_role(
     keeper: Container, policy: Path, base: Base, start_program: Any
 ) -> None:
     asker = start_program(ASKER, "asker", str(policy), "0.02")
@@ -116,7 +116,7 @@ def test_who_loses_the_role_meanwhile_is_refused_from_then_on_and_served_when_it
     wait_until(lambda: base.went >= went + 2)
 
 
-def test_who_may_not_administer_ends_no_notification_of_another(
+def test_cancelling_a_foreign_notification_needs_the_right_to_administer(
     keeper: Container, policy: Path, start_program: Any
 ) -> None:
     noted = start_program(ASKER, "asker", str(policy), "60").heard()

@@ -86,7 +86,7 @@ def test_at_waits_for_the_moment(here: Container, dock: Dock, handle: Callable[[
     assert datetime.now(timezone.utc) >= moment
 
 
-def test_at_goes_by_the_clock_on_the_wall_also_when_it_is_set(
+def test_at_uses_the_wall_clock_even_when_it_is_set(
     here: Container, dock: Dock, handle: Callable[[str], Handle], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noted = here.at(datetime.now(timezone.utc) + timedelta(hours=5), handle("go"))
@@ -171,7 +171,7 @@ def test_a_service_may_get_notifications_about_others_with_arguments_of_its_own(
 # --- conditions
 
 
-def test_if_is_asked_at_that_moment(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
+def test_if_is_evaluated_at_that_moment(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
     noted = here.once(handle("go"), if_=handle("is_low"))
     wait_until(lambda: not noted.active)
     assert dock.asked == 1
@@ -193,7 +193,7 @@ def test_a_low_battery_sends_the_robot_to_its_dock_at_every_tick_until_it_is_cha
     wait_until(lambda: dock.asked >= asked + 3)
 
 
-def test_on_the_edge_it_fires_once_each_time_the_condition_comes_to_hold(
+def test_on_the_edge_it_fires_once_each_time_the_condition_becomes_true(
     here: Container, dock: Dock, handle: Callable[[str], Handle]
 ) -> None:
     here.every(SOON_S, handle("go"), if_=handle("is_low"), edge=True)
@@ -253,7 +253,7 @@ def test_after_counts_from_when_its_condition_holds(
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_makes_no_sense_is_refused(here: Container, ask: Callable[[Container], Any], said: str) -> None:
+def test_an_invalid_trigger_is_refused(here: Container, ask: Callable[[Container], Any], said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         ask(here)
     assert here.notifications() == []
@@ -374,7 +374,7 @@ def test_one_may_live_in_another_container(
     assert not noted.active
 
 
-def test_it_ends_with_who_asked_for_it(
+def test_a_notification_ends_with_its_owner(
     here: Container, there: Container, start_container: Any, handle: Callable[[str], Handle]
 ) -> None:
     brief = start_container("brief")
@@ -385,7 +385,7 @@ def test_it_ends_with_who_asked_for_it(
     wait_until(lambda: there.notifications() == [])
 
 
-def test_a_detached_one_outlives_who_asked_for_it(
+def test_a_detached_notification_outlives_its_owner(
     here: Container, there: Container, start_container: Any, dock: Dock, handle: Callable[[str], Handle]
 ) -> None:
     brief = start_container("brief")
@@ -400,7 +400,7 @@ def test_a_detached_one_outlives_who_asked_for_it(
     here.cancel_notification(info.id)
 
 
-def test_one_that_lives_here_cannot_outlive_here(here: Container) -> None:
+def test_a_notification_cannot_outlive_its_own_container(here: Container) -> None:
     with pytest.raises(ConfigurationError, match="request it with host="):
         here.every(60, print).detach()
 
@@ -410,14 +410,14 @@ def test_another_container_cannot_call_a_function_of_this_process(here: Containe
         here.every(60, print, host=there.name)
 
 
-def test_a_session_of_a_client_takes_its_own_with_it(here: Container) -> None:
+def test_a_session_of_a_client_ends_with_its_notifications(here: Container) -> None:
     with here.open_session("page"):
         noted = here.every(60, print)
         assert noted.info().owner.startswith(f"{here.session}/page")
     wait_until(lambda: not noted.active)
 
 
-def test_who_asked_hears_of_failures_elsewhere(
+def test_the_owner_of_a_notification_gets_its_failures_elsewhere(
     here: Container, there: Container, handle: Callable[[str], Handle], caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "trade"):

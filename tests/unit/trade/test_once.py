@@ -147,7 +147,7 @@ def end(once: CallDeduplicator, one: Call, body: bytes = b"") -> None:
     once.end(begun(once, one), one, answer, keep=True)
 
 
-def test_answers_go_some_seconds_after_their_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_are_dropped_some_seconds_after_their_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     once = CallDeduplicator()
     now = time.monotonic_ns()
     for i in range(600):

@@ -25,7 +25,7 @@ def watching(memory: MemorySystem, policy: Path) -> Iterator[Container]:
         yield made
 
 
-def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
+def test_an_identity_revoked_in_the_file_is_refused_without_an_explicit_reload(
     watching: Container, memory: MemorySystem, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "revoked.toml").write_text('revoked = ["thief"]')

@@ -45,7 +45,7 @@ def dial() -> Iterator[Callable[[int], bool]]:
         sock.close()
 
 
-def test_who_comes_after_too_many_is_dropped_until_they_have_gone(
+def test_connections_beyond_the_limit_are_dropped_until_others_have_gone(
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:
     port, links = door.getsockname()[1], [0]
@@ -61,7 +61,7 @@ def test_who_comes_after_too_many_is_dropped_until_they_have_gone(
         guard.close()
 
 
-def test_links_are_no_strangers(door: socket.socket, dial: Callable[[int], bool]) -> None:
+def test_established_links_do_not_count_as_strangers(door: socket.socket, dial: Callable[[int], bool]) -> None:
     port, looked = door.getsockname()[1], [0]
 
     def links() -> int:

@@ -100,7 +100,7 @@ def test_a_malformed_endpoint_is_refused_with_an_example(what: str, endpoint: st
     ],
 )
 @pytest.mark.parametrize("what", ["listen", "connect"])
-def test_an_endpoint_that_cannot_be_is_refused_in_our_words(what: str, endpoint: str, problem: str) -> None:
+def test_an_impossible_endpoint_is_refused_with_a_message_of_trade(what: str, endpoint: str, problem: str) -> None:
     with pytest.raises(ConfigurationError, match=problem):
         read(**{what: [endpoint]})
 
@@ -118,7 +118,7 @@ def test_an_unread_variable_causes_a_warning(name: str, hint: str, caplog: pytes
 
 @pytest.mark.parametrize("name", ["a/b", "*", "a b", "@me", "x" * 81, ".", "..", "ä"])
 @pytest.mark.parametrize("what", ["system", "identity", "container"])
-def test_a_name_that_cannot_stand_in_a_key_is_refused(what: str, name: str) -> None:
+def test_a_name_that_is_not_allowed_in_a_key_is_refused(what: str, name: str) -> None:
     with pytest.raises(ConfigurationError, match=f"is no name for a {what}; use letters, digits"):
         read(**{what: name})
 

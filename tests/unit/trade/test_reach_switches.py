@@ -148,7 +148,7 @@ def test_what_was_connected_is_linked_again_after_its_restart(start_container: A
     assert clock_of(here, "there").key.address == again.address
 
 
-def test_disconnecting_says_that_a_standing_link_stays(apart: tuple[Container, Container]) -> None:
+def test_disconnecting_says_that_an_open_link_stays(apart: tuple[Container, Container]) -> None:
     one, other = apart
     endpoint = other.settings.listen[0]
     one.system.connect(endpoint)

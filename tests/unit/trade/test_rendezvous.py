@@ -26,7 +26,7 @@ def old(path: Path) -> None:
     os.utime(path, (1, 1))
 
 
-def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: Path) -> None:
+def test_a_container_writes_its_endpoint_and_removes_it(system: str, folder: Path) -> None:
     rendezvous = HostFolder(system)
     assert rendezvous.enter("tcp/127.0.0.1:7450") == []
     assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:7450"]
@@ -35,7 +35,7 @@ def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: P
     assert list(folder.iterdir()) == []
 
 
-def test_who_enters_hears_of_those_that_listen(system: str, folder: Path) -> None:
+def test_a_new_container_finds_those_that_listen(system: str, folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
         HostFolder(system).enter(endpoint)
@@ -172,7 +172,9 @@ def test_containers_that_start_at_the_same_moment_see_each_other(start_program: 
     assert [program.ends() for program in pair] == [0, 0]
 
 
-def test_who_is_known_but_does_not_listen_yet_is_dialled_until_it_does(here: Container, start_container: Any) -> None:
+def test_a_known_container_that_does_not_listen_yet_is_dialled_until_it_does(
+    here: Container, start_container: Any
+) -> None:
     """Its file was there first; it read the folder before ours was."""
     endpoint = free_endpoint()
     HostFolder(here.settings.system).enter(endpoint)

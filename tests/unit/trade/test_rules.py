@@ -227,7 +227,7 @@ def test_a_dry_run_says_on_each_occasion_what_it_would_call_and_calls_nothing(
     assert desk.heard.empty()
 
 
-def test_a_rehearsal_says_what_would_fire_now(here: Container, desk: Desk, tmp_path: Path) -> None:
+def test_a_dry_run_says_which_rules_would_fire_now(here: Container, desk: Desk, tmp_path: Path) -> None:
     file = tmp_path / "rules.toml"
     file.write_text(f"""
         [rule.absent]

@@ -140,7 +140,7 @@ def fire(known: LoopDetector, mark: Mark, since_ns: int = 0, ended_ns: int | Non
     return turns(way)
 
 
-def test_a_way_leads_back_to_where_it_began() -> None:
+def test_a_circle_of_rules_is_counted_each_time_it_closes() -> None:
     known, a, b = LoopDetector(), Mark("a", "x"), Mark("b", "x")
     assert [fire(known, mark) for mark in (a, b, a, b, a, b, a)] == [0, 0, 1, 1, 2, 2, 3]
 

@@ -297,7 +297,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("kind", "groups", "implements", "message"), REFUSED.values(), ids=list(REFUSED))
-def test_what_cannot_work_is_refused_at_registration_with_place_and_remedy(
+def test_an_unusable_service_is_refused_at_registration_with_place_and_remedy(
     here: Container, kind: type, groups: str, implements: tuple[type, ...], message: str
 ) -> None:
     with pytest.raises(ConfigurationError) as refused:
@@ -379,9 +379,7 @@ class Diary:
         self.lines.clear()
 
 
-def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock(
-    here: Container, there: Container
-) -> None:
+def test_a_service_with_effect_note_is_neither_locked_nor_blocked_by_a_lock(here: Container, there: Container) -> None:
     diary = Diary()
     here.register(diary, "hall.diary")
     write = there.find(where(name="write", group="hall.diary"))
@@ -396,7 +394,7 @@ def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock
         there.lock([write]).acquire()
 
 
-def test_a_note_needs_nothing_physical() -> None:
+def test_a_service_with_effect_note_uses_no_resources() -> None:
     with pytest.raises(ConfigurationError, match="a note uses no resources"):
         service(effect="note", uses=["pen"])(lambda: None)
 

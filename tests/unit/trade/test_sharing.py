@@ -234,7 +234,7 @@ def test_another_list_withdraws_what_it_has_not_and_disturbs_nothing_else(two: T
 # --- sessions, stops
 
 
-def test_S03_what_a_foreign_client_moves_stops_with_him_alone(two: Two) -> None:
+def test_S03_what_a_foreign_client_moves_stops_with_that_client_alone(two: Two) -> None:
     tail = Joint("tail")
     two.robot.register(tail, "rosie.tail")
     wag = two.bob.find(where(name="go_on", group="rosie.tail"), wait_s=20)
@@ -250,7 +250,7 @@ def test_S03_what_a_foreign_client_moves_stops_with_him_alone(two: Two) -> None:
     assert tail.stopped.wait(20)
 
 
-def test_S03_a_client_that_was_gone_when_his_call_came_moves_nothing(two: Two) -> None:
+def test_S03_a_client_that_was_gone_when_its_call_came_moves_nothing(two: Two) -> None:
     go = two.find("go_on")
     page = two.anna.open_session("page")
     two.clinic.settle()  # its sign of life was seen: one that comes later would say that it is present
@@ -263,13 +263,13 @@ def test_S03_a_client_that_was_gone_when_his_call_came_moves_nothing(two: Two) -
     assert not two.joint.resource.moving
 
 
-def test_S03_a_killed_border_leaves_no_motion(two: Two) -> None:
+def test_S03_a_killed_federation_gateway_leaves_no_motion(two: Two) -> None:
     two.find("go_on")(1.0)
     two.lab.kill(two.ours)
     assert two.joint.stopped.wait(20)
 
 
-def test_S05_a_border_that_loses_the_other_system_leaves_no_motion(two: Two) -> None:
+def test_S05_a_federation_gateway_that_loses_the_other_system_leaves_no_motion(two: Two) -> None:
     two.find("go_on")(1.0)
     two.clinic.partition(two.anna, two.theirs)
     two.clinic.advance(3)
@@ -313,7 +313,7 @@ def test_a_lock_in_another_system_is_a_lock_at_home_under_the_clients_name(two: 
     assert two.joint.written == [0.1, 0.2]
 
 
-def test_who_has_it_at_home_keeps_it_and_is_asked(two: Two) -> None:
+def test_an_owner_at_home_keeps_the_lock_and_is_asked_to_release_it(two: Two) -> None:
     asked: list[tuple[str, str]] = []
     heard = threading.Event()
 
@@ -435,7 +435,7 @@ def test_what_is_shared_is_not_shared_back_nor_further(two: Two) -> None:
             assert {handle.groups[0] for handle in nurse.services(~where(group="trade"))} == {"clinic.map"}
 
 
-def test_of_both_systems_containers_may_have_the_same_names(two: Two) -> None:
+def test_containers_of_both_systems_may_have_the_same_names(two: Two) -> None:
     namesake = member(two.clinic, "robot", "clinic", "rosie")
     tail = Joint("pan")
     namesake.register(tail, "rosie.head")
@@ -449,7 +449,7 @@ def test_of_both_systems_containers_may_have_the_same_names(two: Two) -> None:
         go["robot"](1.0)
 
 
-def test_of_two_resources_of_one_name_the_second_is_not_shared(two: Two, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_second_resource_of_one_name_is_not_shared(two: Two, caplog: pytest.LogCaptureFixture) -> None:
     other = two.lab.container("other", identity="other")
     other.register(Joint("pan"), "rosie.twin")
     wait_until(lambda: "is not shared with clinic" in caplog.text, "it is said")

@@ -57,7 +57,7 @@ def test_nothing_is_kept_of_short_lived_containers(
 
 
 @NEEDS_GLIBC
-def test_of_a_session_of_the_transport_that_says_nothing_nothing_is_kept(
+def test_nothing_is_kept_of_a_silent_session_of_the_transport(
     start_program: Callable[..., Any], unwatched: str
 ) -> None:
     staying = start_program(STAYING, prelude=unwatched)

@@ -149,7 +149,7 @@ def test_a_container_stops_a_group_it_is_linked_to(
     assert lamp.stops >= 1
 
 
-def test_who_is_open_can_be_asked(driver: Container) -> None:
+def test_open_estops_can_be_listed(driver: Container) -> None:
     assert driver.estop("smoke").complete
     [answer] = asked(driver, b'{"v":1,"ask":"open"}\n')
     assert [estop["reason"] for estop in answer["open"]] == ["smoke"]  # type: ignore[attr-defined]
@@ -165,7 +165,7 @@ def test_the_socket_is_for_this_user_and_goes_with_its_container(driver: Contain
     assert not path.exists()
 
 
-def test_what_a_killed_container_left_is_taken_away(driver: Container) -> None:
+def test_the_socket_of_a_killed_container_is_removed(driver: Container) -> None:
     left = (
         runtime_folder() / driver.settings.system / ".stop-4194400-00000000"
     )  # beyond the highest process there can be
@@ -174,11 +174,11 @@ def test_what_a_killed_container_left_is_taken_away(driver: Container) -> None:
     assert not left.exists()
 
 
-def test_who_has_nothing_to_stop_does_not_listen(start_container: StartContainer) -> None:
+def test_a_container_with_nothing_to_stop_does_not_listen(start_container: StartContainer) -> None:
     assert places(start_container("mind").settings) == []
 
 
-def test_who_is_revoked_stops_nothing(start_container: StartContainer, tmp_path: Path, lamp: Lamp) -> None:
+def test_a_revoked_identity_stops_nothing(start_container: StartContainer, tmp_path: Path, lamp: Lamp) -> None:
     policy = tmp_path / "policy.toml"
     policy.write_text('revoked = ["anna"]\n[identities]\nberta = ["all"]\n[roles.all]\nregister = ["*"]\n')
     container = start_container("driver")
@@ -250,12 +250,12 @@ def test_a_container_that_confirmed_once_is_not_missing() -> None:
     assert all_of("1", [first, second]) == EstopReport("1", ("a/a", "b/b"), ("c/c",), {"d/d": "it is stuck"})
 
 
-def test_who_failed_to_one_has_not_confirmed() -> None:
+def test_a_container_that_failed_for_one_has_not_confirmed() -> None:
     first, second = EstopReport("1", ("a/a",)), EstopReport("1", (), failed={"a/a": "it is stuck"})
     assert not all_of("1", [first, second]).complete
 
 
-def test_what_one_stopped_is_stopped() -> None:
+def test_what_one_container_stopped_counts_as_stopped() -> None:
     reports = [StopReport("a", ("a.stop",)), StopReport("a", (), {"a.stop": "ServiceGone", "b.stop": "stuck"})]
     assert together("a", reports) == StopReport("a", ("a.stop",), {"b.stop": "stuck"})
 

@@ -103,7 +103,7 @@ def test_a_closed_stream_gives_nothing_more_and_ends_its_loop(two: Two) -> None:
         stream.next(PATIENCE_S)
 
 
-def test_who_waits_for_a_sample_is_woken_when_the_stream_is_closed(two: Two) -> None:
+def test_a_wait_for_a_sample_ends_when_the_stream_is_closed(two: Two) -> None:
     stream = two.here.stream(two.service("charge"), hz=FAST_HZ, on_change=True)
     stream.next(PATIENCE_S)
     closing = threading.Timer(0.05, stream.close)
@@ -113,7 +113,7 @@ def test_who_waits_for_a_sample_is_woken_when_the_stream_is_closed(two: Two) -> 
     closing.join()
 
 
-def test_streams_end_with_the_session_that_opened_them_and_others_go_on(two: Two) -> None:
+def test_streams_end_with_the_session_that_opened_them_and_others_continue(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ) as own:
         with two.here.open_session("page"):
             page = two.here.stream(two.service("count"), hz=FAST_HZ)
@@ -261,21 +261,21 @@ def policy_file(folder: Any, read: str) -> Any:
     return path
 
 
-def test_who_may_not_read_a_service_may_not_listen_to_it(start_container: Any, tmp_path: Any) -> None:
+def test_listening_to_a_service_needs_the_right_to_read_it(start_container: Any, tmp_path: Any) -> None:
     here = start_container("here", policy=policy_file(tmp_path, 'read = ["lab"]'))
     [count] = [handle for handle in here.register(Battery(), "rosie") if handle.name == "count"]
     with pytest.raises(AccessDenied, match="read"):
         here.stream(count)
 
 
-def test_a_source_refuses_who_did_not_ask_the_policy(start_container: Any, tmp_path: Any) -> None:
+def test_a_source_refuses_a_listener_that_bypasses_the_policy(start_container: Any, tmp_path: Any) -> None:
     there = start_container("there", policy=policy_file(tmp_path, 'read = ["lab"]'))
     there.register(Battery(), "rosie")
     with pytest.raises(AccessDenied, match="read"):
         start_container("here").stream(where(name="count", group="rosie"))
 
 
-def test_who_loses_the_right_is_heard_no_more(start_container: Any, tmp_path: Any) -> None:
+def test_a_listener_that_loses_the_right_gets_no_more_samples(start_container: Any, tmp_path: Any) -> None:
     there = start_container("there", policy=policy_file(tmp_path, 'read = ["rosie"]'))
     there.register(Battery(), "rosie")
     with start_container("here").stream(where(name="count", group="rosie"), hz=FAST_HZ) as stream:

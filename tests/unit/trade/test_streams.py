@@ -61,7 +61,7 @@ def test_samples_are_sent_once_for_all_listeners_and_never_without_one(memory: M
             assert first.value == first.number
 
 
-def test_who_wants_fewer_is_given_fewer(two: Two) -> None:
+def test_a_listener_that_wants_fewer_samples_gets_fewer(two: Two) -> None:
     with (
         two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as fast,
         two.here.stream(two.service("count"), hz=FAST_HZ / 10, keep=1000) as slow,
@@ -131,7 +131,7 @@ def test_samples_of_another_rate_are_counted_for_themselves(apart: Two) -> None:
     ],
     ids=["all", "fewer", "a step below", "slower than any", "not all seen", "none seen"],
 )
-def test_who_is_behind_a_gateway_is_put_what_it_lets_pass(
+def test_a_listener_behind_a_gateway_gets_the_rate_that_it_passes(
     apart: Two,
     memory: MemorySystem,
     monkeypatch: pytest.MonkeyPatch,
@@ -196,7 +196,7 @@ def test_rates_that_look_alike_in_keys_are_one(apart: Two) -> None:
             assert heard == list(range(heard[0], heard[0] + 10))
 
 
-def test_a_source_is_not_put_at_any_number_of_rates(apart: Two) -> None:
+def test_the_number_of_rates_of_a_source_is_limited(apart: Two) -> None:
     source = Source(
         apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__
     )
@@ -217,7 +217,7 @@ def test_on_change_only_what_differs_is_given_and_the_first_at_once(two: Two) ->
     assert found == [100, 90, 80, 70]
 
 
-def test_what_does_not_change_is_hardly_ever_put(memory: MemorySystem, apart: Two, eventually: Any) -> None:
+def test_an_unchanged_value_is_rarely_published(memory: MemorySystem, apart: Two, eventually: Any) -> None:
     put: list[str] = []
     memory.tap(lambda passage: put.append(passage.key) if is_sample(passage) else None)
     with apart.here.stream(apart.service("charge"), hz=FAST_HZ, on_change=True) as stream:
@@ -235,7 +235,7 @@ def test_a_listener_who_comes_late_hears_at_once_what_has_not_changed(two: Two) 
             assert other.next(PATIENCE_S).value == 100
 
 
-def test_a_slower_listener_has_the_last_change_as_well(two: Two) -> None:
+def test_a_slower_listener_gets_the_last_change_too(two: Two) -> None:
     charge = two.service("charge")
     with (
         two.here.stream(charge, hz=FAST_HZ, on_change=True) as fast,
@@ -259,7 +259,7 @@ def test_a_condition_that_fails_says_so(two: Two) -> None:
         stream.next(PATIENCE_S)
 
 
-def test_who_is_slow_has_the_newest_and_knows_how_many_are_missing(two: Two, eventually: Any) -> None:
+def test_a_slow_listener_gets_the_newest_sample_and_the_number_of_missed_ones(two: Two, eventually: Any) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=4) as stream:
         assert eventually(lambda: (latest := stream.latest()) is not None and latest.number > 20)
         first, *others = some(stream, 4)

@@ -64,7 +64,7 @@ def test_names_that_the_reference_omits_exist(kind: str, name: str) -> None:
     assert hasattr(made, name) or f"self.{name}" in inspect.getsource(made)
 
 
-def test_the_reference_leaves_out_what_the_rooms_tell_each_other() -> None:
+def test_the_reference_leaves_out_methods_for_other_rooms() -> None:
     left_out = {parameter.id for parameter in _left_out()}
     assert {"Lock.add", "Stream.hear", "Run.fail", "Container.abandon", "Resource.latch"} <= left_out
 

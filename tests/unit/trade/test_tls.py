@@ -108,7 +108,7 @@ def test_containers_with_certificates_discover_each_other(start_container: Any, 
 
 
 @pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])
-def test_who_has_a_certificate_of_another_authority_is_not_linked_and_sees_nothing(
+def test_a_container_with_a_certificate_of_another_authority_is_not_linked_and_sees_nothing(
     start_container: Any, papers: Papers, strangers: Papers, first: int
 ) -> None:
     folders = [papers.of("arm"), strangers.of("arm")]
@@ -221,7 +221,7 @@ def test_the_right_name_with_a_wrong_key_is_not_linked_if_it_opens_all_the_same(
 
 
 @pytest.mark.parametrize("honest", [True, False], ids=["for the host", "for another host"])
-def test_who_sits_where_its_certificate_is_not_for_is_not_linked(
+def test_a_container_at_an_address_outside_its_certificate_is_not_linked(
     start_container: Any, open_bare: OpenBare, papers: Papers, monkeypatch: pytest.MonkeyPatch, honest: bool
 ) -> None:
     """Else any container of the system could take another one's address."""
@@ -510,7 +510,7 @@ planner = ["viewer"]
 """
 
 
-def test_with_a_policy_a_container_is_sent_nothing_by_who_is_not_in_it(
+def test_with_a_policy_a_container_gets_nothing_from_identities_outside_it(
     start_container: Any, papers: Papers, tmp_path: Path
 ) -> None:
     """Directly linked, and whatever the other one's own policy says."""
@@ -530,7 +530,7 @@ def test_with_a_policy_a_container_is_sent_nothing_by_who_is_not_in_it(
         mallory.register(stand_in, "robot")
 
 
-def test_who_is_in_the_policy_by_a_pattern_only_is_warned_of(
+def test_an_identity_that_the_policy_names_only_by_a_pattern_is_warned_of(
     start_container: Any, papers: Papers, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     policy = tmp_path / "policy.toml"

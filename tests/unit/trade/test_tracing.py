@@ -118,7 +118,7 @@ def test_untraced_services_are_not_wrapped_and_nothing_is_recorded(here: Contain
     assert here._parts.caller.spans is None
 
 
-def test_notes_are_counted_so_that_one_can_read_on(
+def test_traced_calls_are_numbered_so_that_a_reader_can_continue(
     here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any
 ) -> None:
     monkeypatch.setattr(noted, "MOST", 5)
@@ -135,7 +135,9 @@ def test_notes_are_counted_so_that_one_can_read_on(
     assert spans(None, 8) == spans(None, 9) == []
 
 
-def test_the_notes_are_bounded(here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any) -> None:
+def test_the_number_of_traced_calls_is_bounded(
+    here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any
+) -> None:
     monkeypatch.setattr(noted, "MOST", 5)
     small = start_container("small")
     small.register(Arm(), "rosie.arm")
@@ -166,7 +168,7 @@ def test_events_of_one_call_are_bounded(here: Container) -> None:
 # --- what is noted
 
 
-def test_a_call_is_noted_by_who_asks_and_by_who_serves(here: Container, there: Container, arm: Arm) -> None:
+def test_a_call_is_traced_by_caller_and_callee(here: Container, there: Container, arm: Arm) -> None:
     assert here.set_tracing(True) == ["here", "there"]
     here.find(where(name="reach"), wait_s=20)(0.25)
     asked, served = sorted(here.spans(), key=lambda span: span.side)
@@ -190,7 +192,7 @@ def test_an_error_is_reported_by_its_type_alone(here: Container, there: Containe
     assert not any("swordfish" in str(span) for span in here.spans())
 
 
-def test_a_call_that_is_refused_is_noted_by_who_asked(here: Container, there: Container, arm: Arm) -> None:
+def test_a_refused_call_is_traced_by_the_caller(here: Container, there: Container, arm: Arm) -> None:
     reach = here.find(where(name="reach"), wait_s=20)
     here.set_tracing(True)
     with pytest.raises(Exception, match="angle_rad"):
@@ -233,7 +235,7 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
     assert served["q.follow"].waited_s >= waited_s
 
 
-def test_what_is_secret_is_in_no_note(here: Container, there: Container, arm: Arm) -> None:
+def test_what_is_secret_is_in_no_trace(here: Container, there: Container, arm: Arm) -> None:
     here.set_tracing(True)
     assert here.call(where(name="login"), "swordfish") == "swordfish"
     trace = here.trace(_last(here, "rosie.arm.login"))

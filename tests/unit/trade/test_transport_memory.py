@@ -261,7 +261,7 @@ def tell(transport: MemoryTransport, key: str, payload: bytes) -> None:
     question.close()
 
 
-def test_who_is_cut_off_answers_until_it_is_lost(room: Room) -> None:
+def test_a_container_that_is_cut_off_answers_until_it_is_lost(room: Room) -> None:
     room.one.questions("shop/*")
     room.cut(one_way=True)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
@@ -302,7 +302,7 @@ def test_signs_of_the_killed_fall_at_once_and_what_it_sent_is_lost(room: Room) -
         thing.close()
 
 
-def test_killing_or_cutting_the_dead_does_nothing(room: Room) -> None:
+def test_killing_or_cutting_off_a_dead_container_does_nothing(room: Room) -> None:
     room.one.close()
     room.network.kill(room.one.node)
     room.cut()

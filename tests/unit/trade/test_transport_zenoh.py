@@ -48,7 +48,7 @@ class TestZenoh(TransportConformance):
             assert read.receive().payload == b"at last"
             assert int(unread.receive().payload or b"0") >= _CHANNEL_CAPACITY
 
-    def test_who_waits_for_questions_while_they_are_closed_hears_that_they_are(self) -> None:
+    def test_a_wait_for_queries_ends_when_their_queue_is_closed(self) -> None:
         def read(questions: Questions) -> None:
             with contextlib.suppress(ChannelClosed):
                 questions.receive()
@@ -81,7 +81,7 @@ class TestZenoh(TransportConformance):
                 assert sorted(set(heard)) == list(numbers[before[-1] :])
             putting.result(60)
 
-    def test_who_settles_is_closed_as_ever(self) -> None:
+    def test_a_transport_that_settles_can_be_closed(self) -> None:
         def read(channel: Channel) -> None:
             with contextlib.suppress(ChannelClosed):
                 while True:

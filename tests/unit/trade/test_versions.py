@@ -172,7 +172,7 @@ def test_a_container_of_another_version_is_shown_with_it_and_offers_nothing(
     assert f"speaks protocol version {OTHER}, this one speaks {PROTOCOL}" in said[0]
 
 
-def test_of_who_has_said_nothing_yet_the_version_is_not_known(memory: MemorySystem, eventually: Eventually) -> None:
+def test_the_version_of_a_silent_container_is_unknown(memory: MemorySystem, eventually: Eventually) -> None:
     here = memory.container("here")
     silent = Address("tester", "silent", "e1")
     transport = MemoryTransport(memory.network, "silent")
@@ -183,7 +183,7 @@ def test_of_who_has_said_nothing_yet_the_version_is_not_known(memory: MemorySyst
     transport.close()
 
 
-def test_what_has_answered_in_another_version_is_asked_no_more(
+def test_a_container_that_answered_in_another_version_is_not_asked_again(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:
     here = memory.container("here")
@@ -227,7 +227,7 @@ def test_S09_an_order_to_stop_is_obeyed_and_confirmed_whatever_its_version(
     assert move(one) == "moved"
 
 
-def test_an_order_to_clear_is_heeded_in_its_own_version_only(
+def test_an_order_to_clear_is_obeyed_in_its_own_version_only(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:
     arm_of(memory)
@@ -277,7 +277,9 @@ def test_S09_a_report_names_containers_of_another_version_that_confirmed(
     assert report.complete
 
 
-def test_S09_who_of_another_version_does_not_confirm_is_missing(memory: MemorySystem, stranger: Strangers) -> None:
+def test_S09_a_container_of_another_version_that_does_not_confirm_is_missing(
+    memory: MemorySystem, stranger: Strangers
+) -> None:
     arm_of(memory)
     stranger(obeys=False)
     report = memory.container("caller").estop("smoke", limit_s=0.3)
@@ -309,7 +311,7 @@ def test_a_clearing_names_containers_of_another_version_that_still_have_it_open(
 # --- reports of open ones
 
 
-def test_S09_who_joins_takes_over_what_containers_of_another_version_have_open(
+def test_S09_a_joining_container_takes_over_what_containers_of_another_version_have_open(
     memory: MemorySystem, stranger: Strangers
 ) -> None:
     stranger(open_=(["abc", "bob/desk/e9", "spill", 1.5, "more"],))

@@ -31,7 +31,7 @@ def host(here: Container, open_raw: Any) -> Iterator[Announcer]:
 
 
 @pytest.mark.parametrize(("providers", "services"), [(10_000, 1), (1000, 10)])
-def test_ten_thousand_services_are_known_to_who_listens_and_to_who_comes_late(
+def test_ten_thousand_services_are_known_to_running_and_to_late_containers(
     here: Container, start_container: Any, host: Announcer, eventually: Any, providers: int, services: int
 ) -> None:
     for revision in range(1, providers + 1):
@@ -41,7 +41,7 @@ def test_ten_thousand_services_are_known_to_who_listens_and_to_who_comes_late(
     assert eventually(lambda: len(late.services(where(group="panels"))) == 10_000)
 
 
-def test_most_of_them_withdrawn_who_comes_late_knows_the_rest(
+def test_a_late_container_knows_the_services_left_after_most_were_withdrawn(
     here: Container, start_container: Any, host: Announcer, eventually: Any
 ) -> None:
     for revision in range(1, 2001):
@@ -55,7 +55,7 @@ def test_most_of_them_withdrawn_who_comes_late_knows_the_rest(
         assert left.key.provider == "p2000"
 
 
-def test_what_was_lost_on_the_way_is_asked_for_when_the_container_says_how_far_it_is(
+def test_lost_entries_are_requested_when_the_container_reports_its_revision(
     here: Container, host: Announcer, monkeypatch: pytest.MonkeyPatch, eventually: Any
 ) -> None:
     host.announce("panels", "p1", entry(1, 1))
@@ -75,7 +75,7 @@ class Panel:
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_who_calls_at_once_on_hearing_of_a_service_is_answered(
+def test_an_immediate_call_to_a_new_service_is_answered(
     here: Container, there: Container, start_container: Callable[[str], Container], eventually: Any, late: bool
 ) -> None:
     """The callee listens before it announces; whether one hears of it from an announcement or from an answer."""

@@ -157,7 +157,7 @@ def test_what_could_be_a_pattern_is_no_chunk(text: str) -> None:
     assert not is_chunk(text)
 
 
-def test_identities_stand_in_chunks_of_their_own() -> None:
+def test_each_identity_is_a_chunk_of_its_own() -> None:
     callee = Address("arm", "driver", "e1")
     assert call_key("me", callee, "rosie", "Arm-1", stop=False) == "call/me/arm/driver/e1/rosie/Arm-1"
     assert call_key("me", callee, "rosie", "Arm-1", stop=True) == "stop/me/arm/driver/e1/rosie/Arm-1"
@@ -247,7 +247,7 @@ GONE = {
 }
 
 
-def test_a_flood_of_nonsense_is_counted_while_calls_go_on(
+def test_a_flood_of_nonsense_is_counted_while_calls_continue(
     here: Container, there: Container, open_raw: Any, eventually: Any
 ) -> None:
     there.register(Echo(), "robot")
@@ -380,7 +380,7 @@ def test_an_entry_under_a_pattern_never_makes_a_service(
     assert still_works(here, raw)
 
 
-def test_a_late_joiner_survives_malformed_entries_that_stand(
+def test_a_late_joiner_survives_malformed_entries_in_the_registry(
     here: Container, start_container: Any, open_raw: Any, echo: Echo
 ) -> None:
     raw = open_raw(here)

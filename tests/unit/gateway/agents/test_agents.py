@@ -19,7 +19,7 @@ from trade.testing import MemorySystem
 from trade_gateway.mcp._tools import TOOLS
 
 
-def test_an_agent_looks_at_what_there_is(agent: Container) -> None:
+def test_an_agent_lists_the_services_that_exist(agent: Container) -> None:
     async def looks(client: Client) -> None:
         found = await client("services", group="rosie.head")
         assert {one["name"] for one in found} == {"state", "turn", "spin", "stop"}
@@ -34,7 +34,7 @@ def test_an_agent_looks_at_what_there_is(agent: Container) -> None:
     run(looks, agent)
 
 
-def test_tools_are_listed_with_schemas_that_stand_alone(agent: Container) -> None:
+def test_tools_are_listed_with_self_contained_schemas(agent: Container) -> None:
     async def lists(client: Client) -> None:
         tools = (await client._session.list_tools()).tools
         assert [tool.name for tool in tools] == list(TOOLS)

@@ -29,7 +29,7 @@ def _decide(by: Container, word: str, *more: str) -> None:
     by.find(where(name=word, container=handle.container), wait_s=5)(one.id, *more)
 
 
-def test_what_is_marked_waits_for_a_persons_word(
+def test_a_marked_call_waits_for_the_approval_of_a_person(
     memory: MemorySystem, robot: Robot, governed: Path, agent: Container
 ) -> None:
     person = memory.container("person", identity="ann")
@@ -133,7 +133,7 @@ class Joint:
     def stop(self) -> None: ...
 
 
-def test_what_is_marked_is_asked_for_whichever_service_moves_it(
+def test_a_marked_group_needs_approval_whichever_service_moves_it(
     memory: MemorySystem, robot: Robot, agent: Container
 ) -> None:
     joint, alias = Joint(robot.head), Part("lamp")

@@ -267,7 +267,7 @@ def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand:
     assert "has no resolt" in reported["text"]
 
 
-def test_a_later_goal_of_whomever_ends_the_one_before_and_is_done(mover: Mover, stand: Stand) -> None:
+def test_a_later_goal_of_any_client_ends_the_one_before_and_is_done(mover: Mover, stand: Stand) -> None:
     first = client(stand, ENDLESS, "first")
     first.wait_for("active")
     second = client(stand, 2, "second")

@@ -43,7 +43,7 @@ def test_frames_come_as_they_were_sent_in_order(pair: Pair) -> None:
     assert not reader.is_alive()
 
 
-def test_of_what_may_be_dropped_the_newest_stays_and_nothing_else_is_held_up(pair: Pair) -> None:
+def test_of_droppable_frames_the_newest_stays_and_no_other_frame_is_delayed(pair: Pair) -> None:
     one, other = pair
     for number in range(100):
         one.put({"n": number}, bytes(1_000_000), key="topic", most=5)
@@ -58,7 +58,7 @@ def test_of_what_may_be_dropped_the_newest_stays_and_nothing_else_is_held_up(pai
     reader.join(PATIENCE_S)
 
 
-def test_who_waits_to_read_is_woken_by_the_end_of_its_own_side(pair: Pair) -> None:
+def test_a_blocked_read_is_woken_by_the_end_of_its_own_side(pair: Pair) -> None:
     _, other = pair
     _, reader = read(other)
     other.close()

@@ -227,7 +227,7 @@ def test_a_namespace_without_parameters_is_refused(graph: Ros1) -> None:
         graph.parameters("/leg", 30)
 
 
-def test_a_value_that_ros_has_no_word_for_is_refused(graph: Ros1) -> None:
+def test_a_value_that_ros_cannot_express_is_refused(graph: Ros1) -> None:
     for value in (None, 2**40, [None], object()):
         with pytest.raises(RosRefused, match="/arm/x"):
             graph.set_parameter("/arm", "x", value, 30)

@@ -50,7 +50,7 @@ def test_what_a_node_publishes_is_heard_here_with_its_name(graph: Ros1, stand: S
     assert (message["header"]["frame_id"], message["name"], message["position"]) == ("base", ["pan"], [0.25])
 
 
-def test_who_comes_later_is_given_the_last_message_of_a_latched_topic(graph: Ros1, stand: Stand) -> None:
+def test_a_late_subscriber_gets_the_last_message_of_a_latched_topic(graph: Ros1, stand: Stand) -> None:
     topic = graph.advertise("/map", TEXT, latched=True)
     topic.send({"data": "old"})
     topic.send({"data": "new"})
@@ -99,7 +99,7 @@ def test_a_listener_that_is_frozen_delays_no_other(graph: Ros1, stand: Stand) ->
     send_until(lambda: topic.send({"data": "last"}), lambda: any(one["data"] == "last" for one in quick.all("heard")))
 
 
-def test_of_what_a_slow_callback_misses_the_newest_stays(graph: Ros1, stand: Stand) -> None:
+def test_a_slow_callback_gets_the_newest_message(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
     begun, go_on = threading.Event(), threading.Event()
 

@@ -107,7 +107,7 @@ def test_S05_who_has_just_ended_keeps_its_name_for_a_while(
     assert presence.known(gid(EARLY)) == ""
 
 
-def test_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) -> None:
+def test_nothing_is_kept_of_withdrawn_endpoints(graph: Ros2, router: Router) -> None:
     presence = graph._node.presence
     come_and_go(graph, router, EARLY)
     assert (Kind.PUBLISHER, "/said") not in presence._offered

@@ -116,7 +116,7 @@ def test_an_empty_list_is_of_the_type_the_parameter_has(graph: Ros2, offering: O
 
 
 @pytest.mark.parametrize("value", [None, {}, [1, "a"], [None], [], [[1]]])
-def test_what_can_be_no_parameter_is_not_sent(graph: Ros2, offering: Offering, value: Any) -> None:
+def test_a_value_that_is_no_valid_parameter_is_not_sent(graph: Ros2, offering: Offering, value: Any) -> None:
     with pytest.raises(ConfigurationError, match="can be no value"):
         graph.set_parameter("/camera", "unset", value, LONG_S)
     assert not offering.set

@@ -74,7 +74,7 @@ def test_a_router_that_was_killed_and_started_again_finds_all_as_it_was(
     assert not peer.has("heard", data="while it was gone")
 
 
-def test_a_graph_that_never_finds_a_router_ends_as_well(own_router: Router, open_graph: Callable[..., Ros2]) -> None:
+def test_a_graph_that_never_finds_a_router_ends_too(own_router: Router, open_graph: Callable[..., Ros2]) -> None:
     graph = open_graph(own_router)
     graph.advertise("/topic", STRING).send({"data": "to no node"})
     graph.close()

@@ -52,7 +52,7 @@ def test_a_closed_subscription_hears_no_more(graph: Ros2, peer: Process) -> None
     assert "after" not in ended.texts
 
 
-def test_who_comes_late_is_given_what_is_latched(graph: Ros2, peer: Process) -> None:
+def test_a_late_subscriber_gets_the_latched_message(graph: Ros2, peer: Process) -> None:
     latched = graph.advertise("/latched", STRING, latched=True)
     latched.send({"data": "first"})
     latched.send({"data": "last"})
