@@ -146,6 +146,22 @@ def opened(container: Container, folder: Path, **options: Any) -> Iterator[tuple
         yield gateway, tokens
 
 
+@contextmanager
+def served_axis(folder: Path) -> Iterator[Opened]:
+    """An HTTP gateway of a robot with one joint more, `axis`; all joints stop in the end."""
+    with memory_system() as system:
+        robot = Robot(system)
+        axis = Axis("axis")
+        robot.joints["axis"] = axis
+        system.container("axis").register(axis, "robot.axis")
+        system.settle()
+        with opened(robot.me, folder) as (gateway, tokens):
+            yield Opened(robot, gateway, tokens)
+        for joint in robot.joints.values():
+            joint.hold.set()
+            joint.stopped.set()
+
+
 def heard(socket: ClientConnection) -> Any:
     """The next message."""
     return json.loads(socket.recv(timeout=PATIENCE_S))

@@ -15,6 +15,7 @@ import pytest
 
 from tests.support.certificates import Papers
 from tests.support.http_clients import POLICY, Client, Opened, ask, govern, governed, heard, opened, say
+from tests.support.strangers import is_closed
 from tests.support.two_joint_robot import Robot
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
@@ -36,22 +37,12 @@ def test_strangers_take_a_bounded_number_of_descriptors(served: Opened) -> None:
     try:
         for _ in range(700):
             strangers.append(socket.create_connection((place.hostname, place.port), timeout=20))
-        wait_until(lambda: _is_closed(strangers[-1]), "further ones are closed")
-        assert not _is_closed(strangers[0])  # it has its time to ask for something
+        wait_until(lambda: is_closed(strangers[-1]), "further ones are closed")
+        assert not is_closed(strangers[0])  # it has its time to ask for something
     finally:
         for one in strangers:
             one.close()
     wait_until(lambda: _lets_in(served), "it answers again")
-
-
-def _is_closed(stranger: socket.socket) -> bool:
-    stranger.settimeout(0)
-    try:
-        return stranger.recv(1) == b""
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
 
 
 def _lets_in(served: Opened) -> bool:

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.certificates import Papers
-from tests.support.http_clients import Axis, Client, Opened, opened
+from tests.support.http_clients import Client, Opened, opened, served_axis
 from tests.support.two_joint_robot import Robot
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Handle, Reachability, service, where
@@ -45,17 +45,8 @@ class Lamp:
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Opened]:
-    with memory_system() as system:
-        robot = Robot(system)
-        axis = Axis("axis")
-        robot.joints["axis"] = axis
-        system.container("axis").register(axis, "robot.axis")
-        system.settle()
-        with opened(robot.me, tmp_path) as (made, tokens):
-            yield Opened(robot, made, tokens)
-        for joint in robot.joints.values():
-            joint.hold.set()
-            joint.stopped.set()
+    with served_axis(tmp_path) as served:
+        yield served
 
 
 @pytest.mark.parametrize("depth", [90, 200, 500, 900, 2000, 100_000])

@@ -15,13 +15,11 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from tests.support.http_clients import Axis, Client, Opened, ask, heard, opened, say
-from tests.support.two_joint_robot import Robot
+from tests.support.http_clients import Client, Opened, ask, heard, say, served_axis
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import progress, service
 from trade._protocol.messages import decode_call
 from trade._transport.memory.network import InFlightMessage
-from trade.testing import memory_system
 
 
 class Walker:
@@ -43,17 +41,8 @@ class Walker:
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Opened]:
-    with memory_system() as system:
-        robot = Robot(system)
-        axis = Axis("axis")
-        robot.joints["axis"] = axis
-        system.container("axis").register(axis, "robot.axis")
-        system.settle()
-        with opened(robot.me, tmp_path) as (made, tokens):
-            yield Opened(robot, made, tokens)
-        for joint in robot.joints.values():
-            joint.hold.set()
-            joint.stopped.set()
+    with served_axis(tmp_path) as served:
+        yield served
 
 
 def go_on(name: str = "a", number: int = 1) -> dict[str, object]:

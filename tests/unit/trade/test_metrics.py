@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from tests.support.strangers import is_closed
 from tests.support.waiting import wait_until
 from trade import Container, Measure, Resource, Settings, service, where
 from trade._services.local_service import LocalService
@@ -51,22 +52,12 @@ def test_strangers_take_a_bounded_number_of_descriptors_and_threads(there: Conta
     try:
         for _ in range(200):
             strangers.append(socket.create_connection(("127.0.0.1", there.metrics_port), timeout=20))
-        wait_until(lambda: sum(_is_closed(one) for one in strangers) >= 150, "most are closed at once")
+        wait_until(lambda: sum(is_closed(one) for one in strangers) >= 150, "most are closed at once")
         assert threading.active_count() - before <= 40
     finally:
         for one in strangers:
             one.close()
     wait_until(lambda: _answers(there), "it answers again")
-
-
-def _is_closed(stranger: socket.socket) -> bool:
-    stranger.settimeout(0)
-    try:
-        return stranger.recv(1) == b""
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
 
 
 def _answers(container: Container) -> bool:
@@ -162,7 +153,7 @@ def test_the_record_says_how_far_it_is(here: Container, start_container: Start, 
     assert found["trade_call_seconds_count", "rosie.arm.reach"] == 1
 
 
-def test_the_port_is_free_again_when_the_container_is_closed(there: Container, start_container: Start) -> None:
+def test_the_port_is_free_again_when_the_containeris_closed(there: Container, start_container: Start) -> None:
     place = f"127.0.0.1:{there.metrics_port}"
     with pytest.raises(ConfigurationError, match="a port of its own"):
         start_container("other", metrics=place)

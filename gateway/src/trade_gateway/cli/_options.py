@@ -17,6 +17,12 @@ TIMING: Final = "Timing"
 OUTPUT: Final = "Output"
 
 Json = Annotated[bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print JSON.")]
+Wait = Annotated[
+    float,
+    typer.Option(
+        min=0.0, rich_help_panel=TIMING, metavar="SECONDS", help="Time to wait for the service to appear, in seconds."
+    ),
+]
 Groups = Annotated[
     list[str] | None, typer.Option("--group", help="Select this group and the groups beneath it. Repeatable.")
 ]

@@ -60,7 +60,7 @@ _decoder: Final = msgspec.msgpack.Decoder(StreamSample)
 def stream_key(service: ServiceKey, hz: float) -> str:
     """The key of a service's samples at a rate.
 
-    For some rates, a source also publishes signs of life on this key, so they reach the same listeners as its samples.
+    At the rates of ``STEPS_HZ``, a source also publishes signs of life on this key, so they reach the same listeners.
     """
     return f"{_all_rates(service)}/{hz:g}"
 

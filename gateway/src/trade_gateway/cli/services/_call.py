@@ -14,7 +14,7 @@ import typer
 from trade import Handle
 from trade.errors import TradeError
 from trade_gateway._usage import UsageError, find
-from trade_gateway.cli._options import Json
+from trade_gateway.cli._options import TIMING, Json, Wait
 from trade_gateway.cli._output import Output, say_error
 from trade_gateway.cli._system_choice import visitor
 
@@ -33,11 +33,10 @@ def call(
         typer.Argument(help="Arguments as JSON, by position ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
     ] = None,
     deadline: Annotated[
-        float, typer.Option(min=0.001, metavar="SECONDS", help="Deadline of the call, in seconds.")
+        float,
+        typer.Option(min=0.001, rich_help_panel=TIMING, metavar="SECONDS", help="Deadline of the call, in seconds."),
     ] = 10.0,
-    wait: Annotated[
-        float, typer.Option(min=0.0, metavar="SECONDS", help="Time to wait for the service to appear, in seconds.")
-    ] = 2.0,
+    wait: Wait = 2.0,
     container: Annotated[str | None, typer.Option(help="Call the service of this container.")] = None,
     as_json: Json = False,
 ) -> None:

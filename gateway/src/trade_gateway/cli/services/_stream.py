@@ -9,7 +9,7 @@ import typer
 from trade import Sample
 from trade._timestamps import clock
 from trade_gateway._usage import find
-from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json
+from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json, Wait
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
 
@@ -28,15 +28,7 @@ def stream(
         int | None,
         typer.Option(min=1, rich_help_panel=OUTPUT, help="End after this many samples; by default at Ctrl-C."),
     ] = None,
-    wait: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            rich_help_panel=TIMING,
-            metavar="SECONDS",
-            help="Time to wait for the service to appear, in seconds.",
-        ),
-    ] = 2.0,
+    wait: Wait = 2.0,
     container: Annotated[
         str | None, typer.Option(rich_help_panel=SELECT, help="Stream the service of this container.")
     ] = None,
