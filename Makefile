@@ -65,7 +65,7 @@ siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
-mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's; 20 min)
+mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's)
 	@$(RUN) pytest -m mutant -p tests.support.mutant_table -p no:tests.support.rerun tests tests/endurance/siege_mutants.py $(ARGS)
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)

@@ -259,7 +259,7 @@ class ClientApi:
         return [messages.lock_view(info) for info in broken]
 
     def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
-        """The services that use only these resources. Raises NoSuchService: the client may see no such service."""
+        """The services that use exactly these resources. Raises NoSuchService: the client may see no such service."""
         wanted = set(resources)
         actuating = [one for one in self.seen(who) if one.effect == "actuate"]
         found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]
