@@ -186,9 +186,10 @@ def test_a_follower_whose_lock_is_broken_halts_and_obeys_other_clients(pair: Pai
     code, _, errors = ended(program)
     assert code == 1
     assert "LockLost" in errors or "MotionStopped" in errors  # whichever comes first
-    wait_until(pair.at_rest)
     move: Any = trade.find(where(name="move_to", group="pair.follower", kind="JointGroup"))
-    assert move([0.1] * 6)[0] == pytest.approx(0.1, abs=TOLERANCE_RAD)
+    with trade.lock(where(group="pair.follower"), wait_s=PATIENCE_S):  # granted once the driver has reported the stop
+        assert pair.at_rest()
+        assert move([0.1] * 6)[0] == pytest.approx(0.1, abs=TOLERANCE_RAD)
 
 
 def test_a_leader_that_holds_is_refused_and_nothing_moves(pair: Pair) -> None:
