@@ -17,7 +17,7 @@ HOURS ?= 1
 MUTANT ?=
 MINIMISE ?=
 
-.PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation
+.PHONY: demo screenshots docs release-check test test-realtime test-system test-all test-socketcan soak soak-registry soak-relocation
 .PHONY: chaos chaos-locks chaos-robots siege mutants
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
@@ -36,16 +36,25 @@ $(UV):
 demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
 	@$(RUN) --no-dev --group demo python examples/demo.py $(ARGS)
 
-test: $(UV) ## the whole test suite; in parts; the others run also when one fails
-	@mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; \
-	failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
-	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
-	part -n 2 --dist loadfile --ignore tests/unit/drivers --ignore tests/contract --ignore tests/system --ignore tests/bench --ignore tests/endurance/chaos --ignore tests/endurance/soak; \
-	part -n 2 --dist loadfile tests/system tests/bench tests/endurance/chaos tests/endurance/soak --ignore tests/system/test_demo.py --ignore tests/system/browser --ignore tests/system/peers; \
-	part -n 2 --dist loadfile tests/unit/drivers tests/contract; \
-	part -n 2 --dist loadfile tests/system/browser tests/system/peers/test_conformance.py; \
-	part tests/system/peers/test_rust.py tests/system/test_demo.py; \
-	test -z "$$failed" || { echo "failed, of all parts:"; cat build/failures; exit 1; }
+# Three tiers of tests, by what a test may use: tests/support/tiers.py. In the last two, what failed runs again at the end, alone.
+WITH_PROCESSORS_TO_ITSELF := tests/system/peers/test_rust.py tests/system/test_demo.py
+REALTIME := $(RUN) pytest --rerun --durations=10 -m "realtime and not system"
+SYSTEM := $(RUN) pytest --rerun --durations=10 -m system
+
+test: $(UV) ## what decides whether a change lands: code, containers and zenoh within a process; 3 minutes on two cores
+	@$(RUN) pytest --durations=10 -n 4 --dist worksteal --hypothesis-profile ci -m "not realtime and not system" $(ARGS)
+
+test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 25 minutes at most
+	@$(REALTIME) -n 2 --dist loadfile $(ARGS)
+
+test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 30 minutes at most (root)
+	@failed=; part() { code=0; "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; *) failed=1 ;; esac; }; \
+	part $(SYSTEM) -n 2 --dist loadfile tests $(WITH_PROCESSORS_TO_ITSELF:%=--ignore %); \
+	part $(SYSTEM) -n 0 $(WITH_PROCESSORS_TO_ITSELF); test -z "$$failed"
+
+test-all: ## the three tiers in a row
+	@failed=; for tier in test test-realtime test-system; do $(MAKE) --no-print-directory $$tier || failed="$$failed $$tier"; done; \
+	test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/system/socketcan/run pytest tests/system/socketcan $(ARGS)
@@ -59,14 +68,14 @@ siege: export SIEGE_MINUTES := $(MINUTES)
 siege: export SIEGE_MUTANT := $(MUTANT)
 siege: export SEED := $(SEED)
 siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
-	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:tests.support.rerun $(ARGS) || { \
+	@$(RUN) pytest -s -n 0 tests/system/test_siege.py $(ARGS) || { \
 	  test -z "$(MINIMISE)" || $(RUN) python -m tests.system.siege_minimised; exit 1; }
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
 mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's)
-	@$(RUN) pytest -m mutant -p tests.support.mutant_table -p no:tests.support.rerun tests tests/endurance/siege_mutants.py $(ARGS)
+	@$(RUN) pytest -m mutant -p tests.support.mutant_table tests tests/endurance/siege_mutants.py $(ARGS)
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
 	@$(RUN) --group fuzz python -m tests.endurance.fuzz --minutes $(MINUTES) $(ARGS)
@@ -78,7 +87,7 @@ soak-registry: $(UV) ## three containers on two hosts register at the same momen
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
 soak-relocation: $(UV) ## a host is lost 100 times, with random trouble between; never two (SEED=..; root, iproute2; 45 min)
-	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:tests.support.rerun $(ARGS)
+	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, spelling, plain English, isolated install of the core
 	@$(RUN) ruff check

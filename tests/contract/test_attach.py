@@ -10,6 +10,8 @@ import pytest
 from tests.contract.rigs.base import SafetyRig
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.realtime
+
 
 def refused(rig: SafetyRig) -> str:
     announced: list[object] = []

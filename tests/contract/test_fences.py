@@ -22,6 +22,8 @@ from trade.errors import (
     TradeError,
 )
 
+pytestmark = pytest.mark.realtime
+
 # --- S11
 
 

@@ -22,6 +22,8 @@ from trade_drivers.testing import JointGroupContract, MotorContract
 from trade_hil_sim import ByteLog, SimProcess, events
 from trade_hil_sim.robot._robot import buses_of
 
+pytestmark = pytest.mark.realtime
+
 FILES = {
     "head": HEAD,
     "fast": HEAD.replace('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'),

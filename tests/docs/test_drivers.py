@@ -16,6 +16,8 @@ from trade import where
 from trade_drivers import JointGroup, Measured, PolledSensor, SensorInfo, attach, load
 from trade_hil_sim import SimProcess, events
 
+pytestmark = pytest.mark.realtime
+
 PAGE = "drivers.md"
 
 

@@ -124,6 +124,7 @@ def test_a_share(tmp_path: Path, text: str) -> None:
 # --- docs/drivers.md
 
 
+@pytest.mark.realtime
 @of("drivers.md", "The robot file")
 def test_a_robot_file(tmp_path: Path, text: str) -> None:
     """What its drivers have to say of it is said by them, on the simulated devices."""

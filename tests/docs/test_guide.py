@@ -266,6 +266,7 @@ def test_while_it_runs(play: Play) -> None:
         wait_until(lambda: "robot" in {info.name for info in trade.system.containers()})
 
 
+@pytest.mark.realtime
 @of(PAGE, "Create objects in other containers")
 def test_objects_made_elsewhere(play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mypkg").mkdir()
@@ -294,6 +295,7 @@ def test_objects_made_elsewhere(play: Play, tmp_path: Path, monkeypatch: pytest.
         program.close()
 
 
+@pytest.mark.realtime
 @of(PAGE, "Other hosts")
 def test_other_hosts(play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no other host: what stands for ``ssh`` says so. tests/system/test_starts.py has one."""

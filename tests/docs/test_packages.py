@@ -12,6 +12,8 @@ import pytest
 from tests.docs.blocks import ROOT, blocks
 from tests.system.terminals import Shell, end_all_but
 
+pytestmark = pytest.mark.realtime
+
 PACKAGES = ("trade", "drivers", "hil-sim")
 
 

@@ -1,171 +1,78 @@
-"""A test that was late because the computer stood still runs once more, and the run's summary says which and why.
+"""Runs what failed again at the end: alone, one after the other, three times (`--rerun`).
 
-The devices of these tests have deadlines of milliseconds. Drivers keep their promises by saying so when they were held
-up, and who shares a processor with other programs is held up now and then. So a failure counts only if nothing stood
-still: a process of its own looks at the clock, and the product's own words for being late count as well. What fails
-twice has failed. More than `_MOST` such tests fail the run: that is no accident any more.
-
-Two failures of each process may be without such a reason and still run once more: of thousands of tests one that waits
-for too little should not refuse a whole day. The summary shows them with what failed, so that they get fixed.
+Tests on real clocks may fail because other tests kept the computer busy. Alone they have it to themselves, so a fault
+of the product fails there, too. What passes three times is listed as unsteady with what failed, to be fixed; anything
+else fails the run. More than `_MOST_UNSTEADY` are no accident, so they run only once and fail the run.
 """
 
 import os
-import re
 import subprocess
 import sys
-import time
-from pathlib import Path
 from typing import Final
 
 import pytest
-from _pytest.runner import runtestprotocol
 
-_MOST: Final = 12
-_STILL_S: Final = 0.04
-"""For so long a device of these tests may go unattended."""
-_LATE: Final = re.compile(
-    r"was held up for [\d.]+ s|did not answer on [^\s;]+( for [\d.]+ s)?|did not answer within \d+ ms"
-    r"|no(body| device) answers;|it was away; remove the cause|it heard nothing for too long; remove the cause"
-)
-_CLOCK: Final = f"""
-import os, time
-last = time.monotonic()
-while os.getppid() == {{parent}}:
-    time.sleep(0.01)
-    now = time.monotonic()
-    if now - last > 0.01 + {_STILL_S}:
-        print(now - last - 0.01, flush=True)
-    last = now
-"""
-_KEY: Final = "ran again"
-_UNSTEADY: Final = "for no known reason, fix it: "
-_UNSTEADY_ONES: Final = 2
-_FAILURES: Final = "TEST_FAILURES"
-"""The variable that names a file for a line of each failure: `make test` shows those of all its parts at its end."""
+_MOST_UNSTEADY: Final = 12
+_ROUNDS: Final = 3
+_LONGEST_ROUND_S: Final = 1800
+_NO_RERUN: Final = ("-n", "0", "-p", "no:tests.support.rerun", "-p", "no:cacheprovider")
 
 
-class Clock:
-    """A process that does nothing but look whether it is woken in time."""
+class Rerun:
+    """The plug-in, in the process that the user sees."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-S", "-c", _CLOCK.format(parent=os.getpid())], stdout=subprocess.PIPE, bufsize=0
-        )
-        assert self._process.stdout is not None
-        self._said = self._process.stdout
-        os.set_blocking(self._said.fileno(), False)
-
-    def stood_still_s(self) -> float:
-        """For how long at once, since this was asked last."""
-        words = self._said.read() or b""
-        return max(map(float, words.split()), default=0.0)
-
-    def close(self) -> None:
-        """End it."""
-        self._process.kill()
-        self._process.wait()
-        self._said.close()
-
-
-class Again:
-    """The plugin; in each process that runs tests."""
-
-    def __init__(self) -> None:
-        self._clock = Clock()
-        self._unsteady_left = _UNSTEADY_ONES
-        self._once_more: list[pytest.TestReport] | None = None
-
-    @pytest.hookimpl(tryfirst=True)
-    def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-        """Run one test, and once more if that one was late."""
-        if self._once_more is not None:
-            self._once_more.extend(runtestprotocol(item, nextitem=nextitem, log=False))
-            return True
-        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-        self._clock.stood_still_s()
-        reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        if (why := self._late(reports) or self._unsteady(reports)) and _afresh(item):
-            item.user_properties.append((_KEY, why))
-            reports = self._once_more = []
-            # By way of the hook, so that this run has a time limit of its own, too.
-            item.ihook.pytest_runtest_protocol(item=item, nextitem=nextitem)
-            self._once_more = None
-        for report in reports:
-            item.ihook.pytest_runtest_logreport(report=report)
-        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-        return True
-
-    def pytest_unconfigure(self) -> None:
-        self._clock.close()
-
-    def _late(self, reports: list[pytest.TestReport]) -> str:
-        """Why it may have failed through no fault of its own; empty if it has not, or there is no such reason."""
-        failed = [report for report in reports if report.failed]
-        if not failed:
-            return ""
-        time.sleep(0.05)  # what the clock has to say of the last moment
-        still_s = self._clock.stood_still_s()
-        if still_s:
-            return f"the computer stood still for {still_s:.2f} s"
-        found = next(filter(None, (_LATE.search(report.longreprtext) for report in failed)), None)
-        return "" if found is None else f"it said: {found.group()}"
-
-    def _unsteady(self, reports: list[pytest.TestReport]) -> str:
-        """What failed, if there is still one to be let off without a reason."""
-        failed = next((report for report in reports if report.failed), None)
-        if failed is None or not self._unsteady_left:
-            return ""
-        self._unsteady_left -= 1
-        return _UNSTEADY + failed.longreprtext
-
-
-def _afresh(item: pytest.Item) -> bool:
-    """Have it make all that it needs again, also what whole modules share; False if the old ones cannot be ended."""
-    try:
-        item.session._setupstate.teardown_exact(None)
-    except Exception:  # noqa: BLE001 - the failure that there is says more
-        return False
-    item._initrequest()  # type: ignore[attr-defined]
-    return True
-
-
-class RerunSummary:
-    """The summary, in the process that the user sees."""
-
-    def __init__(self) -> None:
-        self._again: dict[str, str] = {}
-        self._failed: list[str] = []
+        self._failed: dict[str, str] = {}
+        self._failed_again: dict[str, int] = {}
+        self._lines: list[str] = []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Remember who ran again, and who failed."""
+        """Remember what failed, and how."""
         if report.failed:
-            crash = getattr(report.longrepr, "reprcrash", None)
-            why = str(getattr(crash, "message", report.longreprtext)).strip().partition("\n")[0]
-            self._failed.append(f"{report.nodeid} ({report.when}): {why}")
-        for key, why in report.user_properties:
-            if key == _KEY:
-                self._again[report.nodeid] = str(why)
+            self._failed.setdefault(report.nodeid, f"{report.when}:\n{report.longreprtext}")
 
+    @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Too many of them is a failure."""
-        if len(self._again) > _MOST and session.exitstatus == pytest.ExitCode.OK:
-            session.exitstatus = pytest.ExitCode.TESTS_FAILED
-            self._failed.extend(f"{name} ran twice, one of more than {_MOST}" for name in self._again)
-        if path := os.environ.get(_FAILURES):
-            with Path(path).open("a", encoding="utf-8") as file:
-                file.writelines(f"{line}\n" for line in self._failed)
+        """Run the failed tests again, and decide."""
+        if session.exitstatus != pytest.ExitCode.TESTS_FAILED or not self._failed:
+            return
+        if len(self._failed) > _MOST_UNSTEADY:
+            self._lines = [f"{len(self._failed)} failed; {_MOST_UNSTEADY} at most run again"]
+            return
+        for number in range(1, _ROUNDS + 1):
+            code, said = self._run_alone(session.config)
+            if code != pytest.ExitCode.OK:
+                self._lines = [f"failed also alone, in round {number} of {_ROUNDS}:", said]
+                return
+        session.exitstatus = pytest.ExitCode.OK
+        self._lines = [f"{name} failed at {what}\n" for name, what in self._failed.items()]
+        self._lines.insert(0, f"unsteady: {len(self._failed)}; each passed {_ROUNDS} times alone. Fix them:")
+
+    def _run_alone(self, config: pytest.Config) -> tuple[int, str]:
+        command = [sys.executable, "-m", "pytest", "-q", *_NO_RERUN, *self._failed]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+        try:
+            done = subprocess.run(  # noqa: PLW1510 - its exit code is what is asked for
+                command, cwd=config.rootpath, env=environment, capture_output=True, text=True, timeout=_LONGEST_ROUND_S
+            )
+        except subprocess.TimeoutExpired:
+            return pytest.ExitCode.INTERRUPTED, f"it took more than {_LONGEST_ROUND_S} s"
+        return done.returncode, done.stdout
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Say who ran again."""
-        if self._again:
-            terminalreporter.section(f"ran twice: {len(self._again)} (more than {_MOST} are a failure)")
-            for name, why in self._again.items():
-                terminalreporter.line(f"{name}: {why}")
+        """Say what ran again, and how it went."""
+        if self._lines:
+            terminalreporter.section("ran again, alone")
+            for line in self._lines:
+                terminalreporter.line(line)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add `--rerun`."""
+    parser.addoption("--rerun", action="store_true", help="what failed runs again at the end: alone, three times")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Called for a module that is named as a plugin."""
-    if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(RerunSummary())
-    if hasattr(config, "workerinput") or not getattr(config.option, "numprocesses", None):
-        config.pluginmanager.register(Again())
+    if config.getoption("--rerun") and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Rerun())

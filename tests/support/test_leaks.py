@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.realtime
+
 pytest_plugins = ["pytester"]
 
 LEAKS = {
@@ -35,7 +37,10 @@ LEAKS = {
 
 
 @pytest.mark.parametrize("what", LEAKS)
-def test_a_test_that_leaves_something_behind_fails(what: str, pytester: pytest.Pytester) -> None:
+def test_a_test_that_leaves_something_behind_fails(
+    what: str, pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     conftest = Path(__file__).parents[1].joinpath("conftest.py").read_text(encoding="utf-8")
     pytester.makeconftest(conftest.replace("_SETTLE_S = 5.0", "_SETTLE_S = 0.2"))
     pytester.makepyfile(LEAKS[what] + "\n\n        def test_innocent():\n            pass\n")

@@ -22,6 +22,7 @@ def test_the_page_names_a_test_for_each_of_them() -> None:
     assert {ROWS[mutant][1] for mutant in MUTANTS} == {"test_broken_locks_are_found"}
 
 
+@pytest.mark.realtime
 @pytest.mark.mutant
 @pytest.mark.parametrize("mutant", HOW)
 def test_what_is_broken_is_found_by_the_test_of_its_rule(mutant: str) -> None:

@@ -1,5 +1,7 @@
 """Complaints of other projects about how motion begins and ends, and what comes after a fault."""
 
+import pytest
+
 from tests.contract.complaints import motion_mutants as mutants
 from tests.contract.complaints.bodies import Body, Call, outcome
 from tests.contract.complaints.table import complaint
@@ -8,6 +10,8 @@ from tests.unit.drivers.conftest import written_now
 from trade import where
 from trade.testing import memory_system
 from trade_hil_sim import Heal, Replug, Unplug
+
+pytestmark = pytest.mark.realtime
 
 
 @complaint(

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from tests.contract.complaints import system_mutants as mutants
@@ -13,6 +14,8 @@ from tests.support.waiting import wait_until
 from trade import Handle, service, where
 from trade.testing import memory_system
 from trade_gateway.cli import app
+
+pytestmark = pytest.mark.realtime
 
 
 @complaint(

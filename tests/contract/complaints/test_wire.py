@@ -2,12 +2,16 @@
 
 import time
 
+import pytest
+
 from tests.contract.complaints import wire_mutants as mutants
 from tests.contract.complaints.bodies import Body, Call, outcome
 from tests.contract.complaints.table import complaint
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import sleep_past
 from trade_hil_sim import Unplug
+
+pytestmark = pytest.mark.realtime
 
 
 @complaint(

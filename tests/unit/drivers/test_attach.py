@@ -15,6 +15,8 @@ from trade_drivers import Driver, drivers, load
 from trade_drivers.plugins import _driver as driver_module
 from trade_hil_sim import DynamixelBus, Servo
 
+pytestmark = pytest.mark.realtime
+
 
 def refused(rig: Rig, **options: Any) -> str:
     with pytest.raises(ConfigurationError) as error:

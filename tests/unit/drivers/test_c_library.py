@@ -17,6 +17,8 @@ from trade.errors import ConfigurationError, InvalidArgument, LockedByOther, Tra
 from trade.testing import MemorySystem, memory_system
 from trade_drivers.clibrary import CFunctionFailed, CLibrary
 
+pytestmark = pytest.mark.realtime
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "c_gripper"
 MORE = r"""
 #include <stdint.h>

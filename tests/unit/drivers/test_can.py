@@ -137,6 +137,7 @@ def elsewhere(bus: CanBus) -> str:
     return bus.port.replace("127.0.0.1", "localhost")
 
 
+@pytest.mark.realtime
 def test_frames_pass_the_simulated_adapter_both_ways(bus: CanBus) -> None:
     here, there = CanPort(bus.port, 1_000_000), CanPort(elsewhere(bus), 1_000_000)
     here.open()
@@ -149,6 +150,7 @@ def test_frames_pass_the_simulated_adapter_both_ways(bus: CanBus) -> None:
     there.close()
 
 
+@pytest.mark.realtime
 def test_frames_for_a_server_go_out_in_one_write_and_in_order(bus: CanBus, monkeypatch: pytest.MonkeyPatch) -> None:
     here, there = CanPort(bus.port, 1_000_000), CanPort(elsewhere(bus), 1_000_000)
     here.open()
@@ -163,6 +165,7 @@ def test_frames_for_a_server_go_out_in_one_write_and_in_order(bus: CanBus, monke
     there.close()
 
 
+@pytest.mark.realtime
 def test_an_unplugged_adapter_is_a_loss_after_few_frames_and_opens_again(bus: CanBus) -> None:
     port = CanPort(bus.port, 1_000_000)
     port.open()
@@ -179,6 +182,7 @@ def test_an_unplugged_adapter_is_a_loss_after_few_frames_and_opens_again(bus: Ca
     port.close()
 
 
+@pytest.mark.realtime
 def test_a_bus_off_of_the_adapter_is_a_loss(bus: CanBus) -> None:
     port = CanPort(bus.port, 1_000_000)
     port.open()

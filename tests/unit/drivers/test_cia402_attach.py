@@ -14,6 +14,8 @@ from trade_drivers import load
 from trade_hil_sim import Mute, Unplug
 from trade_hil_sim.cia402 import Cia402Bus
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["leg", "rig"]
 
 

@@ -21,6 +21,8 @@ from trade_hil_sim import (
     Truncate,
 )
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["leg", "rig"]
 
 

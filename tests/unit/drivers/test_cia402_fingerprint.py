@@ -5,6 +5,8 @@ import pytest
 from tests.unit.drivers.legs import HIP, Leg, leg, rig
 from trade.errors import ConfigurationError, WrongDevice
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["leg", "rig"]
 
 

@@ -33,6 +33,8 @@ from trade_drivers.vendors.cia402._stream import Following, Turning, interpolati
 from trade_hil_sim import Entry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["leg", "rig"]
 
 QUICK_STOP, OPERATE = 0x02, 0x0F

@@ -22,6 +22,8 @@ from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import Stage
 from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, Mute, SimProcess, events, frames
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["leg", "rig"]
 
 SLOW_S = 0.03

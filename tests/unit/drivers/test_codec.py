@@ -191,6 +191,7 @@ def test_the_public_names_exist() -> None:
         assert getattr(trade_drivers, name).__doc__
 
 
+@pytest.mark.realtime
 def test_no_vendor_library_is_imported_before_a_bus_is_attached() -> None:
     imports = "import sys, trade_drivers, trade_drivers.vendors.dynamixel"
     code = f"{imports}; print({{'serial', 'dynamixel_sdk'}} & set(sys.modules))"

@@ -16,6 +16,8 @@ from trade_hil_sim import DynamixelBus, Gripper, Mute, RobotiqBus, Servo, WrongM
 from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo
 
+pytestmark = pytest.mark.realtime
+
 
 class Make(NamedTuple):
     """One make of servo, simulated, and what sets it up."""

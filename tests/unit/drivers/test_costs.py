@@ -27,6 +27,8 @@ from trade_drivers import AttachedRobot
 from trade_drivers.plugins._driver import Driver, drivers
 from trade_hil_sim import Entry
 
+pytestmark = pytest.mark.realtime
+
 TURNS = 60
 KEEPING_TURNS = 120
 MOST_LOOKS = 12

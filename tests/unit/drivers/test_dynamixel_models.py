@@ -9,6 +9,8 @@ from trade_drivers import scan
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_hil_sim import MODELS, Jam, Servo, WrongModel, instructions
 
+pytestmark = pytest.mark.realtime
+
 
 def plug(rig: Rig, pan: str, tilt: str) -> None:
     """A head with a servo of these models in each joint."""

@@ -22,6 +22,8 @@ from trade.errors import (
     OutcomeUnknown,
 )
 
+pytestmark = pytest.mark.realtime
+
 WATCHDOG_S = 0.3
 
 

@@ -17,6 +17,8 @@ from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
 from trade_drivers.faults import FaultPoller
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def hand(tmp_path: Path) -> Iterator[HandRig]:

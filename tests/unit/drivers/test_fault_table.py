@@ -13,6 +13,8 @@ from tests.unit.drivers.fault_subjects import ALONE, SUBJECTS, Subject
 from tests.unit.drivers.fault_table import TABLE, page
 from trade.errors import DeviceError, DeviceFault
 
+pytestmark = pytest.mark.realtime
+
 _ARRIVED = 0.97
 _NOTHING = 0.005
 """Less than this share of the move is no motion: 0.4 degrees, 0.3 mm."""

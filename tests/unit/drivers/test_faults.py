@@ -18,6 +18,8 @@ from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._jobs import Enable, Relax
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 
+pytestmark = pytest.mark.realtime
+
 COUNT_RAD = 6.283185 / 4096
 
 

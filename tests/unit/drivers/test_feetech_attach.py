@@ -13,6 +13,8 @@ from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim.feetech import Servo
 
+pytestmark = pytest.mark.realtime
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "servo_arm.toml"
 
 

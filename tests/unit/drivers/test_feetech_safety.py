@@ -15,6 +15,8 @@ from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, tail_rig
 from trade.errors import LockedByOther
 
+pytestmark = pytest.mark.realtime
+
 SLOWLY_RAD_S = 0.3
 
 

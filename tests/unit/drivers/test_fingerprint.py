@@ -14,6 +14,8 @@ from trade.errors import ConfigurationError, DeviceFault, DeviceSilent, WrongDev
 from trade_drivers import Motor
 from trade_hil_sim import BrownOut, motion_writes
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def tail(tmp_path: Path) -> Iterator[TailRig]:

@@ -16,6 +16,8 @@ from trade.testing import memory_system
 from trade_drivers import AttachedRobot, FollowProgress, JointGroup, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Servo
 
+pytestmark = pytest.mark.realtime
+
 COUNTS_PER_RAD = 4096 / math.tau
 NAMES = ["rosie.neck.pan", "rosie.neck.tilt"]
 Row = tuple[float, list[float]] | tuple[float, list[float], list[float] | None]

@@ -25,6 +25,8 @@ from trade.errors import DeviceFault, MotionStopped
 from trade_drivers import JointGroup, Motor, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.joints import Steps, Work
 
+pytestmark = pytest.mark.realtime
+
 SPEED_RAD_S = 0.5
 WATCHDOG_S = 0.4
 AWAY_S = 1.4

@@ -14,6 +14,8 @@ from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._serial_port import SerialLine
 from trade_drivers.bus.can import CanPort
 
+pytestmark = pytest.mark.realtime
+
 _numbers = count()
 _HOLDER = """
 import sys

@@ -9,6 +9,8 @@ from tests.support.waiting import wait_until
 from trade_drivers import attach, load
 from trade_hil_sim import SimProcess
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).parents[3]
 
 

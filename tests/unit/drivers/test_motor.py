@@ -7,6 +7,8 @@ from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade.errors import InvalidArgument, MotionStopped
 from trade_drivers import AttachedRobot
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def robot(head: Rig) -> AttachedRobot:

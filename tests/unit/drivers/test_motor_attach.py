@@ -15,6 +15,8 @@ from trade_drivers import load
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["motor_rig", "wag"]
 
 

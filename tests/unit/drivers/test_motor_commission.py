@@ -23,6 +23,8 @@ from trade_hil_sim.cia402 import Drive
 from trade_hil_sim.damiao import Motor
 from trade_hil_sim.odrive import Axis
 
+pytestmark = pytest.mark.realtime
+
 __all__ = ["motor_rig", "wag"]
 
 COMMISSIONERS = {"odrive": OdriveDriver.commissioner, "damiao": DamiaoDriver.commissioner}

@@ -1,10 +1,14 @@
 """The rules of motion for ODrives and Damiao motors, judged on frames: the numbers are those of docs/safety.md."""
 
+import pytest
+
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.motor_rig import ROOT, MotorRig, motor_rig, wag
 from trade.errors import (
     TradeError,
 )
+
+pytestmark = pytest.mark.realtime
 
 __all__ = ["motor_rig", "wag"]
 

@@ -14,6 +14,8 @@ from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.damiao import DamiaoDriver
 from trade_drivers.vendors.odrive import OdriveDriver
 
+pytestmark = pytest.mark.realtime
+
 RIGS: dict[str, type[Leg]] = {"cia402": Leg, **KINDS}
 COMMISSIONERS: dict[str, Callable[[], Commissioner]] = {
     "cia402": Cia402Driver.commissioner,

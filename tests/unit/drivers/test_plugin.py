@@ -19,6 +19,8 @@ from trade_drivers.testing import SensorContract
 from trade_hil_sim import ByteLog, Heal, Late, Mute, Replug, SimProcess, SimulationError, Supply, Truncate, Unplug
 from trade_hil_sim.robot._robot import buses_of, read_robot
 
+pytestmark = pytest.mark.realtime
+
 PLUGIN = Path(__file__).parents[3] / "examples" / "plugin"
 OVEN = PLUGIN / "oven.toml"
 MOST_LINES = 60

@@ -14,6 +14,8 @@ from trade.errors import (
 )
 from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events
 
+pytestmark = pytest.mark.realtime
+
 SLOW_M_S = 0.02
 
 

@@ -12,6 +12,8 @@ from tests.unit.drivers.gripper_rig import HandRig, made_rig
 from trade.errors import BusGone, DeviceError, DeviceSilent, TradeError
 from trade_drivers import Gripper, GripperState
 
+pytestmark = pytest.mark.realtime
+
 SLOW_M_S = 0.02
 
 

@@ -16,6 +16,8 @@ from trade_drivers.vendors.robotiq import _table as table
 from trade_hil_sim import DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[HandRig]:

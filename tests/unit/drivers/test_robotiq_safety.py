@@ -20,6 +20,8 @@ from trade.errors import (
 from trade_drivers import Gripper
 from trade_hil_sim import Heal, Mute, Put, instructions, received
 
+pytestmark = pytest.mark.realtime
+
 SLOW_M_S = 0.02
 
 

@@ -13,6 +13,8 @@ from trade.errors import (
 )
 from trade_hil_sim import DynamixelBus
 
+pytestmark = pytest.mark.realtime
+
 # --- S18 attach moves and resets nothing
 
 

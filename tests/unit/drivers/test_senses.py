@@ -32,6 +32,8 @@ from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.robot._robot import buses_of
 from trade_hil_sim.scene import LIMB, OBJECT, Field, fields
 
+pytestmark = pytest.mark.realtime
+
 EYE = """
 [camera.eye]
 driver = "snapshot"

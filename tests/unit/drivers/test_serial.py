@@ -14,6 +14,8 @@ from trade_drivers.bus._serial_port import LONGEST_WAIT_S, SerialLine, SerialWir
 from trade_drivers.vendors.dynamixel._wire import Wire as ServoWire
 from trade_drivers.vendors.robotiq._wire import Wire as GripperWire
 
+pytestmark = pytest.mark.realtime
+
 WIRES = pytest.mark.parametrize("kind", [ServoWire, GripperWire], ids=["dynamixel", "robotiq"])
 
 

@@ -13,6 +13,8 @@ from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, Motio
 from trade_drivers import AttachedRobot, Motor
 from trade_hil_sim import BrownOut, Servo
 
+pytestmark = pytest.mark.realtime
+
 COUNTS_PER_RAD = 4096 / math.tau
 
 

@@ -7,6 +7,8 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Rig, call, written_now
 from trade_drivers import parse
 
+pytestmark = pytest.mark.realtime
+
 BAUD, JOINTS = 57_600, 6
 LONGEST_STRETCH_S = 0.020
 """Below the rule's 50 ms, so that a read of all joints in one piece, which takes 26 ms here, would show."""

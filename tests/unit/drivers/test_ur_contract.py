@@ -14,6 +14,8 @@ from trade_drivers.testing import ArmContract
 from trade_hil_sim import Arm as SimArm
 from trade_hil_sim import instructions
 
+pytestmark = pytest.mark.realtime
+
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 
 

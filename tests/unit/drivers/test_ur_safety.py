@@ -28,6 +28,8 @@ from trade.errors import (
 from trade_drivers import Arm, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Absent, Local, Mute, Unplug, events, instructions
 
+pytestmark = pytest.mark.realtime
+
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 __all__ = ["arm_rig", "free_rig"]
 

@@ -18,6 +18,8 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
 from trade_hil_sim import DynamixelBus, writes
 
+pytestmark = pytest.mark.realtime
+
 
 def joint(**changes: Any) -> Joint:
     values: dict[str, Any] = {"min_rad": -1.0, "max_rad": 1.0, "max_speed_rad_s": 1.0, "max_accel_rad_s2": 10.0}

@@ -76,6 +76,7 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(
     assert found.fix == 'pip install "trade-drivers[dynamixel]"'
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "it is unknown")]
 )
@@ -84,6 +85,7 @@ def test_the_clock_is_synchronised_or_not_or_unknown(said: str, level: str, text
     assert (found.level, found.text.startswith(text)) == (level, True)
 
 
+@pytest.mark.realtime
 def test_a_host_without_the_tool_does_not_know() -> None:
     assert only(host.clock(["/no/such/tool"])).text.startswith("it is unknown")
 
@@ -163,11 +165,13 @@ def test_a_missing_port_is_reported(robot_file: Path) -> None:
     assert (found.level, found.about) == ("error", "bus neck")
 
 
+@pytest.mark.realtime
 def test_devices_that_answer_are_named(robot_file: Path) -> None:
     with simulated(robot_file):
         assert [found.level for found in of_devices(robot_file)] == ["ok", "ok"]
 
 
+@pytest.mark.realtime
 def test_a_device_that_does_not_answer_is_an_error(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].absent = True
@@ -175,6 +179,7 @@ def test_a_device_that_does_not_answer_is_an_error(robot_file: Path) -> None:
     assert (pan.level, pan.text, tilt.level) == ("error", "does not answer at 1000000 baud", "ok")
 
 
+@pytest.mark.realtime
 def test_a_device_that_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.do(Mute(ids=(1,), instruction="ping", skip=3, count=2))
@@ -183,6 +188,7 @@ def test_a_device_that_answers_now_and_then_has_a_bad_line(robot_file: Path) -> 
     assert "termination" in pan.fix
 
 
+@pytest.mark.realtime
 def test_another_device_than_the_file_says_is_an_error(robot_file: Path) -> None:
     with simulated(robot_file):
         text = robot_file.read_text(encoding="utf-8").replace("id = 1\n", 'id = 1\nfirmware = "44"\n')
@@ -192,6 +198,7 @@ def test_another_device_than_the_file_says_is_an_error(robot_file: Path) -> None
     assert pan.text == "its firmware is 45, and the robot file says 44"
 
 
+@pytest.mark.realtime
 def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         from trade_drivers.vendors.dynamixel import DynamixelDriver
@@ -204,6 +211,7 @@ def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
     assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
 
 
+@pytest.mark.realtime
 def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].memory.set("max_position_limit", 2500)
@@ -225,6 +233,7 @@ def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: 
 WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
 
 
+@pytest.mark.realtime
 def test_a_file_that_drivers_refuse_is_reported_for_all_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text(WRONG)
@@ -236,6 +245,7 @@ def test_a_file_that_drivers_refuse_is_reported_for_all_parts_and_ends_nothing(s
     assert f'{path}: gripper."left.hand".max_width_m: 85 is outside' in errors["bus hand"]
 
 
+@pytest.mark.realtime
 def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     said = CliRunner().invoke(app, ["doctor", str(robot_file), "--json"])
     assert said.exit_code == 1
@@ -247,6 +257,7 @@ def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     assert "0 errors" in well.output
 
 
+@pytest.mark.realtime
 def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = free_endpoint()
     monkeypatch.setenv("TRADE_CONNECT", nowhere)
@@ -258,6 +269,7 @@ def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pyt
     assert "no container is visible" not in said.stdout
 
 
+@pytest.mark.realtime
 def test_a_client_with_bad_certificates_is_not_advised_to_connect_without(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,6 +284,7 @@ def test_a_client_with_bad_certificates_is_not_advised_to_connect_without(
         assert error["fix"] == fix, error
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("text", "said"),
     [('system = "lab"', "trade gateway {} --check"), ('[system]\nname = "home"', "trade system up {} --check")],

@@ -13,6 +13,8 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade_gateway.process._kill_timer import TimerLease, uptime_s
 from trade_gateway.supervisor._single_instance import alone, is_free
 
+pytestmark = pytest.mark.realtime
+
 STAYS = """
 import os, signal, sys, threading
 from trade_gateway.process._parent_watch import end_with_stdin

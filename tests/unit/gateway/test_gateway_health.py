@@ -8,6 +8,8 @@ import pytest
 from trade_gateway.cli.robots._gateway import Gateway
 from trade_gateway.config._gateway_file import read_gateway_file
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def running(system: str, tmp_path: Path) -> Iterator[Gateway]:

@@ -75,6 +75,7 @@ def test_the_help_of_each_command_fits_a_narrow_terminal(name: str) -> None:
     assert [line for line in shown.output.splitlines() if len(line) > _WIDTH] == []
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("words", "expected", "other"),
     [("trade lo", {"lock", "locks", "logs"}, "up"), ("trade stream --h", {"--hz", "--help"}, "--json")],

@@ -21,6 +21,8 @@ from tests.support.two_joint_robot import Robot
 from trade import service
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.realtime
+
 
 class Shade(enum.Enum):
     WARM = "warm"

@@ -86,6 +86,7 @@ def test_services_are_listed_and_called_by_place_and_by_name(served: Opened) -> 
     assert {one["name"] for one in anna.ask("GET", "/containers").body} >= {"a", "b", "me"}
 
 
+@pytest.mark.realtime
 def test_the_page_about_it_does_what_it_says(served: Opened) -> None:
     text = (Path(__file__).parents[3] / "docs" / "http.md").read_text(encoding="utf-8")
     [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -98,6 +99,7 @@ def test_the_page_about_it_does_what_it_says(served: Opened) -> None:
     assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program), ended.stderr
 
 
+@pytest.mark.realtime
 def test_its_program_connects_over_https(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "http.md").read_text(encoding="utf-8")
     [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -175,6 +177,7 @@ def test_S03_what_a_session_moves_stops_with_it_and_nothing_of_another_does(serv
     assert (gone.status, gone.title) == (404, "NoSuchSession")
 
 
+@pytest.mark.realtime
 def test_S05_a_silent_session_ends_and_an_active_one_does_not(served: Opened) -> None:
     heard, silent = served.client("anna").opened(lease_s=2), served.client("bert").opened(lease_s=2)
     heard.call("robot.a.go_on", 1.0)
@@ -271,6 +274,7 @@ def test_S09_an_http_gateway_that_finds_no_container_does_not_say_that_no_e_stop
         assert (refused.status, refused.title) == (503, "NoContainerFound")
 
 
+@pytest.mark.realtime
 def test_S09_an_e_stop_that_no_container_received_is_no_success_and_stays_open(tmp_path: Path) -> None:
     with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
         anna = Client(made.url, add_token(tokens, "anna"))

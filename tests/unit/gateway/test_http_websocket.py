@@ -200,6 +200,7 @@ def test_S05_a_call_ends_with_the_page_that_made_it(served: Opened) -> None:
     assert served["a"].written == []
 
 
+@pytest.mark.realtime
 def test_S05_a_frozen_page_is_dropped_although_its_connection_is_open(served: Opened) -> None:
     """It answers no pings and takes nothing more; a stream fills what lies between."""
     served.robot.system.container("walker").register(Walker(), "walker")

@@ -263,6 +263,7 @@ def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:
     assert several == 4 * alone
 
 
+@pytest.mark.realtime
 @pytest.mark.usefixtures("_systemd")
 @pytest.mark.parametrize("robots", [[], ["rosie.toml"]], ids=["a gateway", "a robot's computer"])
 def test_systemd_takes_the_unit_and_finds_it_exposed_little(tmp_path: Path, robots: list[str]) -> None:
@@ -275,6 +276,7 @@ def test_systemd_takes_the_unit_and_finds_it_exposed_little(tmp_path: Path, robo
     assert judged.returncode == 0, judged.stdout
 
 
+@pytest.mark.realtime
 @pytest.mark.usefixtures("_systemd")
 def test_a_path_with_signs_that_mean_something_to_systemd_arrives_as_it_is(tmp_path: Path) -> None:
     folder = tmp_path / "a %i b"

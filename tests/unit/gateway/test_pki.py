@@ -370,6 +370,7 @@ def test_the_commands_say_what_is_wrong(folder: Path) -> None:
     assert said("issue", "x", "--hours", "0", "--ca", folder).exit_code == 2
 
 
+@pytest.mark.realtime
 def test_a_refusal_is_a_line_on_standard_error(folder: Path) -> None:
     import sys
 

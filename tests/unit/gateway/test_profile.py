@@ -9,6 +9,8 @@ from trade import Span
 from trade.errors import ConfigurationError
 from trade_gateway.cli.watching._profile import deviations, learn, read, sequences, statistics, write
 
+pytestmark = pytest.mark.realtime
+
 
 def span(call_id: int, service: str, **others: Any) -> Span:
     given: dict[str, Any] = {

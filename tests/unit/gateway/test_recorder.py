@@ -27,6 +27,8 @@ from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted
 
+pytestmark = pytest.mark.realtime
+
 
 class State(Struct):
     name: str

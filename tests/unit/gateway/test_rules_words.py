@@ -97,6 +97,7 @@ def trade(*words: str) -> Any:
     return CliRunner().invoke(app, list(words))
 
 
+@pytest.mark.realtime
 def test_rules_run_report_their_firings_are_listed_and_leave(
     run: Callable[..., Any], desk: Desk, file: Path, start_container: StartContainer
 ) -> None:
@@ -115,6 +116,7 @@ def test_rules_run_report_their_firings_are_listed_and_leave(
     assert running.wait(60) == 0
 
 
+@pytest.mark.realtime
 def test_a_changed_file_counts_and_a_wrong_one_does_not(run: Callable[..., Any], file: Path) -> None:
     running = run()
     assert message(running)["rule"] == "alone"
@@ -129,6 +131,7 @@ def test_a_changed_file_counts_and_a_wrong_one_does_not(run: Callable[..., Any],
     assert message(running) == {"reloaded": str(file)}
 
 
+@pytest.mark.realtime
 def test_a_dry_run_calls_nothing(run: Callable[..., Any], desk: Desk) -> None:
     fired = message(run("--dry-run"))
     assert (fired["rule"], fired["dry_run"], fired["steps"][0]["result"]) == ("alone", True, "would be called")
@@ -165,6 +168,7 @@ def test_help_has_an_example(command: str) -> None:
     assert f"For example: trade rules {command}" in re.sub(r"\s+", " ", trade("rules", command, "--help").stdout)
 
 
+@pytest.mark.realtime
 def test_nothing_is_left_of_rules_that_have_ended(run: Callable[..., Any], start_container: StartContainer) -> None:
     running, looker = run(), start_container("looker")
     looker.find(where(group="rules", name="rules"), wait_s=20)

@@ -20,6 +20,8 @@ from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
 from trade_hil_sim.damiao import DamiaoBus, Motor
 from trade_hil_sim.odrive import Axis, OdriveBus
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def line(tmp_path: Path) -> Iterator[DynamixelBus]:

@@ -203,6 +203,7 @@ def _whole(path: Path) -> int:
     return turn
 
 
+@pytest.mark.realtime
 def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: Path) -> None:
     *killed, done = _saver(tmp_path, "step by step").communicate(timeout=100)[0].split()
     assert (set(killed), done) == ({str(-signal.SIGKILL)}, "0")
@@ -211,6 +212,7 @@ def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: 
     assert outcomes == sorted(outcomes)
 
 
+@pytest.mark.realtime
 def test_killed_at_any_moment_every_confirmed_save_is_kept(tmp_path: Path) -> None:
     path, dice = tmp_path / "state.sqlite", random.Random(7)
     for _ in range(4):

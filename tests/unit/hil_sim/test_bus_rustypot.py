@@ -9,6 +9,8 @@ import rustypot
 from tests.support.waiting import wait_until
 from trade_hil_sim import DynamixelBus, writes
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def client(bus: DynamixelBus) -> Iterator[Any]:

@@ -10,6 +10,8 @@ import pytest
 from tests.support.waiting import wait_until
 from trade_hil_sim import DynamixelBus, Servo, instructions, motion_writes, writes
 
+pytestmark = pytest.mark.realtime
+
 OK = (0, 0)
 TORQUE, GOAL, POSITION = 64, 116, 132
 

@@ -34,6 +34,8 @@ from trade_hil_sim import (
     frames,
 )
 
+pytestmark = pytest.mark.realtime
+
 
 class Parrot:
     """A device that answers every frame ``100#data`` with ``200+id#data``."""

@@ -31,6 +31,8 @@ from trade_hil_sim import (
 )
 from trade_hil_sim.cia402 import OBJECTS, Cia402Bus, Drive, pdo_objects
 
+pytestmark = pytest.mark.realtime
+
 KINDS = {"u8": 5, "i8": 2, "u16": 6, "i16": 3, "u32": 7, "i32": 4, "text": 9}
 LEG = """
 [robot]

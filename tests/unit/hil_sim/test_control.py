@@ -16,6 +16,8 @@ from trade_hil_sim.control._server import ControlServer
 from trade_hil_sim.faults._commands import kinds_of
 from trade_hil_sim.faults._methods import FaultMethods
 
+pytestmark = pytest.mark.realtime
+
 KINDS: Final = kinds_of(Command)
 FIELDS: Final[dict[str, Any]] = {
     "bus": "neck",

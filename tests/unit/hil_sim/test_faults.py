@@ -35,6 +35,8 @@ from trade_hil_sim import (
     instructions,
 )
 
+pytestmark = pytest.mark.realtime
+
 TIMEOUT, CORRUPT = dynamixel_sdk.COMM_RX_TIMEOUT, dynamixel_sdk.COMM_RX_CORRUPT
 POSITION = 132
 

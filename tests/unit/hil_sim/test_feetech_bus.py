@@ -17,6 +17,8 @@ from tests.support.waiting import wait_until
 from trade_hil_sim import SimProcess, events, motion_writes, writes
 from trade_hil_sim.feetech import FeetechBus, PacketReader, Servo, encode, status
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def make_bus(tmp_path: Path) -> Iterator[Callable[..., FeetechBus]]:

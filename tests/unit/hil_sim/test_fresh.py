@@ -53,6 +53,7 @@ def test_one_of_two_of_one_id_is_unplugged_by_its_number(tmp_path: Path) -> None
         bus.do(Absent(nth=3))
 
 
+@pytest.mark.realtime
 def test_where_ids_are_unique_there_is_no_number(tmp_path: Path) -> None:
     with Cia402Bus([Drive(1)]) as bus, pytest.raises(SimulationError, match="not by nth"):
         bus.do(Absent(nth=1))

@@ -13,6 +13,8 @@ import serial
 from tests.support.waiting import wait_until
 from trade_hil_sim import ByteLog, SerialLine, SimulationError, received, sent
 
+pytestmark = pytest.mark.realtime
+
 
 class Parrot:
     """Answers what it hears; wakes at a set time."""

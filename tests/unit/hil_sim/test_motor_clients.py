@@ -15,7 +15,7 @@ from trade_hil_sim import events, frames
 from trade_hil_sim.damiao import DamiaoBus, Motor
 from trade_hil_sim.odrive import Axis, Control, OdriveBus
 
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.realtime, pytest.mark.filterwarnings("ignore")]
 NODE = 1
 
 

@@ -20,6 +20,8 @@ from trade_hil_sim.__main__ import main
 from trade_hil_sim.dynamixel import encode
 from trade_hil_sim.faults._commands import kinds_of
 
+pytestmark = pytest.mark.realtime
+
 COMMAND = [sys.executable, "-m", "trade_hil_sim"]
 
 

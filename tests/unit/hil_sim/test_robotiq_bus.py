@@ -20,6 +20,8 @@ from trade_hil_sim import Gripper, RobotiqBus, SimulationError
 from trade_hil_sim.robot._robot import buses_of, find_simulator
 from trade_hil_sim.robotiq import frame
 
+pytestmark = pytest.mark.realtime
+
 COMMAND, STATUS = 0x03E8, 0x07D0
 ANSWER_S = 0.5
 """Patience of the clients: simulator and client share two cores and one interpreter here."""

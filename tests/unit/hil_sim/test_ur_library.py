@@ -15,6 +15,8 @@ from tests.support.waiting import wait_until
 from trade_hil_sim import Arm, UrBus, events, instructions, motion_writes
 from trade_hil_sim.ur import HOME
 
+pytestmark = pytest.mark.realtime
+
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 DEADLINE_S = 60
 

@@ -30,6 +30,8 @@ from trade_hil_sim import (
 )
 from trade_hil_sim.ur import HOME
 
+pytestmark = pytest.mark.realtime
+
 PATIENCE_S = 30.0
 
 

@@ -108,6 +108,7 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
     assert stand.container.locks() == []
 
 
+@pytest.mark.realtime
 def test_an_unanswered_ros_service_raises_ros_unreachable_before_the_deadline(stand: Stand) -> None:
     """By default the bridge waits as long as a call lasts."""
     lab = Lab(stand)

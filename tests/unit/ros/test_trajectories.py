@@ -162,6 +162,7 @@ def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Limb) -> None:
     wait_until(lambda: stand.container.locks() == [])
 
 
+@pytest.mark.realtime
 def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     person = stand.memory.container("person")

@@ -429,6 +429,7 @@ def join(certificates: Path, policy: Policy, tmp_path: Path) -> Iterator[Join]:
         yield start
 
 
+@pytest.mark.realtime
 def test_containers_do_all_they_may_under_the_rules(
     join: Join, eventually: Callable[[Callable[[], bool]], bool]
 ) -> None:

@@ -298,6 +298,7 @@ def test_a_disabled_audit_record_adds_no_interceptor_and_no_file(
     assert list(tmp_path.glob("**/*.sqlite")) == []
 
 
+@pytest.mark.realtime
 def test_without_a_record_the_core_loads_no_database() -> None:
     program = "import sys, trade; sys.exit('sqlite3' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0

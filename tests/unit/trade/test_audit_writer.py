@@ -17,6 +17,8 @@ from trade._audit.hash_chain import AuditRow, ChainCheck, verify
 from trade._audit.store import AuditStore, Keep, moved_aside_in, reading
 from trade._audit.writer import AuditWriter
 
+pytestmark = pytest.mark.realtime
+
 Eventually = Callable[[Callable[[], bool]], bool]
 KEEP = Keep(90, 1_000_000)
 

@@ -10,6 +10,8 @@ import pytest
 from trade import Container, Meta, service, where
 from trade.errors import InvalidArgument
 
+pytestmark = pytest.mark.realtime
+
 
 class CMath:
     """The C library's own functions, through ctypes; other ways to C (cffi, extension modules) are used alike."""

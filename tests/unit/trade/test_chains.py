@@ -132,6 +132,7 @@ def test_an_asynchronous_service_commands_nothing_after_it_was_cancelled(
     assert (leaf.begun, type(outer.outcomes[0])) == (1, Cancelled)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("leaf", ["elsewhere"], indirect=True)
 def test_the_deadline_calls_what_ends_a_call_that_does_not_end_by_itself(
     here: Container, outer: Outer, leaf: Leaf

@@ -187,6 +187,7 @@ with memory_system() as system:
 """
 
 
+@pytest.mark.realtime
 def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
     if shutil.which("strace") is None:
         pytest.fail("there is no strace") if os.environ.get("CI") == "true" else pytest.skip("there is no strace")

@@ -14,6 +14,8 @@ from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport
 from trade.errors import CannotConnect, ConfigurationError, NoSuchService
 
+pytestmark = pytest.mark.realtime
+
 ALICE = ("alice", "pass:word")
 OTHERS = [("alice", "wrong"), ("bob", "pass:word"), None]
 

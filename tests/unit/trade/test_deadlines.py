@@ -57,6 +57,7 @@ def found(here: Container, name: str) -> Handle:
     return here.find(where(name=name, group="robot"), wait_s=20)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("how", ["call", "start", "acall"])
 def test_an_overrun_is_an_unknown_outcome(here: Container, there: Container, gate: Any, how: str) -> None:
     there.register(gate, "robot")
@@ -73,6 +74,7 @@ def test_an_overrun_is_a_timeout_error(here: Container, there: Container, gate: 
         found(here, "pass_through").with_(deadline_s=0.05)()
 
 
+@pytest.mark.realtime
 def test_an_answer_after_the_deadline_disturbs_no_later_call(here: Container, there: Container, gate: Any) -> None:
     there.register(gate, "robot")
     here.find(where(name="clock", container="there"), wait_s=20)()
@@ -161,6 +163,7 @@ def test_a_stop_knows_no_deadline(offer: Any) -> None:
     assert offer(Motor())("stop").with_(deadline_s=5)() is None
 
 
+@pytest.mark.realtime
 def test_S01_a_call_that_arrives_late_never_runs(start_program: Any, here: Container, tmp_path: Path) -> None:
     log = tmp_path / "log"
     program = start_program(COUNTING, str(log))
@@ -178,6 +181,7 @@ def test_S01_a_call_that_arrives_late_never_runs(start_program: Any, here: Conta
     assert log.read_text().splitlines() == ["moved", "moved"]
 
 
+@pytest.mark.realtime
 def test_S01_a_first_call_to_a_frozen_container_never_runs(start_program: Any, here: Container, tmp_path: Path) -> None:
     log = tmp_path / "log"
     program = start_program(COUNTING, str(log))
@@ -194,6 +198,7 @@ def test_S01_a_first_call_to_a_frozen_container_never_runs(start_program: Any, h
     assert log.read_text().splitlines() == ["moved"]
 
 
+@pytest.mark.realtime
 def test_a_stop_sent_to_a_frozen_container_runs_when_it_wakes(
     start_program: Any, here: Container, tmp_path: Path, eventually: Any
 ) -> None:

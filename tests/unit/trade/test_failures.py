@@ -15,6 +15,8 @@ from trade._protocol.messages import ErrorInfo
 from trade._protocol.remote_errors import RemoteTraceback, pack_error, unpack_error
 from trade.errors import CallerError, DeadlineExceeded, InvalidResult, LimitExceeded, RemoteError, TradeError
 
+pytestmark = pytest.mark.realtime
+
 CONCRETE = [
     kind
     for name in errors.__all__

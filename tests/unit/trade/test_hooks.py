@@ -315,6 +315,7 @@ def test_a_hook_that_fails_changes_nothing_and_is_suspended_in_the_end(
     assert (info.failures, info.suspended, info.last_error) == (3, True, "OSError: no film")
 
 
+@pytest.mark.realtime
 def test_a_slow_hook_is_cut_off(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
@@ -328,6 +329,7 @@ def test_a_slow_hook_is_cut_off(
     assert observer.times == 3
 
 
+@pytest.mark.realtime
 def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, observer: Observer) -> None:
     [plan, *_] = here.register(Planner(), "mind")
     here.register(observer, "eye")
@@ -337,6 +339,7 @@ def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, obser
     assert hook.infos()[0].failures == 1
 
 
+@pytest.mark.realtime
 def test_what_is_too_late_after_its_hooks_does_not_run(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
@@ -369,6 +372,7 @@ def test_the_gates_are_checked_after_the_hooks(
     grabber.lock.release()
 
 
+@pytest.mark.realtime
 def test_nothing_comes_before_a_stop_and_what_comes_after_does_not_hold_it_up(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer
 ) -> None:

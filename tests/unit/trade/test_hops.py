@@ -74,6 +74,7 @@ def test_deadline_and_chain_go_over_two_hops(hops: Any) -> None:
     assert 0 < remaining_s <= 5
 
 
+@pytest.mark.realtime
 def test_S01_what_expired_two_hops_away_runs_nowhere(hops: Any, start_container: Callable[..., Container]) -> None:
     last = start_container("last")
     counter = Counter()

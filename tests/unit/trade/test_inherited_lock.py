@@ -45,6 +45,7 @@ def lamp(there: Container) -> Container:
     return there
 
 
+@pytest.mark.realtime
 def test_a_child_calls_under_the_lock_of_its_parent_until_it_is_given_back(
     lamp: Container, here: Container, start_program: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,8 @@ from trade.errors import (
     Stopped,
 )
 
+pytestmark = pytest.mark.realtime
+
 # --- S12 and S14: loss
 
 

@@ -8,6 +8,8 @@ import pytest
 from trade import Container, Handle, service, where
 from trade.errors import ContainerLost, ServiceGone
 
+pytestmark = pytest.mark.realtime
+
 DRIVER = """
 import threading
 class Driver:

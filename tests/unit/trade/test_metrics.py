@@ -174,6 +174,7 @@ def test_when_off_nothing_is_counted_and_no_service_is_wrapped(here: Container, 
     assert there.metrics_port == 0
 
 
+@pytest.mark.realtime
 def test_the_core_loads_the_library_only_if_it_is_wanted() -> None:
     program = "import sys, trade; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0

@@ -3,8 +3,12 @@
 import queue
 from typing import Any
 
+import pytest
+
 from tests.support.waiting import wait_until
 from trade import Container, HookEvent, service, where
+
+pytestmark = pytest.mark.realtime
 
 PLANNER = """
 class Planner:

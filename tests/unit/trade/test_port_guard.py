@@ -14,7 +14,10 @@ from trade import Container, Settings
 from trade._transport.endpoints import Endpoint, free_endpoint
 from trade._transport.port_guard import MOST_STRANGERS, PortGuard
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only")
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only"),
+]
 
 
 @pytest.fixture

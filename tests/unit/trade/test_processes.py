@@ -13,6 +13,8 @@ from trade import Container, Settings, service, where
 from trade._container import default
 from trade.errors import ConfigurationError, NoSuchService
 
+pytestmark = pytest.mark.realtime
+
 
 class Lamp:
     @service(effect="read")

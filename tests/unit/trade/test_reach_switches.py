@@ -12,6 +12,8 @@ from trade import Container, Handle, where
 from trade._transport.endpoints import Endpoint, free_endpoint
 from trade.errors import CannotConnect, ConfigurationError, LinkStays, NoSuchService
 
+pytestmark = pytest.mark.realtime
+
 
 @pytest.fixture
 def apart(start_container: Any) -> tuple[Container, Container]:

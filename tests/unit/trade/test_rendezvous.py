@@ -73,6 +73,7 @@ def test_a_file_of_before_this_host_was_started_is_old(system: str, folder: Path
         assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
 
 
+@pytest.mark.realtime
 def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
     system: str, folder: Path, start_program: Any
 ) -> None:
@@ -153,6 +154,7 @@ def test_a_folder_that_is_a_link_is_refused(system: str, tmp_path: Path) -> None
         HostFolder(system)
 
 
+@pytest.mark.realtime
 def test_containers_that_start_at_the_same_moment_see_each_other(start_program: Any, system: str) -> None:
     source = """
         for round in range(10):

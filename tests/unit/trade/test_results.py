@@ -108,6 +108,7 @@ def ask(start_program: Any, here: Container) -> Callable[..., Any]:
     return lambda name, *args: here.find(where(name=name, group="robot"), wait_s=20)(*args)
 
 
+@pytest.mark.realtime
 def test_results_of_unknown_types_are_records(ask: Callable[..., Any]) -> None:
     snapshot = ask("snapshot")
     assert (snapshot.pose.x_m, snapshot.pose.y_m) == (1.5, 0.25)
@@ -124,6 +125,7 @@ def test_results_of_unknown_types_are_records(ask: Callable[..., Any]) -> None:
     assert (tree.name, tree.inner) == ("root", [{"name": "leaf", "inner": []}])
 
 
+@pytest.mark.realtime
 def test_records_and_mappings_pass_as_arguments_of_unknown_types(ask: Callable[..., Any]) -> None:
     pose = ask("maybe", True)
     assert ask("go", pose).x_m == 2.0
@@ -203,6 +205,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.realtime
 def test_what_a_program_defines_is_known_by_the_name_it_is_imported_by(
     tmp_path: Path, system: str, here: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:

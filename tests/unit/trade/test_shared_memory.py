@@ -2,7 +2,11 @@
 
 from typing import Any
 
+import pytest
+
 from trade import Container, where
+
+pytestmark = pytest.mark.realtime
 
 OFFERS = """
     class Lamp:

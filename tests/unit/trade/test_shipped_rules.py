@@ -85,6 +85,7 @@ def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) 
     assert reported == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
 
 
+@pytest.mark.realtime
 def test_bootstrap_stays_discoverable_until_a_provider_that_can_see_has_joined(
     start_container: StartContainer, only: Only, here: Container
 ) -> None:
@@ -217,6 +218,7 @@ def test_a_dry_run_of_relocating_says_whom_it_would_ask_and_moves_nothing(
     mind.register(planner, "mind.planner")
     mind.set_health(planner, "degraded: the host is too hot")
     wait_until(lambda: here.services(where(name="plan", healthy=False)))
+    here.find(where(name="migrate", container="mind"), wait_s=30)
     [rehearsal] = rehearse(here, {"relocate": read_rules(SHIPPED)["relocate"]})
     [step] = rehearsal.steps
     assert (step.service, step.container, step.result) == ("trade.migrate", "mind", "would be called")

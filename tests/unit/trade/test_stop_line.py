@@ -116,6 +116,7 @@ def test_no_stop_is_refused_for_the_length_of_its_reason(driver: Container, lamp
     assert driver.estop_clear(["1234abcd"]).complete
 
 
+@pytest.mark.realtime
 def test_what_is_asked_of_many_is_one_estop(driver: Container, start_container: StartContainer, lamp: Lamp) -> None:
     others = [start_container(f"arm{number}") for number in range(6)]
     for other in others:

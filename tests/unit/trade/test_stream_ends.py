@@ -275,6 +275,7 @@ def test_a_source_refuses_a_listener_that_bypasses_the_policy(start_container: A
         start_container("here").stream(where(name="count", group="rosie"))
 
 
+@pytest.mark.realtime
 def test_a_listener_that_loses_the_right_gets_no_more_samples(start_container: Any, tmp_path: Any) -> None:
     there = start_container("there", policy=policy_file(tmp_path, 'read = ["rosie"]'))
     there.register(Battery(), "rosie")
@@ -303,6 +304,7 @@ hear()
 """
 
 
+@pytest.mark.realtime
 def test_a_source_that_is_killed_is_lost(start_container: Any, start_program: Any) -> None:
     program = start_program(SOURCE)
     assert program.heard() == "up"

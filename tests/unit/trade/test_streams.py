@@ -119,6 +119,7 @@ def test_samples_of_another_rate_are_counted_for_themselves(apart: Two) -> None:
     assert [sample.dropped for sample in some(stream, 3)] == [0, 0, 1]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("passing", "wanted", "given"),
     [
@@ -151,6 +152,7 @@ def test_a_listener_behind_a_gateway_gets_the_rate_that_it_passes(
     assert put[-1].rpartition("/")[2] == f"{given:g}"
 
 
+@pytest.mark.realtime
 def test_when_a_gateway_lets_more_pass_or_less_its_listeners_follow(
     apart: Two, monkeypatch: pytest.MonkeyPatch, eventually: Any
 ) -> None:

@@ -79,6 +79,7 @@ def test_public_names_are_sorted_and_complete() -> None:
     assert public - {"Any", "datetime", "Iterable", "Mapping", "Sequence"} <= set(trade.__all__)
 
 
+@pytest.mark.realtime
 def test_importing_trade_needs_nothing_of_one_operating_system_and_no_hardware(start_program: Any) -> None:
     program = start_program(
         """

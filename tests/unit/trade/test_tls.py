@@ -27,6 +27,8 @@ from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import AccessDenied, CannotConnect, ConfigurationError, ContainerLost, NoSuchService
 
+pytestmark = pytest.mark.realtime
+
 
 class Echo:
     @service(effect="read")

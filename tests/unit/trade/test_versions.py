@@ -133,6 +133,7 @@ def stranger(memory: MemorySystem) -> Iterator[Strangers]:
 
     def join(**how: Any) -> Stranger:
         made.append(Stranger(memory, **how))
+        memory.settle()
         return made[-1]
 
     yield join

@@ -14,6 +14,8 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _action_client
 
+pytestmark = pytest.mark.realtime
+
 TEST = "actionlib/action/Test"
 ENDLESS, ABORTS, HANGS = 0, -1, -2
 SUCCEEDED, PREEMPTED, ABORTED, RECALLED = 3, 2, 4, 8

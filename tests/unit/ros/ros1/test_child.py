@@ -21,6 +21,8 @@ from trade_gateway.ros.ros1._child import environment
 from trade_gateway.ros.ros1._node import _heart
 from trade_gateway.ros.ros1._node._frames import Channel, Head
 
+pytestmark = pytest.mark.realtime
+
 LIVES = """
 import sys, time
 from trade_gateway.ros.ros1 import Ros1

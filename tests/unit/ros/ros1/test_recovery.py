@@ -12,6 +12,8 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1
 
+pytestmark = pytest.mark.realtime
+
 TEXT = "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
 

@@ -14,6 +14,8 @@ from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros1 import Ros1, _link, _service
 from trade_gateway.ros.ros1._service import Served
 
+pytestmark = pytest.mark.realtime
+
 TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
 

@@ -10,6 +10,8 @@ from tests.support.waiting import wait_until
 from trade.errors import ConfigurationError
 from trade_gateway.ros.ros1 import Ros1
 
+pytestmark = pytest.mark.realtime
+
 TEXT = "std_msgs/msg/String"
 JOINTS = "sensor_msgs/msg/JointState"
 

@@ -30,6 +30,8 @@ from trade_gateway.ros._graph import Ended, Goal, Outcome, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 from trade_gateway.ros.ros2._names import Kind
 
+pytestmark = pytest.mark.realtime
+
 # --- our server, and a client of keys and bytes
 
 

@@ -10,6 +10,8 @@ from tests.support.waiting import wait_until
 from trade_gateway.ros.ros2 import Ros2
 from trade_gateway.ros.ros2._names import Kind, gid
 
+pytestmark = pytest.mark.realtime
+
 
 class Reports:
     """Of nodes."""

@@ -13,6 +13,8 @@ from tests.unit.ros.ros2.fibonacci_action import ATTACHMENT, CDR, LONG_S, OTHER,
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 
+pytestmark = pytest.mark.realtime
+
 # --- our client, and a server of keys and bytes
 
 

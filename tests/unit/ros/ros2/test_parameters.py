@@ -12,6 +12,8 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 
+pytestmark = pytest.mark.realtime
+
 LONG_S = 60.0
 SRV = "rcl_interfaces/srv"
 SERVICES = {

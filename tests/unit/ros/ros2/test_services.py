@@ -15,6 +15,8 @@ from trade_gateway.ros.ros2 import Ros2
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._services import Client
 
+pytestmark = pytest.mark.realtime
+
 ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
 

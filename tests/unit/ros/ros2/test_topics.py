@@ -10,6 +10,8 @@ from tests.support.waiting import wait_until
 from trade.errors import ConfigurationError
 from trade_gateway.ros.ros2 import Ros2
 
+pytestmark = pytest.mark.realtime
+
 STRING = "std_msgs/msg/String"
 
 
