@@ -17,7 +17,7 @@ HOURS ?= 1
 MUTANT ?=
 MINIMISE ?=
 
-.PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation
+.PHONY: demo screenshots docs release-check test test-all test-socketcan soak soak-registry soak-relocation
 .PHONY: chaos chaos-locks chaos-robots siege mutants
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
@@ -36,16 +36,21 @@ $(UV):
 demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
 	@$(RUN) --no-dev --group demo python examples/demo.py $(ARGS)
 
-test: $(UV) ## the whole test suite; in parts; the others run also when one fails
-	@mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; \
-	failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
-	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
-	part -n 2 --dist loadfile --ignore tests/unit/drivers --ignore tests/contract --ignore tests/system --ignore tests/bench --ignore tests/endurance/chaos --ignore tests/endurance/soak; \
-	part -n 2 --dist loadfile tests/system tests/bench tests/endurance/chaos tests/endurance/soak --ignore tests/system/test_demo.py --ignore tests/system/browser --ignore tests/system/peers; \
-	part -n 2 --dist loadfile tests/unit/drivers tests/contract; \
-	part -n 2 --dist loadfile tests/system/browser tests/system/peers/test_conformance.py; \
-	part tests/system/peers/test_rust.py tests/system/test_demo.py; \
-	test -z "$$failed" || { echo "failed, of all parts:"; cat build/failures; exit 1; }
+# Tests side by side, then those that need the processors for themselves. The second part also runs when the first fails.
+ALONE := tests/system/peers/test_conformance.py tests/system/test_demo.py
+TOGETHER := -n 4 --dist worksteal tests $(ALONE:%=--ignore %)
+APART := -n 2 --dist loadfile $(ALONE)
+define run-tests
+mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; failed=; \
+part() { code=0; $(RUN) pytest --durations=15 "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
+part $(1) $(TOGETHER); part $(1) $(APART); test -z "$$failed" || { echo "failed, of all parts:"; cat build/failures; exit 1; }
+endef
+
+test: $(UV) ## each promise, rule of motion, fault, complaint and contract; 10 minutes on two cores
+	@$(call run-tests,-m "not slow and not mutant")
+
+test-all: $(UV) ## the whole test suite; 30 minutes on two cores
+	@$(call run-tests,)
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/system/socketcan/run pytest tests/system/socketcan $(ARGS)
@@ -59,14 +64,14 @@ siege: export SIEGE_MINUTES := $(MINUTES)
 siege: export SIEGE_MUTANT := $(MUTANT)
 siege: export SEED := $(SEED)
 siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
-	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:tests.support.rerun $(ARGS) || { \
+	@$(RUN) pytest -s -n 0 tests/system/test_siege.py $(ARGS) || { \
 	  test -z "$(MINIMISE)" || $(RUN) python -m tests.system.siege_minimised; exit 1; }
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
 mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's)
-	@$(RUN) pytest -m mutant -p tests.support.mutant_table -p no:tests.support.rerun tests tests/endurance/siege_mutants.py $(ARGS)
+	@$(RUN) pytest -m mutant -p tests.support.mutant_table tests tests/endurance/siege_mutants.py $(ARGS)
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
 	@$(RUN) --group fuzz python -m tests.endurance.fuzz --minutes $(MINUTES) $(ARGS)
@@ -78,7 +83,7 @@ soak-registry: $(UV) ## three containers on two hosts register at the same momen
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
 soak-relocation: $(UV) ## a host is lost 100 times, with random trouble between; never two (SEED=..; root, iproute2; 45 min)
-	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:tests.support.rerun $(ARGS)
+	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, spelling, plain English, isolated install of the core
 	@$(RUN) ruff check

@@ -14,7 +14,8 @@ import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
 from tests.bench._children import Job
 from tests.bench._flood import FLOODS
-from tests.bench._others import Rpyc
+from tests.bench._others import Grpc, Pyro5, Rpyc
+from tests.bench._peers import Tcp
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
@@ -52,6 +53,7 @@ def succeed(_: object) -> None:
     print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
 
 
+@pytest.mark.slow
 def test_a_part_that_fails_twice_is_reported_and_the_others_continue(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -68,6 +70,7 @@ def test_a_part_that_fails_twice_is_reported_and_the_others_continue(
     assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_part_that_fails_once_is_measured_again(tmp_path: Path) -> None:
     attempts = iter((True, False))
 
@@ -86,17 +89,19 @@ PEERS = ("raw TCP", "bare zenoh pair", "bare zenoh query", "TRADE ", "rpyc", "Py
 SIZES = ("64 B", "4 KiB", "64 KiB", "2 MiB")
 
 
+@pytest.mark.slow
 def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     printed = bench("calls", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
     each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    others = ["Pyro5", "gRPC"] if Viam().missing else ["Pyro5", "gRPC", Viam.name]
-    small = (*each, *(f"p50 / {other}" for other in others), "p99 / p50")
+    others = [peer.name for peer in (Tcp(), Rpyc(), Pyro5(), Grpc(), Rospy(), Viam()) if not peer.missing]
+    small = (*each[:2], *(f"p50 / {other}" for other in others), "p99 / p50")
     of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
     assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
 
+@pytest.mark.slow
 def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> None:
     printed = bench("in-flight", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, threads"):
@@ -105,6 +110,7 @@ def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> No
     assert targets(printed) == [*shares[:2], "64 B, 32 in flight: /s", *shares[2:]]
 
 
+@pytest.mark.slow
 def test_the_bench_of_checks_prints_each_thing_that_may_be_added_to_a_call() -> None:
     printed = bench("checks", "-n", "3", "--rounds", "1")
     for kind in ("lock held", "hooks: 1 ", "hooks: 10", "TLS and policy"):
@@ -112,11 +118,19 @@ def test_the_bench_of_checks_prints_each_thing_that_may_be_added_to_a_call() -> 
     assert len(re.findall(r"takes +[0-9.]+ x the p50", printed)) == 5
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
     printed = bench("supervisor", "--rounds", "1", "--idle", "1")
-    assert targets(printed) == ["supervisor: % of a core", "crash to serving, s", "crash to serving / plain start"]
+    assert targets(printed) == [
+        "supervisor: % of a core",
+        "crash to serving, s",
+        "crash to serving / plain start",
+        "one bus: to service, s",
+        "one bus: RSS, MiB",
+    ]
 
 
+@pytest.mark.slow
 def test_a_peer_that_is_not_installed_is_named_and_skipped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -126,6 +140,7 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's figures of threads are Linux's")
 def test_what_each_thread_of_a_call_takes_is_printed_for_both_ends() -> None:
     command = [sys.executable, "-m", "tests.bench.threads", "-n", "50"]
@@ -136,6 +151,7 @@ def test_what_each_thread_of_a_call_takes_is_printed_for_both_ends() -> None:
         assert "python, main" in block
 
 
+@pytest.mark.slow
 def test_rospy_answers_under_the_Python_that_it_is_installed_for_and_its_master_ends_with_it() -> None:
     need_ros1()
     with up([Rospy()]) as [rospy]:
@@ -156,35 +172,43 @@ def test_the_Viam_SDK_answers_in_an_environment_of_its_own() -> None:
     assert many.calls_per_s > 0
 
 
+@pytest.mark.slow
 def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
     printed = bench("local", "-n", "3", "--rounds", "2", "--json", str(tmp_path / "run.json"))
-    assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call"]
+    assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call", "local: attribute / handle"]
     run = Run.read(tmp_path / "run.json")
     assert [target.name for target in run.targets] == targets(printed)
     assert [(point.part, point.name) for point in run.points] == [
-        ("local", name) for name in ("plain method", "strict", "strict=False")
+        ("local", name) for name in ("plain method", "strict", "strict=False", "strict, attribute")
     ]
     assert all(point.n == 2 * 50 * 3 and point.values["us"].rounds == 2 for point in run.points)
     assert run.took_s is not None
     assert run.arguments == ["local", "-n", "3", "--rounds", "2"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_registry_prints_its_targets() -> None:
     printed = bench("registry", "--services", "30", "--rounds", "1")
     assert targets(printed) == ["late joiner: s", "remote service: KiB", "find: us"]
     assert "missed up to" not in printed
 
 
+@pytest.mark.slow
 def test_the_bench_of_locks_prints_its_targets() -> None:
-    assert targets(bench("locks", "-n", "3", "--rounds", "1")) == ["lock and unlock / call", "checked / unchecked call"]
+    assert targets(bench("locks", "-n", "3", "--rounds", "1")) == [
+        "lock and unlock / call on the transport",
+        "checked / unchecked call",
+    ]
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_can_bus_prints_its_targets() -> None:
     printed = bench("can", "--rounds", "1", "--seconds", "0.5")
     assert targets(printed) == ["late at 500 Hz, 1 TPDO, %", "late at 400 Hz, 2 TPDO, %"]
     assert printed.count("late in an empty loop") == 2
 
 
+@pytest.mark.slow
 def test_the_bench_of_a_whole_robot_prints_its_target() -> None:
     printed = bench("rosie", "--rounds", "2", "--seconds", "0.5")
     assert "legs 200 Hz" in printed
@@ -192,20 +216,24 @@ def test_the_bench_of_a_whole_robot_prints_its_target() -> None:
     assert targets(printed) == ([] if lost else ["all drivers: % of a core"])
 
 
+@pytest.mark.slow
 def test_the_bench_of_watching_prints_its_targets() -> None:
     printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
     assert targets(printed) == ["merged ticks, %", "another watched / none"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_audit_records_prints_its_targets() -> None:
     printed = bench("audit", "-n", "3", "--rounds", "1", "--seconds", "0.3")
     assert targets(printed) == ["p50: audit on / off", "p99: audit on / off", "records/s written"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_streams_prints_its_target() -> None:
     assert targets(bench("streams", "--rounds", "1", "--seconds", "0.1")) == ["five listeners / one"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
@@ -213,18 +241,21 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     assert targets(printed) == ["fast sync / limit", "CPU at 100 Hz, fast", "CPU at 100 Hz, plain"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
     printed = bench("feetech", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "142 bytes a cycle" in printed
     assert targets(printed) == ["Feetech sync / limit", "CPU at 100 Hz, Feetech"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_arms_prints_its_targets() -> None:
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
     printed = bench("arm", "--rounds", "1", "--seconds", "0.5")
     assert targets(printed) == ["set-points/s, driver"]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() -> None:
     if reason := why_not():
@@ -245,11 +276,13 @@ def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() 
         assert len(re.findall(rf"^{flood.name} .*[1-9]", printed, re.MULTILINE)) == 1
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_deadman_prints_every_way_to_end() -> None:
     printed = bench("deadman", "--rounds", "1")
     assert targets(printed) == ["killed in a call", "killed in a start", "frozen in a call", "frozen in a jog"]
 
 
+@pytest.mark.slow
 def test_the_bench_of_many_containers_prints_its_targets() -> None:
     printed = bench("scale", "--containers", "4", "--idle", "0.2")
     ours = [
@@ -262,6 +295,15 @@ def test_the_bench_of_many_containers_prints_its_targets() -> None:
     assert targets(printed) == [*ours, *processes]
 
 
+@pytest.mark.slow
+def test_the_bench_of_containers_behind_a_hub_prints_its_targets() -> None:
+    printed = bench("hub", "--containers", "4", "--idle", "0.2")
+    if "behind a hub: skipped" not in printed:
+        assert targets(printed) == ["behind a hub: % of a core, each", "behind a hub: a join, s"]
+        assert re.search(r"^  the hub +\d+ open files$", printed, re.MULTILINE)
+
+
+@pytest.mark.slow
 def test_a_stand_in_costs_what_a_container_costs() -> None:
     """So what is counted of a thousand, most of them stand-ins, is what a thousand containers would cost."""
     whole, others = measure(6), measure(6, whole=2)

@@ -107,6 +107,7 @@ def test_each_room_has_a_row(package: str) -> None:
     assert sorted(shown()[package]) == sorted(rooms(package))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_classes_of_a_row_are_in_its_rooms(package: str) -> None:
     rows: dict[frozenset[str], set[str]] = {}

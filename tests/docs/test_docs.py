@@ -30,6 +30,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+@pytest.mark.slow
 def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> None:
     [program] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     path, last = tmp_path / "program.py", program.strip().splitlines()[-1]
@@ -87,6 +88,7 @@ def test_every_error_is_in_the_guides_table() -> None:
     assert set(errors.__all__) - branches - named == set()
 
 
+@pytest.mark.slow
 def test_the_command_for_the_simulator_strikes_it() -> None:
     page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
     [command] = re.findall(r"```sh\n(trade-hil-sim --do .*?)\n```", page)

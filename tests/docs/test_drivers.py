@@ -37,6 +37,7 @@ def rests_rad(sim: SimProcess, joint: str) -> list[float]:
     return [round(one.position_rad or 0.0, 2) for one in events(sim.entries(), "at_rest") if one.joint == joint]
 
 
+@pytest.mark.slow
 @of(PAGE, "Drivers")
 def test_a_robot_is_attached_and_moved(sim: SimProcess, play: Play) -> None:
     play.run()
@@ -44,6 +45,7 @@ def test_a_robot_is_attached_and_moved(sim: SimProcess, play: Play) -> None:
     assert rests_rad(sim, "neck.tilt") == pytest.approx([0.2], abs=0.02)
 
 
+@pytest.mark.slow
 @of(PAGE, "Trajectories")
 def test_a_trajectory_is_followed(sim: SimProcess, play: Play) -> None:
     with attach(load("examples/head.toml")) as rosie:

@@ -27,6 +27,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_program_of_a_package_says_what_its_page_says(package: str, system: str, folder: Path) -> None:
     [program] = blocks(page(package), "python")
@@ -44,6 +45,7 @@ def test_the_program_of_a_package_says_what_its_page_says(package: str, system: 
         assert ended.returncode == 0, ended.stderr
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_gateways_page(system: str, folder: Path) -> None:
     [commands] = blocks(page("gateway"), "sh")
     up, *others = commands.text.splitlines()

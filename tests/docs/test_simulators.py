@@ -4,6 +4,8 @@ import shutil
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.docs.blocks import DOCS, ROOT, of, said, sections
 from tests.docs.conftest import Play
 from trade_drivers import attach, load
@@ -15,6 +17,7 @@ def test_every_program_of_the_page_is_run() -> None:
     assert sections(iter([DOCS / PAGE]), "python") == said(globals())
 
 
+@pytest.mark.slow
 @of(PAGE, "Run it")
 def test_a_simulator_in_a_program(play: Play, tmp_path: Path) -> None:
     (tmp_path / "examples").mkdir()

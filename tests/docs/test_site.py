@@ -59,6 +59,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
     return {path: Page(path) for path in folder.rglob("*.html")}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # 15 s of a processor
 def test_the_site_has_all_pages_and_each_link_leads_somewhere(site: dict[Path, Page]) -> None:
     names = {path.stem for path in site}
@@ -66,6 +67,7 @@ def test_the_site_has_all_pages_and_each_link_leads_somewhere(site: dict[Path, P
     assert not sorted(_dead(site))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_site_loads_nothing_from_elsewhere(site: dict[Path, Page]) -> None:
     loaded = {link.to for page in site.values() for link in page.links if link.tag in ("script", "link", "img")}

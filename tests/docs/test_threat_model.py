@@ -47,6 +47,7 @@ def _modules() -> list[Path]:
     return [path for room in ("trade", "drivers", "gateway", "hil-sim") for path in (ROOT / room / "src").rglob("*.py")]
 
 
+@pytest.mark.slow
 def test_nothing_is_unpickled_or_evaluated() -> None:
     found: list[str] = []
     for path in _modules():

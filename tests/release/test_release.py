@@ -16,6 +16,8 @@ from tests.release._build import MEMBERS, ROOT, build
 from tests.release._licences import AS_THEY_ARE, licence, not_permissive
 from tests.release._pythons import pythons
 
+pytestmark = pytest.mark.slow
+
 UV = os.environ.get("UV") or shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
 needs_uv = pytest.mark.skipif(not Path(UV).exists(), reason="uv is not there; `make` fetches it into .uv/")
 

@@ -6,6 +6,8 @@ import pytest
 
 from tests.release import wheels
 
+pytestmark = pytest.mark.slow
+
 
 def test_all_but_one_library_can_be_installed_on_arm64_without_a_compiler() -> None:
     assert wheels.lacking(wheels.LOCK.read_text(encoding="utf-8")).keys() == wheels.ALLOWED

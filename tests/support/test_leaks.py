@@ -34,6 +34,7 @@ LEAKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", LEAKS)
 def test_a_test_that_leaves_something_behind_fails(what: str, pytester: pytest.Pytester) -> None:
     conftest = Path(__file__).parents[1].joinpath("conftest.py").read_text(encoding="utf-8")

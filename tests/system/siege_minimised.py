@@ -29,7 +29,7 @@ def fewest(kinds: Sequence[str], fails: Callable[[Sequence[str]], bool]) -> list
 
 def besiege(minutes: float, **settings: str) -> "subprocess.CompletedProcess[str]":
     """Runs one siege in a process of its own, with more settings in its environment."""
-    options = ("-q", "-n", "0", "-p", "no:tests.support.rerun", "-k", "whatever_faults_occur")
+    options = ("-q", "-n", "0", "-k", "whatever_faults_occur")
     return subprocess.run(
         [sys.executable, "-m", "pytest", *options, str(_TEST)],
         env={**os.environ, "SIEGE_MINUTES": str(minutes), **settings},

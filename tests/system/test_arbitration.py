@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tests.support.waiting import wait_until
 from tests.system.conftest import Program, Rosie
 from trade import Container, where
@@ -21,6 +23,7 @@ def reported(program: Program, until: str) -> str:
     return line
 
 
+@pytest.mark.slow
 def test_navigation_asks_for_the_head_and_gets_it(
     rosie_up: Callable[[], Rosie], run: Callable[..., Program], start_container: Callable[..., Container]
 ) -> None:

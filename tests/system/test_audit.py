@@ -14,6 +14,8 @@ from tests.system.conftest import Rosie
 from trade import Container, where
 from trade.errors import AccessDenied, InvalidArgument, LockedByOther, Stopped
 
+pytestmark = pytest.mark.slow
+
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 
 

@@ -70,6 +70,7 @@ def test_containers_with_no_way_to_each_other_work_together_through_a_bridge(
     assert left[0].ask("gone") == ["r1"] * PROVIDERS
 
 
+@pytest.mark.slow
 def test_containers_with_certificates_work_together_through_a_bridge_and_strangers_do_not(
     member: StartMember, two_networks: None, tmp_path: Path
 ) -> None:
@@ -93,6 +94,7 @@ def test_containers_with_certificates_work_together_through_a_bridge_and_strange
     all_work_together([stranger])
 
 
+@pytest.mark.slow
 def test_when_a_bridge_dies_neighbours_work_on_and_the_far_come_back_with_the_next_one(
     member: StartMember, two_networks: None
 ) -> None:
@@ -118,6 +120,7 @@ def test_when_a_bridge_dies_neighbours_work_on_and_the_far_come_back_with_the_ne
         assert left[0].ask("use") == 3
 
 
+@pytest.mark.slow
 def test_containers_on_the_host_of_the_bridge_take_part_in_any_start_order(
     member: StartMember, two_networks: None
 ) -> None:
@@ -129,6 +132,7 @@ def test_containers_on_the_host_of_the_bridge_take_part_in_any_start_order(
     all_work_together([early, bridge, left, right, late])
 
 
+@pytest.mark.slow
 def test_private_networks_dial_out_and_messages_cross_two_bridges_in_a_row(
     networks: Networks, member: StartMember
 ) -> None:
@@ -154,6 +158,7 @@ def test_private_networks_dial_out_and_messages_cross_two_bridges_in_a_row(
     all_work_together([robot, arm, desk, laptop, guest, single])
 
 
+@pytest.mark.slow
 def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMember, two_networks: None) -> None:
     bridge = up(member("between", "bridge", BRIDGE, bridge="net1,net2"))
     left = up(member("left1", "l1", "10.231.1.2:0"))
@@ -170,6 +175,7 @@ def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMemb
         second.ask("connect", LEFT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linked", [True, False])
 def test_when_one_of_two_parallel_bridges_dies_no_call_runs_twice(
     networks: Networks, member: StartMember, linked: bool
@@ -198,6 +204,7 @@ def test_when_one_of_two_parallel_bridges_dies_no_call_runs_twice(
     assert left.ask("gone") == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bridge", "listen", "problem"),
     [
@@ -219,6 +226,7 @@ def test_a_bridge_that_cannot_join_its_networks_says_what_to_do(
         refused.ask("start")
 
 
+@pytest.mark.slow
 def test_a_bridge_may_listen_on_all_networks_of_its_host(member: StartMember, two_networks: None) -> None:
     bridge = up(member("between", "bridge", "0.0.0.0:7450", bridge="net1,net2"))
     left = up(member("left1", "l1", "10.231.1.2:0"), LEFT)
@@ -226,6 +234,7 @@ def test_a_bridge_may_listen_on_all_networks_of_its_host(member: StartMember, tw
     all_work_together([bridge, left, right])
 
 
+@pytest.mark.slow
 def test_all_containers_on_one_network_are_linked_to_each_other(networks: Networks, member: StartMember) -> None:
     networks.lay("net", left="10.231.1.1", right="10.231.1.2")
     # Two of them can dial, but not be dialled.
@@ -240,6 +249,7 @@ def test_all_containers_on_one_network_are_linked_to_each_other(networks: Networ
     all_work_together(members)
 
 
+@pytest.mark.slow
 def test_a_group_spans_two_hosts_grows_and_shrinks(networks: Networks, member: StartMember) -> None:
     networks.lay("net", left="10.231.1.1", right="10.231.1.2")
     left, right = member("left", "l", "10.231.1.1:7450"), member("right", "r", "10.231.1.2:0")

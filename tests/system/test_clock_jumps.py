@@ -51,6 +51,7 @@ def wall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Wall:
     return made
 
 
+@pytest.mark.slow
 def test_no_lock_is_lost_no_call_fails_and_the_record_stays_whole(
     wall: Wall,
     rosie_up: Callable[[], Rosie],

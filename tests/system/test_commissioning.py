@@ -196,6 +196,7 @@ def bench(system: str, tmp_path: Path) -> Iterator[Bench]:
         yield Bench(tmp_path, undo)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # it asks every id at every rate
 def test_new_devices_become_a_robot(bench: Bench) -> None:
     """With WRITE_TABLES=1 in the environment the page's transcript is written again."""

@@ -2,16 +2,20 @@
 
 import json
 import math
+import os
 import re
 import runpy
 import signal
 import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
+import msgspec
 import pytest
 from mcap.reader import make_reader
 
@@ -19,7 +23,7 @@ from tests.support.http_clients import Client
 from tests.support.waiting import wait_until
 from tests.system.conftest import ROOT, Program
 from tests.system.networks import ip, why_not
-from trade_drivers import load
+from trade_drivers import load, parse
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_hil_sim import frames, motion_writes, read_log
 
@@ -50,10 +54,46 @@ def reported(demo: Program, until: str) -> str:
     return story
 
 
+@pytest.mark.slow
 def test_a_demo_that_fails_on_a_busy_computer_says_so() -> None:
     busy = runpy.run_path(str(DEMO.with_name("demo_busy.py")))["busy"]
     assert busy(40.0, 2).startswith("this computer is busy (load 40 on 2 cores); try again when it is not")
     assert not busy(1.0, 2)
+
+
+@pytest.mark.parametrize("name", ["rosie.toml", "head.toml"])
+def test_the_robot_of_the_demo_differs_from_the_example_in_rates_and_times_only(name: str) -> None:
+    patient = runpy.run_path(str(DEMO.with_name("demo_robot.py")))["patient"]
+    text = DEMO.with_name(name).read_text(encoding="utf-8")
+    example, made = parse(text, name), parse(patient(text), name)
+    assert msgspec.structs.replace(made, buses=example.buses, given=example.given) == example
+    for before, after in zip(example.buses, made.buses, strict=True):
+        assert after.rate_hz <= before.rate_hz
+        assert after.watchdog_s >= before.watchdog_s
+        assert after.stale_after_s > before.stale_after_s
+        times = {"rate_hz": before.rate_hz, "watchdog_s": before.watchdog_s, "stale_after_s": before.stale_after_s}
+        assert msgspec.structs.replace(after, **times) == before
+
+
+BUSY = "import os\nwhile os.getppid() == {parent}:\n    for _ in range(10**6):\n        pass"
+"""It keeps one core busy until it is killed, or the process that started it has ended."""
+FAULTY = re.compile(
+    r"did not answer|does not answer|held up|watchdog|silent|fault|too busy|is busy|lost|warning|Traceback|\wError"
+    r"|DeadlineExceeded|OutcomeUnknown|ToleranceExceeded|NotStopped|demo failed",
+    re.IGNORECASE,
+)
+"""What a demo without faults of devices does not say."""
+
+
+@contextmanager
+def busy_cores() -> Generator[None]:
+    with ExitStack() as undo:
+        for _ in range(os.cpu_count() or 1):
+            words = [sys.executable, "-S", "-c", BUSY.format(parent=os.getpid())]
+            program = subprocess.Popen(words, start_new_session=True)
+            undo.callback(program.wait)
+            undo.callback(program.kill)
+        yield
 
 
 def left_of(story: str) -> list[str]:
@@ -65,6 +105,7 @@ def left_of(story: str) -> list[str]:
     return sorted(named & there)
 
 
+@pytest.mark.slow
 def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     if reason := why_not():
         pytest.skip(reason)
@@ -80,6 +121,7 @@ def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     assert left_of(story) == []
 
 
+@pytest.mark.slow
 def test_rosie_walks_through_gateways_on_loopback_addresses_and_all_of_it_is_recorded_and_can_be_replayed(
     run: Run, trade_command: Command, tmp_path: Path
 ) -> None:
@@ -149,6 +191,7 @@ def by_drives(log: Path, since: float) -> list[Track]:
     return tracks
 
 
+@pytest.mark.slow
 def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:
     demo = run(DEMO, "--mute")
     story = reported(demo, "no longer answer")
@@ -159,6 +202,7 @@ def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:
     assert why_not() or left_of(story) == []
 
 
+@pytest.mark.slow
 def test_a_demo_that_stays_shows_a_page_ends_with_ctrl_c_and_leaves_nothing(run: Run) -> None:
     demo = run(DEMO, "--stay")
     story = reported(demo, "the head turns while you do")
@@ -174,9 +218,21 @@ def test_a_demo_that_stays_shows_a_page_ends_with_ctrl_c_and_leaves_nothing(run:
     assert left_of(story) == []
 
 
+@pytest.mark.slow
 def test_a_demo_that_is_ended_in_the_middle_leaves_nothing(run: Run) -> None:
     demo = run(DEMO, "--stay")
     story = reported(demo, "Two behaviours want the same head")
     demo.signal(signal.SIGTERM)
     assert demo.wait() == 130, demo.errors
     assert why_not() or left_of(story) == []
+
+
+# Last, as it keeps all cores busy.
+@pytest.mark.slow
+def test_rosie_walks_beside_a_busy_process_for_each_core_and_nothing_looks_like_a_fault(run: Run) -> None:
+    with busy_cores():
+        demo = run(DEMO)
+        story = reported(demo, "confirms every line above")
+        assert demo.wait() == 0, demo.errors
+    assert not FAULTY.findall(story)
+    assert demo.errors == []

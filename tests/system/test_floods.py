@@ -14,6 +14,8 @@ from trade._threads import channel_workers
 from trade._transport.endpoints import free_endpoint
 from trade.errors import Busy
 
+pytestmark = pytest.mark.slow
+
 POLICY = """
 [roles.driver]
 register = ["lab"]

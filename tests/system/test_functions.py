@@ -12,6 +12,8 @@ import pytest
 import trade
 from trade import where
 
+pytestmark = pytest.mark.slow
+
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 CAMERA = """

@@ -69,6 +69,7 @@ def moves(member: Member, times: int) -> Callable[[], bool]:
     return lambda: len(member.ask("moved", "rosie.arm")) == times
 
 
+@pytest.mark.slow
 def test_an_exported_service_is_found_called_and_locked_on_the_other_side_and_reported_gone(
     site: Site, arm: Member, planner: Member
 ) -> None:
@@ -91,8 +92,13 @@ def test_a_service_is_visible_and_callable_only_once_it_is_exported(site: Site, 
     site.change(site.file, "export = []", 'export = ["lobby"]')
     assert [label for _, label in arm.ask("group", "lobby", "planner")] == ["lobby.echo"]
     assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
+    site.change(site.file, 'export = ["lobby"]', "export = []")
+    assert arm.ask("sees", "2") == ["cellar.echo", "rosie.arm.echo"]
+    site.change(site.file, "export = []", 'export = ["lobby"]')
+    assert arm.ask("sees", "3") == ["cellar.echo", "lobby.echo", "rosie.arm.echo"]
 
 
+@pytest.mark.slow
 def test_an_unauthorized_call_is_refused_by_the_caller_the_callee_and_the_gateway(
     site: Site, arm: Member, planner: Member
 ) -> None:
@@ -113,6 +119,7 @@ def test_an_unauthorized_call_is_refused_by_the_caller_the_callee_and_the_gatewa
     assert arm.ask("moved", "rosie.arm") == [0]
 
 
+@pytest.mark.slow
 def test_a_policy_can_be_changed_while_calls_run(site: Site, arm: Member, planner: Member) -> None:
     planner.ask("try_move", "rosie.arm", "20")
     site.change(site.policy, 'planner = ["operator"]', "planner = []")
@@ -129,6 +136,7 @@ def _tried(member: Member) -> str:
     return "moved" if "answer" in said else said["error"].partition(":")[0]
 
 
+@pytest.mark.slow
 def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) -> None:
     site.change(site.file, 'policy = "policy.toml"', 'polcy = "policy.toml"')
     wait_until(lambda: "polcy: unknown key" in site.complaints(), "it is said")
@@ -139,6 +147,7 @@ def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) 
     planner.ask("move", "rosie.arm", "1")
 
 
+@pytest.mark.slow
 def test_a_file_with_its_interfaces_swapped_starts_nothing(site: Site) -> None:
     """Else `left`, which exports one group, would be taken for `right`, and the other way round."""
     swapped = (
@@ -155,6 +164,7 @@ def test_a_file_with_its_interfaces_swapped_starts_nothing(site: Site) -> None:
         assert "network.private.listen: tls/10.231.1.1:7450 is an address of net1 on this host" in ended.stderr
 
 
+@pytest.mark.slow
 def test_S12_a_gateway_that_reloads_loses_no_client_call_or_lock(site: Site, arm: Member, planner: Member) -> None:
     arm.ask("register_one", "rosie.arm.p0")
     planner.ask("group", "rosie.arm.p0", "arm")
@@ -170,6 +180,7 @@ def test_S12_a_gateway_that_reloads_loses_no_client_call_or_lock(site: Site, arm
     assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
 
 
+@pytest.mark.slow
 def test_a_stream_crosses_at_the_rate_of_its_export(site: Site, arm: Member, planner: Member) -> None:
     arm.ask("register_ticker", "rosie.arm")
     near = site.member("left", "chief")
@@ -195,6 +206,7 @@ def test_a_stream_crosses_at_the_rate_of_its_export(site: Site, arm: Member, pla
     planner.ask("heard", "1")
 
 
+@pytest.mark.slow
 def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serves(
     site: Site, arm: Member, planner: Member
 ) -> None:
@@ -211,6 +223,7 @@ def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serv
     assert arm.ask("moved", "rosie.arm") == [1, 3]
 
 
+@pytest.mark.slow
 def test_a_gateway_that_is_terminated_leaves_in_order(site: Site) -> None:
     chief = site.member("right", "chief")
     name = str(site.ready["container"])

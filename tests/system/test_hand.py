@@ -13,6 +13,7 @@ from trade.errors import DeviceFault
 from trade_hil_sim import SimControl, motion_writes, read_log
 
 
+@pytest.mark.slow
 def test_the_example_comes_up_is_activated_by_hand_and_grips(
     run: Callable[..., Any],
     trade_command: Callable[..., subprocess.CompletedProcess[str]],

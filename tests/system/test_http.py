@@ -28,7 +28,8 @@ class HttpProcess:
     def __init__(self, run: Run, trade_command: Command, folder: Path) -> None:
         self._tokens, self._command, self._run = folder / "tokens.toml", trade_command, run
         self.token = self.new("anna")
-        self.program = run("-m", "trade_gateway", "http", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--json")
+        words = ["http", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--mcp", "--json"]
+        self.program = run("-m", "trade_gateway", *words)
         self.url: str = self.program.json()["url"]
 
     def new(self, identity: str) -> str:
@@ -50,6 +51,7 @@ def http(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> Http
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "number"),
     [
@@ -59,6 +61,8 @@ def http(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> Http
         ("request", signal.SIGKILL),
         ("session", signal.SIGKILL),
         ("session", signal.SIGSTOP),
+        ("agent", signal.SIGKILL),
+        ("agent", signal.SIGSTOP),
     ],
 )
 def test_S03_motion_of_a_page_stops_with_it_while_the_http_gateway_runs(
@@ -84,12 +88,17 @@ def test_S03_motion_of_a_page_stops_when_the_http_gateway_ends(bench: Bench, htt
     bench.stopped_short(ended_at, HALFWAY_RAD)
 
 
+@pytest.mark.slow
 def test_an_http_gateway_ends_on_sigterm(http: HttpProcess) -> None:
     http.program.signal(signal.SIGTERM)
     assert http.program.process.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.slow
 def test_an_http_gateway_without_tokens_is_refused(trade_command: Command, tmp_path: Path) -> None:
     refused = trade_command("http", "--listen", "127.0.0.1:0", "--tokens", tmp_path / "none.toml")
     assert refused.returncode == 1
     assert "trade http token" in refused.stderr
+    refused = trade_command("http", "--listen", "127.0.0.1:0", "--ask-first", "rosie")
+    assert refused.returncode == 1
+    assert "Add --mcp" in refused.stderr

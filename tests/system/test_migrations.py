@@ -15,6 +15,8 @@ from tests.support.waiting import wait_until
 from trade import where
 from trade.errors import TradeError
 
+pytestmark = pytest.mark.slow
+
 COUNTER = '''
 import os, pathlib, signal, threading, time
 from trade import service
@@ -191,4 +193,4 @@ def test_it_is_moved_on_the_command_line(
         wait_until(lambda: caller.answers > answers)
     assert_alive_once(folder, [pids["old"], pids["new"]])
     refused = trade_command("migrate", "hall", "--to", "nowhere")
-    assert (refused.returncode, "no service matches" in refused.stderr) == (1, True)
+    assert (refused.returncode, "no service matches" in refused.stderr) == (3, True)

@@ -14,13 +14,15 @@ from pathlib import Path
 import pytest
 
 import trade
-from tests.support.foxglove_viewer import viewer
+from tests.support.foxglove_viewer import UNKNOWN, viewer
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import ROOT, ROSIES_HEAD, Bench, Program, Rosie
 from trade import where
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_gateway.recording._reader import entries
 from trade_hil_sim import SimControl, events, motion_writes, read_log
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_recording_whose_program_was_killed_is_readable_to_its_last_second(
@@ -244,7 +246,7 @@ def test_a_viewer_sees_live_what_a_recording_would_have(
             pass
         showing.signal(ending)
         assert showing.wait() == 0
-    assert showing.errors == []
+    assert [line for line in showing.errors if UNKNOWN not in line] == []
 
 
 def test_a_live_view_that_other_hosts_can_reach_prints_a_warning(

@@ -4,7 +4,6 @@ The nodes are rospy of the distribution; a package of other hands that speaks rm
 a node of our own that says so as rmw_zenoh does. The judge of motion is the simulator's log.
 """
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -14,7 +13,6 @@ from typing import Any, Protocol
 import pytest
 
 import trade
-from tests.support.c_compiler import library
 from tests.support.ros1_system import Peer, need_ros1
 from tests.support.ros1_system import Stand as Ros1Stand
 from tests.support.ros2_processes import Process, Router, free_port
@@ -24,7 +22,6 @@ from trade import Handle, errors, where
 from trade_hil_sim import events, writes
 
 FAR_RAD = 1.2
-EXAMPLE = Path(__file__).parents[2] / "examples" / "c_gripper"
 HALFWAY_RAD = 0.6
 """Where a joint that is not stopped gets to long after everything that stops it should have."""
 FILE = """
@@ -202,15 +199,6 @@ class Bridged:
 
 
 @pytest.fixture
-def c_gripper(tmp_path: Path) -> Path:
-    """The program of examples/c_gripper, beside its compiled library."""
-    folder = tmp_path / "c_gripper"
-    folder.mkdir()
-    library(EXAMPLE / "gripper.c", folder / "libgripper.so")
-    return shutil.copy(EXAMPLE / "gripper.py", folder)
-
-
-@pytest.fixture
 def bridged(ros: Ros, bench: Bench, run: Run, tmp_path: Path) -> Bridged:
     return Bridged(bench, ros, run, tmp_path / "ros.toml")
 
@@ -219,6 +207,7 @@ def _pan(name: str) -> Handle:
     return trade.find(where(name=name, group="rosie.neck.pan"), wait_s=30)
 
 
+@pytest.mark.slow
 @known
 def test_S03_the_motion_of_a_killed_node_stops_and_the_next_node_moves_again(bridged: Bridged) -> None:
     node = bridged.ros.node("teleop")
@@ -235,6 +224,7 @@ def test_S03_the_motion_of_a_killed_node_stops_and_the_next_node_moves_again(bri
     bridged.begun(again_at)
 
 
+@pytest.mark.slow
 def test_S03_what_nodes_move_stops_when_their_core_is_killed_and_can_be_moved_with_the_next_one(
     bridged: Bridged,
 ) -> None:
@@ -249,6 +239,7 @@ def test_S03_what_nodes_move_stops_when_their_core_is_killed_and_can_be_moved_wi
     bridged.begun(again_at)  # it still says so
 
 
+@pytest.mark.slow
 def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_with_the_next_one(
     bridged: Bridged,
 ) -> None:
@@ -262,6 +253,7 @@ def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_wi
     bridged.begun(again_at)  # it still says so
 
 
+@pytest.mark.slow
 @unknown
 def test_S03_the_motion_of_an_unidentified_node_stops_when_the_node_falls_silent(bridged: Bridged) -> None:
     node = bridged.ros.node("teleop")
@@ -304,6 +296,7 @@ def test_a_local_lock_holds_against_ros_and_a_ros_lock_against_local_callers(bri
     move(0.0)
 
 
+@pytest.mark.slow
 def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: Bridged) -> None:
     node = bridged.ros.node("base")
     node.repeat("/battery", 24.5, 20)
@@ -365,6 +358,7 @@ fields = {{ data = "width_m" }}
 """
 
 
+@pytest.mark.slow
 def test_P08_c_python_ros_1_and_ros_2_are_side_by_side_in_one_system(run: Run, tmp_path: Path, c_gripper: Path) -> None:
     with ExitStack() as undo:
         one, two = Ros1System(tmp_path), Ros2OfOthers(tmp_path)

@@ -17,6 +17,8 @@ from tests.system.conftest import ROSIES_HEAD, at_ports
 from trade import where
 from trade_hil_sim import SimProcess, events
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 FILE = """
 system = "{system}"

@@ -34,6 +34,8 @@ def besieged(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
         yield made
 
 
+@pytest.mark.slow
+@pytest.mark.own_load
 def test_nothing_moves_that_must_not_whatever_faults_occur(besieged: Stand) -> None:
     besieged.quiet()
     wrong = besieged.wrong()

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
@@ -36,6 +38,7 @@ def ended(name: str, pid: int) -> Iterator[None]:
             process.kill()
 
 
+@pytest.mark.slow
 def test_a_container_is_started_used_and_ended_on_another_host(sshd: Sshd) -> None:
     started = trade.system.start_container(
         "robot", "eyes", allow=["sight:*"], command=HERE, ssh_config=sshd.config, wait_s=30
@@ -47,6 +50,44 @@ def test_a_container_is_started_used_and_ended_on_another_host(sshd: Sshd) -> No
         assert see() == "a cat"
 
 
+@pytest.mark.slow
+def test_another_container_starts_one_with_all_that_it_needs_and_code_is_brought_to_it(
+    sshd: Sshd,
+    start_container: Callable[[str], trade.Container],
+    trade_command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A service has no file of ssh's settings: it takes those of its user."""
+    (tmp_path / "bin").mkdir()
+    ours = tmp_path / "bin" / "ssh"
+    ours.write_text(f'#!/bin/sh\nexec {shutil.which("ssh")} -F {sshd.config} "$@"\n')
+    ours.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{ours.parent}:{os.environ['PATH']}")
+    (tmp_path / "brought_eye.py").write_text(
+        "from trade import service\nclass Eye:\n    @service\n    def see(self) -> str:\n        return 'a dog'\n"
+    )
+    code = tmp_path / "code"
+    code.mkdir()
+    (tmp_path / "brought_eye.py").rename(code / "brought_eye.py")
+    shown = trade_command("code", code)
+    start_container("starter")
+    start = trade.find(where(name="start_container", container="starter"), wait_s=30).with_(deadline_s=60)
+    started = start(
+        "robot",
+        "eyes",
+        allow=["brought_eye:Eye"],
+        command=HERE,
+        environment={"TRADE_CODE": shown.stdout.strip(), "TRADE_STATE_DIR": str(tmp_path / "state")},
+    )
+    with ended("eyes", started.pid):
+        sent = trade_command("code", code, "--to", "eyes")
+        assert sent.returncode == 0, sent.stderr
+        [see] = trade.find(where(name="instantiate", container="eyes"))("brought_eye:Eye", (), ["rosie.eyes"])
+        assert see() == "a dog"
+
+
+@pytest.mark.slow
 def test_it_is_started_on_the_command_line_and_outlives_that(sshd: Sshd, trade_command: Command) -> None:
     command = Path(sys.executable).parent / "trade"
     ran = trade_command("start", "robot", "eyes", "--command", command, "--ssh-config", sshd.config, "--json")
@@ -55,6 +96,7 @@ def test_it_is_started_on_the_command_line_and_outlives_that(sshd: Sshd, trade_c
         assert trade.find(where(name="clock", container="eyes"), wait_s=30)() > 0
 
 
+@pytest.mark.slow
 def test_a_second_container_of_one_name_is_not_started(sshd: Sshd) -> None:
     started = trade.system.start_container("robot", "eyes", command=HERE, ssh_config=sshd.config, wait_s=30)
     with ended("eyes", started.pid):
@@ -63,6 +105,7 @@ def test_a_second_container_of_one_name_is_not_started(sshd: Sshd) -> None:
         assert refused.value.reason == "it did not come up"
 
 
+@pytest.mark.slow
 def test_a_container_that_does_not_join_the_system_is_reported_with_its_process(sshd: Sshd) -> None:
     with pytest.raises(CannotStart) as refused:
         trade.system.start_container(
@@ -110,6 +153,7 @@ def test_where_no_sshd_listens_it_is_refused(sshd: Sshd) -> None:
     assert refused(sshd).reason == "refused"
 
 
+@pytest.mark.slow
 def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = [word.replace(f"ConnectTimeout={ssh.CONNECT_S}", "ConnectTimeout=1") for word in ssh._ASKED]
     monkeypatch.setattr(ssh, "_ASKED", tuple(asked))
@@ -118,6 +162,7 @@ def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.Mo
         assert refused(sshd).reason == "timeout"
 
 
+@pytest.mark.slow
 def test_an_unresponsive_host_is_reported_before_the_deadline_of_the_call(
     sshd: Sshd, start_container: Callable[[str], trade.Container]
 ) -> None:
@@ -136,6 +181,7 @@ def test_an_unresponsive_host_is_reported_before_the_deadline_of_the_call(
             start.with_(deadline_s=2.0)()
 
 
+@pytest.mark.slow
 def test_a_host_without_trade_is_reported(sshd: Sshd) -> None:
     error = refused(sshd, "no-such-trade")
     assert (error.reason, "'no-such-trade' is not found" in error.remedy) == ("no trade there", True)

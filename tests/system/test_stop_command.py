@@ -12,6 +12,8 @@ from trade import Container, where
 from trade.errors import MotionStopped
 from trade_hil_sim import events, read_log
 
+pytestmark = pytest.mark.slow
+
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 PAN = where(group="rosie.neck.pan", name="move_to")
 

@@ -1,7 +1,6 @@
 """Children of a gateway: up in order, up again after whatever ends or hangs them, given up when that is no use."""
 
 import os
-import queue
 import signal
 import socket
 import time
@@ -17,124 +16,14 @@ from tests.support.certificates import Papers
 from tests.support.http_clients import Client
 from tests.support.waiting import wait_until
 from tests.system.conftest import ROSIES_HEAD, Program, at_ports
+from tests.system.supervised import COUNTER, MODULE, Keeping, call
 from trade import Container, where
 from trade.errors import ConfigurationError
-from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.http import add_token
-from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
 
-MODULE = '''
-import ctypes, os, signal, threading
-from trade import Resource, service
 
-class Counter:
-    def __init__(self) -> None:
-        self.total = 0
-
-    @service
-    def count(self) -> int:
-        self.total += 1
-        return self.total
-
-    @service(effect="read")
-    def shown(self) -> int:
-        return self.total
-
-    def save_state(self):
-        return {"total": self.total}
-
-    def restore_state(self, state) -> None:
-        self.total = state["total"]
-
-class Dies:
-    def __init__(self) -> None:
-        os._exit(3)
-
-class Stays(Counter):
-    @service
-    def ignore(self) -> None:
-        """SIGTERM, for the whole process, which Python itself lets no other thread than the main one do."""
-        ctypes.CDLL(None).signal(signal.SIGTERM, ctypes.c_void_p(1))
-
-class Wheel:
-    def __init__(self) -> None:
-        self.resources = (Resource("wheel"),)
-
-    @service
-    def turn(self) -> None: ...
-
-    @service(effect="stop")
-    def stop(self) -> None: ...
-
-class Loose(Wheel):
-    relocatable = True
-
-class Grows:
-    @service
-    def grow(self, mb: int) -> None:
-        self.kept = bytearray(b"x") * (mb * 1000000)
-'''
-COUNTER = 'providers = [{ class = "tiny:Counter", groups = ["hall"] }]\n'
-
-
-class Keeping:
-    """A supervisor in this process, its children in theirs."""
-
-    def __init__(self, folder: Path, member: Container, grace_s: float) -> None:
-        self.file = folder / "gateway.toml"
-        self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
-        self.reported: list[str] = []
-        self.supervisor = Supervisor(lambda: member, self.news.put, folder / "kept", grace_s=grace_s)
-        (folder / "tiny.py").write_text(MODULE)
-        self.system = member.settings.system
-        self.member = member
-
-    def go_by(self, text: str) -> None:
-        self.file.write_text(f'system = "{self.system}"\n{text}')
-        self.supervisor.go_by(read_gateway_file(self.file).children)
-
-    def child(self, name: str) -> ChildInfo | None:
-        return next((info for info in self.supervisor.children() if info.name == name), None)
-
-    def become(self, name: str, state: str, restarts: int = 0) -> ChildInfo:
-        """Wait until a child is in a state, started again so often at least."""
-        found: list[ChildInfo] = []
-
-        def is_so() -> bool:
-            info = self.child(name)
-            if info is None or info.state != state or info.restarts < restarts:
-                return False
-            found.append(info)
-            return True
-
-        wait_until(is_so, f"{name} is {state}")
-        return found[0]
-
-    def texts(self) -> list[str]:
-        while not self.news.empty():
-            self.reported.append(self.news.get().text)
-        return self.reported
-
-
-@pytest.fixture
-def keeping(system: str, tmp_path: Path, start_container: Callable[..., Container]) -> Iterator[Callable[..., Keeping]]:
-    made: list[Keeping] = []
-
-    def keep(text: str, grace_s: float = 20.0) -> Keeping:
-        made.append(Keeping(tmp_path, start_container(f"door{len(made)}"), grace_s))
-        made[-1].go_by(text)
-        return made[-1]
-
-    yield keep
-    for one in made:
-        one.supervisor.close()
-
-
-def call(name: str, *args: Any) -> Any:
-    return trade.find(where(name=name, group="hall"), wait_s=30)(*args)
-
-
+@pytest.mark.slow
 def test_children_start_in_order_and_end_in_the_other_one(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(f'[container.b]\nproviders = []\nafter = ["a"]\n[container.a]\n{COUNTER}')
     kept.become("b", "up")
@@ -158,6 +47,7 @@ def test_P70_a_child_that_is_killed_is_back_with_its_state(keeping: Callable[...
     assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.1 s", f"a is back, process {again.pid}"]
 
 
+@pytest.mark.slow
 def test_a_restarted_child_resumes_from_its_last_reported_save(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(f"[container.a]\nsave_every_s = 1\n{COUNTER}")
     first = kept.become("a", "up")
@@ -170,6 +60,7 @@ def test_a_restarted_child_resumes_from_its_last_reported_save(keeping: Callable
     assert again.saved_at > counted_at
 
 
+@pytest.mark.slow
 def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(f"[container.a]\nanswers_within_s = 1\n{COUNTER}", grace_s=0.5)
     hung = kept.become("a", "up")
@@ -183,6 +74,7 @@ def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., K
     ]
 
 
+@pytest.mark.slow
 def test_a_child_that_ignores_the_shutdown_request_is_killed(keeping: Callable[..., Keeping]) -> None:
     kept = keeping('[container.a]\nallow = ["tiny:*"]\nproviders = []\n', grace_s=0.5)
     stays = kept.become("a", "up")
@@ -192,6 +84,7 @@ def test_a_child_that_ignores_the_shutdown_request_is_killed(keeping: Callable[.
     assert kept.texts()[1:] == ["a does not shut down and is killed", "a crashed (signal 9)"]
 
 
+@pytest.mark.slow
 def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_again_with_its_state(
     keeping: Callable[..., Keeping],
 ) -> None:
@@ -211,6 +104,7 @@ def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_agai
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wanted", "why"),
     [
@@ -233,6 +127,7 @@ def test_a_child_that_always_fails_is_given_up_with_its_reason_until_its_file_ch
     assert call("count") == 1
 
 
+@pytest.mark.slow
 def test_a_child_that_leaks_is_saved_and_started_again(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(
         "[container.a]\nmax_rss_mb = 400\n"
@@ -247,6 +142,7 @@ def test_a_child_that_leaks_is_saved_and_started_again(keeping: Callable[..., Ke
     assert "MB of memory" in kept.texts()[1]
 
 
+@pytest.mark.slow
 def test_one_that_is_never_restarted_is_not(keeping: Callable[..., Keeping]) -> None:
     kept = keeping('[container.a]\nrestart = "never"\nproviders = []\n')
     os.kill(kept.become("a", "up").pid, signal.SIGKILL)
@@ -254,6 +150,7 @@ def test_one_that_is_never_restarted_is_not(keeping: Callable[..., Keeping]) -> 
     assert kept.texts()[-1] == "a crashed (signal 9)"
 
 
+@pytest.mark.slow
 def test_only_what_is_started_otherwise_than_before_starts_again(keeping: Callable[..., Keeping]) -> None:
     others = "[container.b]\nproviders = []\n[container.c]\nproviders = []\n"
     kept = keeping(f"[container.a]\n{COUNTER}{others}")
@@ -278,6 +175,7 @@ def sim() -> Iterator[SimProcess]:
         yield running
 
 
+@pytest.mark.slow
 def test_S20_a_second_supervisor_of_one_robot_is_refused_and_gives_up_with_the_reason(
     keeping: Callable[..., Keeping], sim: SimProcess, tmp_path: Path
 ) -> None:
@@ -319,6 +217,7 @@ def children() -> list[Any]:
     return trade.find(where(name="children"), wait_s=30)()
 
 
+@pytest.mark.slow
 def test_a_gateway_lists_its_children_and_restarts_one_on_request(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
@@ -337,6 +236,7 @@ def test_a_gateway_lists_its_children_and_restarts_one_on_request(
     assert (again.restarts, again.pid != info.pid) == (1, True)
 
 
+@pytest.mark.slow
 def test_children_end_with_their_gateway_however_that_ends(start_gateway: Callable[[str], GatewayProcess]) -> None:
     there = start_gateway(f'[container.a]\n{COUNTER}[container.head]\nrobot = "{ROSIES_HEAD}"\nsim = true\n')
     there.until("up", "head")
@@ -345,6 +245,7 @@ def test_children_end_with_their_gateway_however_that_ends(start_gateway: Callab
     wait_until(lambda: not any(map(psutil.pid_exists, pids)), "they have left")
 
 
+@pytest.mark.slow
 def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
     start_gateway: Callable[[str], GatewayProcess], sim: SimProcess, tmp_path: Path
 ) -> None:
@@ -362,6 +263,7 @@ def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
     assert not events(sim.entries(), "watchdog_expired")  # it was ordered to, before anything ran out
 
 
+@pytest.mark.slow
 def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
     start_gateway: Callable[[str], GatewayProcess], sim: SimProcess, tmp_path: Path
 ) -> None:
@@ -375,6 +277,7 @@ def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
         assert not writes(sim.entries(), register=register, since=killed_at)
 
 
+@pytest.mark.slow
 def test_P70_a_stopped_gateway_leaves_no_process_and_restores_its_state_after_a_restart(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
@@ -404,6 +307,7 @@ door = ["chief"]
 """
 
 
+@pytest.mark.slow
 def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
     start_gateway: Callable[[str], GatewayProcess], tmp_path: Path, start_container: Callable[..., Container]
 ) -> None:
@@ -425,6 +329,7 @@ def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
     )
 
 
+@pytest.mark.slow
 def test_a_wrong_gateway_file_changes_nothing_and_a_corrected_one_takes_effect(
     start_gateway: Callable[[str], GatewayProcess],
 ) -> None:
@@ -439,6 +344,7 @@ def test_a_wrong_gateway_file_changes_nothing_and_a_corrected_one_takes_effect(
     assert next(one.pid for one in children() if one.name == "a") == info.pid
 
 
+@pytest.mark.slow
 def test_an_http_gateway_that_is_killed_restarts_at_its_address_with_its_tokens(
     start_gateway: Callable[[str], GatewayProcess], tmp_path: Path
 ) -> None:

@@ -1,6 +1,10 @@
 import signal
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 LOOKER = Path(__file__).with_name("looker.py")
 
 

@@ -18,6 +18,8 @@ from tests.system.sshd import Sshd
 from trade import where
 from trade.errors import LockLost
 
+pytestmark = pytest.mark.slow
+
 Command = Callable[..., subprocess.CompletedProcess[str]]
 Run = Callable[..., Program]
 TRADE = Path(sys.executable).parent / "trade"

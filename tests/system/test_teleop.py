@@ -10,10 +10,13 @@ from typing import Any, NamedTuple
 import pytest
 
 import trade
+from tests.support.simulated_robots import at_rest
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import ROOT, Bench, Program
 from trade import where
 from trade_hil_sim import Entry, events, motion_writes
+
+pytestmark = pytest.mark.slow
 
 TELEOP = ROOT / "examples" / "teleop.py"
 ROBOT = ROOT / "examples" / "teleop.toml"
@@ -86,7 +89,7 @@ class Pair:
         return abs(self.position_rad(joint) - position_rad) < TOLERANCE_RAD and self.at_rest()
 
     def at_rest(self) -> bool:
-        return not any(device.moving for bus in self.sim.control.state() for device in bus.devices)
+        return all(at_rest(device) for bus in self.sim.control.state() for device in bus.devices)
 
 
 @pytest.fixture
@@ -186,9 +189,10 @@ def test_a_follower_whose_lock_is_broken_halts_and_obeys_other_clients(pair: Pai
     code, _, errors = ended(program)
     assert code == 1
     assert "LockLost" in errors or "MotionStopped" in errors  # whichever comes first
-    wait_until(pair.at_rest)
     move: Any = trade.find(where(name="move_to", group="pair.follower", kind="JointGroup"))
-    assert move([0.1] * 6)[0] == pytest.approx(0.1, abs=TOLERANCE_RAD)
+    with trade.lock(where(group="pair.follower"), wait_s=PATIENCE_S):  # granted once it is at rest
+        assert pair.at_rest()
+        assert move([0.1] * 6)[0] == pytest.approx(0.1, abs=TOLERANCE_RAD)
 
 
 def test_a_leader_that_holds_is_refused_and_nothing_moves(pair: Pair) -> None:

@@ -65,6 +65,7 @@ def terminal(system: str, tmp_path: Path) -> Iterator[Terminal]:
         yield Terminal(Shell(tmp_path, undo, COLUMNS="180", TRADE_SYSTEM="home"))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_matches_the_behaviour(terminal: Terminal, page: Path) -> None:

@@ -10,6 +10,8 @@ import pytest
 from tests.system.conftest import Program
 from trade import Container, service, where
 
+pytestmark = pytest.mark.slow
+
 StartContainer = Callable[..., Container]
 Run = Callable[..., Program]
 Command = Callable[..., subprocess.CompletedProcess[str]]

@@ -1,8 +1,12 @@
 """The judge on histories made by hand: what is right passes, and each kind of wrong is named."""
 
+import pytest
+
 from tests.endurance.chaos._records import AnyRecord, Beat, Byte, Command, End, Fault, Grant, Renewed
 from tests.endurance.chaos._verify import verify
 from tests.support.lock_log import Ask, Done, Held, Seen
+
+pytestmark = pytest.mark.slow
 
 
 def lock(hold: str, *times: float, resource: str = "a") -> list[AnyRecord]:

@@ -10,6 +10,8 @@ from tests.endurance.fuzz._changes import almost, understood, wrong_inside
 from tests.endurance.fuzz._target import CORPUS, Target
 from tests.endurance.fuzz.targets import TARGETS
 
+pytestmark = pytest.mark.slow
+
 EACH: Final = pytest.mark.parametrize("target", TARGETS.values(), ids=list(TARGETS))
 EXAMPLES: Final = 100
 FEW: Final = hypothesis.settings(

@@ -12,6 +12,8 @@ import pytest
 
 from tests.endurance.soak.judge import Run, Said, Sample, judge
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 SECONDS = 400
 PATIENCE_S = 300

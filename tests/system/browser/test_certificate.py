@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from tests.support.certificates import Papers
@@ -10,6 +11,7 @@ from trade.testing import memory_system
 from trade_gateway.http import HttpGateway, Tokens
 
 
+@pytest.mark.slow
 def test_a_certificate_of_the_systems_authority_takes_the_place_of_a_token(tmp_path: Path) -> None:
     papers, executable = Papers(tmp_path / "pki"), chromium()
     folder = papers.of("anna")

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 from playwright.sync_api import expect
 
+from tests.conftest import StartContainer
 from tests.support.waiting import wait_until
 from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
 from tests.system.conftest import Bench
+from trade import service
 from trade._transport.endpoints import free_endpoint
 from trade_hil_sim import events
 
@@ -62,6 +64,7 @@ def test_a_joint_moves_while_its_button_is_held_and_no_longer(bench: Bench, brow
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["Space", "Enter"])
 def test_a_joint_moves_while_a_key_is_held_on_its_button(bench: Bench, browsers: Browsers, key: str) -> None:
     anna = browsers.view("anna")
@@ -78,6 +81,7 @@ def test_a_joint_moves_while_a_key_is_held_on_its_button(bench: Bench, browsers:
     comes_to_rest(bench)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["blur", "pagehide", "visibilitychange"])
 def test_a_page_that_is_left_moves_nothing(bench: Bench, browsers: Browsers, what: str) -> None:
     anna = browsers.view("anna")
@@ -87,6 +91,7 @@ def test_a_page_that_is_left_moves_nothing(bench: Bench, browsers: Browsers, wha
     expect(anna.plus).to_have_attribute("aria-pressed", "false")
 
 
+@pytest.mark.slow
 def test_S03_a_page_that_is_closed_moves_nothing(bench: Bench, browsers: Browsers) -> None:
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
@@ -94,6 +99,7 @@ def test_S03_a_page_that_is_closed_moves_nothing(bench: Bench, browsers: Browser
     comes_to_rest(bench)
 
 
+@pytest.mark.slow
 def test_S04_a_page_that_is_frozen_moves_nothing(bench: Bench, browsers: Browsers) -> None:
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
@@ -108,6 +114,7 @@ def test_S04_a_page_that_is_frozen_moves_nothing(bench: Bench, browsers: Browser
             process.send_signal(signal.SIGCONT)
 
 
+@pytest.mark.slow
 def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, browsers: Browsers) -> None:
     anna, bert = browsers.view("anna"), browsers.view("bert")
     jog(bench, anna, anna.plus)
@@ -125,6 +132,7 @@ def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, 
     comes_to_rest(bench)
 
 
+@pytest.mark.slow
 def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench, browsers: Browsers) -> None:
     anna, chief = browsers.view("anna"), browsers.view("chief")
     jog(bench, anna, anna.plus)
@@ -153,6 +161,7 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     comes_to_rest(bench)
 
 
+@pytest.mark.slow
 def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
     browsers: Browsers, http: HttpProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -174,6 +183,7 @@ def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
     expect(chief.stopped).not_to_contain_text("nothing moves")
 
 
+@pytest.mark.slow
 def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers: Browsers, http: HttpProcess) -> None:
     anna = browsers.view("anna")
     jog(bench, anna, anna.plus)
@@ -190,6 +200,7 @@ def test_a_page_reconnects_when_the_http_gateway_is_back(bench: Bench, browsers:
     comes_to_rest(bench)
 
 
+@pytest.mark.slow
 def test_a_read_only_client_can_act_only_by_the_e_stop(bench: Bench, browsers: Browsers) -> None:
     vera = browsers.view("vera")
     expect(vera.pan.locator(".figures")).to_contain_text("rad/s")
@@ -207,8 +218,19 @@ def test_a_read_only_client_can_act_only_by_the_e_stop(bench: Bench, browsers: B
     assert not events(bench.sim.entries(), "motion_started")
 
 
-def test_a_service_is_called_by_a_form_made_from_its_schema(bench: Bench, browsers: Browsers) -> None:
+class Hand:
+    @service(needs=["see(?thing)", "at(?place)"], achieves=["holding(?thing)"])
+    def pick_up(self) -> None: ...
+
+
+@pytest.mark.slow
+def test_a_service_is_called_by_a_form_made_from_its_schema_and_shows_its_conditions(
+    bench: Bench, browsers: Browsers, start_container: StartContainer
+) -> None:
+    start_container("hand").register(Hand(), "rosie.hand")
     anna = browsers.view("anna")
+    hand = anna.service("rosie.hand", "pick_up")
+    expect(hand.locator(".note")).to_contain_text(["needs see(?thing), at(?place)", "achieves holding(?thing)"])
     card = anna.service(PAN, "move_to")
     card.get_by_label("position_rad").fill("9")
     card.get_by_role("button", name="Call").click()
@@ -228,6 +250,7 @@ def test_a_service_is_called_by_a_form_made_from_its_schema(bench: Bench, browse
     expect(group.locator(".result")).to_contain_text("→ [")
 
 
+@pytest.mark.slow
 def test_locks_are_taken_requested_and_broken_in_view_of_all_users(browsers: Browsers) -> None:
     anna, chief = browsers.view("anna"), browsers.view("chief")
     anna.page.get_by_label("Group").fill("rosie.head")
@@ -245,6 +268,7 @@ def test_locks_are_taken_requested_and_broken_in_view_of_all_users(browsers: Bro
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
+@pytest.mark.slow
 def test_a_wrong_token_is_reported_and_another_one_is_accepted(browsers: Browsers, http: HttpProcess) -> None:
     anna = browsers.view("anna")
     anna.page.get_by_role("button", name="Sign out").click()
@@ -254,6 +278,7 @@ def test_a_wrong_token_is_reported_and_another_one_is_accepted(browsers: Browser
     expect(anna.page.locator("#who")).to_have_text("as bert")
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_phone_and_every_control_has_a_name(browsers: Browsers) -> None:
     anna = browsers.view("anna", has_touch=True, color_scheme="dark")
     anna.page.set_viewport_size({"width": 360, "height": 740})

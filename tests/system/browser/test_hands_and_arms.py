@@ -14,6 +14,8 @@ from tests.system.browser.conftest import Browsers, View, renderers
 from tests.system.conftest import ROOT, Program
 from trade_hil_sim import SimControl
 
+pytestmark = pytest.mark.slow
+
 LEAST_RAD = 0.02
 """What is more than noise."""
 MOST_RAD = 1.0

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 from playwright.sync_api import expect
 
 from tests.system.browser.conftest import PAN, Browsers, View
@@ -16,6 +17,7 @@ def part(view: View, name: str) -> Any:
     return view.page.locator(f"#{name}")
 
 
+@pytest.mark.slow
 def test_a_fault_is_shown_with_its_remedy_and_the_user_who_acknowledged_it(bench: Bench, browsers: Browsers) -> None:
     anna, vera = browsers.view("anna"), browsers.view("vera")
     hers, veras = (part(view, "fault-list").locator("tr", has_text="overload") for view in (anna, vera))
@@ -37,6 +39,7 @@ def test_a_fault_is_shown_with_its_remedy_and_the_user_who_acknowledged_it(bench
     expect(hers).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_finished_calls_are_shown_to_users_who_may_read_the_system(browsers: Browsers) -> None:
     chief, anna, vera = (browsers.view(name) for name in ("chief", "anna", "vera"))
     expect(part(vera, "call-list")).to_contain_text("the right to read the system")
@@ -69,6 +72,7 @@ def test_readers_of_the_system_see_the_policy_and_only_administrators_see_the_au
     expect(part(chief, "audit-list").get_by_role("row", name="set_tracing").first).to_contain_text("configure")
 
 
+@pytest.mark.slow
 def test_text_has_enough_contrast_with_its_background(browsers: Browsers, bench: Bench) -> None:
     """As WCAG 2 computes it, of all that is shown, in both schemes; what cannot be pressed is exempt."""
     bench.sim.control.hardware_fault(OVERLOAD, [1])
@@ -92,6 +96,7 @@ def test_text_has_enough_contrast_with_its_background(browsers: Browsers, bench:
     assert len(papers) == 2  # both were there
 
 
+@pytest.mark.slow
 def test_a_button_has_enough_contrast_while_it_is_held(browsers: Browsers) -> None:
     """Under the pointer, too, which is where it is then."""
     anna = browsers.view("anna")

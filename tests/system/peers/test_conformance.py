@@ -14,6 +14,8 @@ import pytest
 
 from trade_gateway.conformance import CHECKS
 
+pytestmark = pytest.mark.slow
+
 PEER = Path(__file__).with_name("peer.py")
 NOTICED_BY = {
     "runs-late": "late-is-never",

@@ -51,6 +51,16 @@ def test_an_answer_that_comes_twice_is_found_out(head: Rig) -> None:
     assert "two devices may share this id" in refused(head)
 
 
+@pytest.mark.parametrize("instruction", ["ping", "read", None])
+def test_a_device_has_as_long_to_answer_at_first_as_its_measurements_may_be_old(
+    rig: Rig, instruction: str | None
+) -> None:
+    rig.configure(('port = "/dev/ttyNOWHERE"', 'port = "/dev/ttyNOWHERE"\nstale_after_s = 2\nwatchdog_s = 2'))
+    rig.plug().do(sim.Mute(ids=(1,), instruction=instruction, count=5))
+    assert rig.attach().motor("neck.pan").state().name == "rosie.neck.pan"
+
+
+@pytest.mark.slow
 def test_another_baud_rate_looks_like_absence(rig: Rig) -> None:
     rig.plug(Servo(1, baud=57600), Servo(2, baud=57600))
     assert "baud rate (register 8)" in refused(rig)
@@ -107,6 +117,7 @@ def test_a_setting_that_the_driver_cannot_use_is_named_with_the_right_one(
     assert not sim.writes(rig.log)
 
 
+@pytest.mark.slow
 def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig) -> None:
     rig.plug(prepare=lambda bus: bus.devices[0].fail(0x20, time.monotonic()))
     robot = rig.attach()
@@ -213,6 +224,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
     assert not announced
 
 
+@pytest.mark.slow
 def test_the_example_describes_a_robot_that_can_be_attached(rig: Rig) -> None:
     from pathlib import Path
 

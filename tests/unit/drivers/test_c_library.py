@@ -122,6 +122,7 @@ def hand(example: Any, tmp_path: Path) -> Iterator[Hand]:
     made.gripper.close()
 
 
+@pytest.mark.slow
 def test_functions_of_a_c_library_are_services_with_the_methods_signature(hand: Hand) -> None:
     move = hand("move_to")
     assert move.signature == "move_to(width_m: float (0 to 0.085), speed_m_s: float (<= 0.15, > 0) = 0.05) -> None"

@@ -24,12 +24,14 @@ _numbers = itertools.count()
 # --- the service
 
 
+@pytest.mark.slow
 def test_a_healthy_bus_says_so(leg: Leg) -> None:
     state = leg.attach().monitor("legs").bus_state()
     assert (state.name, state.port, state.up) == ("rosie.bus.legs", leg.sim.port, True)
     assert (state.state, state.error_frames, state.bus_offs) == ("error-active", 0, 0)
 
 
+@pytest.mark.slow
 def test_the_load_is_that_of_the_frames_on_the_wire(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     began = leg.frames("sync")[-1].t
@@ -39,6 +41,7 @@ def test_the_load_is_that_of_the_frames_on_the_wire(leg: Leg) -> None:
     assert expected / 2 < load < expected * 2
 
 
+@pytest.mark.slow
 def test_error_frames_are_counted(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     leg.sim.do(BadCrc(ids=(HIP,), instruction="tpdo1", count=5))
@@ -46,6 +49,7 @@ def test_error_frames_are_counted(leg: Leg) -> None:
     assert monitor.bus_state().state == "error-active"
 
 
+@pytest.mark.slow
 def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     leg.sim.do(BusOff())
@@ -58,6 +62,7 @@ def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     assert not leg.goals(HIP)
 
 
+@pytest.mark.slow
 def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call(
     leg: Leg, start_container: Callable[..., Container]
 ) -> None:
@@ -72,6 +77,7 @@ def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call
 # --- health
 
 
+@pytest.mark.slow
 def test_joints_groups_and_the_bus_report_that_the_bus_is_unhealthy_and_healthy_again(leg: Leg) -> None:
     reported: list[tuple[object, str]] = []
     robot = leg.attach(set_health=lambda provider, health: reported.append((provider, health)))

@@ -14,6 +14,8 @@ from trade import Container, Handle, Run, service, where
 from trade.errors import Cancelled, MotionStopped, SessionEnded, TradeError
 from trade_drivers import AttachedRobot, attach
 
+pytestmark = pytest.mark.slow
+
 FAR, SLOW = 1.2, 0.1
 """12 s away."""
 Begin = Callable[..., Run]

@@ -34,6 +34,7 @@ def objects(**values: int) -> Callable[[Cia402Bus], None]:
     return change
 
 
+@pytest.mark.slow
 def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -> None:
     leg.sim.do(Mute(ids=(KNEE,), instruction="heartbeat"))
     text = refused(leg)
@@ -41,6 +42,7 @@ def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -
     assert not leg.frames("rpdo1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [
@@ -91,6 +93,7 @@ def test_a_channel_that_is_not_there_is_named(leg: Leg) -> None:
     assert leg.sim.port in text
 
 
+@pytest.mark.slow
 def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     hip.enable()
@@ -105,6 +108,7 @@ def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
     assert moving.wait().result == pytest.approx(0.3, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
     rig.robot = load(Path(__file__).parents[3] / "examples" / "legs.toml")
     rig.plug(paced=True)
@@ -112,6 +116,7 @@ def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
     assert rig.attach().group("legs").move_to(goal) == pytest.approx(goal, abs=0.01)
 
 
+@pytest.mark.slow
 def test_on_an_empty_virtual_bus_the_drive_is_absent(rig: Leg) -> None:
     with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:empty"):
         rig.attach(ports={"legs": "virtual:empty"})

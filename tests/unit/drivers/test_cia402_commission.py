@@ -2,11 +2,15 @@
 
 from typing import Any
 
+import pytest
+
 from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import HIP, KNEE, Leg, leg, rig, stop_by_nmt
 from trade_drivers import scan
 from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_hil_sim import Absent
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["leg", "rig"]
 

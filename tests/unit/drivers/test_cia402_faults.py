@@ -28,6 +28,7 @@ ROWS = {row.fault: row for row in TABLE if row.device == "cia402"}
 UNHEARD = ("silence", "no measurements", "heartbeat lost", "cut short", "cable off", "bus-off of the drive")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["silence", "blocked", "EMCY"])
 def test_a_fault_of_one_stops_the_others_of_its_group(leg: Leg, fault: str) -> None:
     group = leg.attach().group("leg")
@@ -39,6 +40,7 @@ def test_a_fault_of_one_stops_the_others_of_its_group(leg: Leg, fault: str) -> N
     assert leg.controlwords(KNEE, started.t)[-1] & HALT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", UNHEARD)
 def test_a_drive_that_is_not_heard_does_not_keep_the_others(leg: Leg, fault: str) -> None:
     robot = leg.attach()
@@ -48,6 +50,7 @@ def test_a_drive_that_is_not_heard_does_not_keep_the_others(leg: Leg, fault: str
     assert knee.move_to(0.3) == pytest.approx(0.3, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["tpdo1", "heartbeat"])
 def test_a_drive_that_answers_but_is_not_heard_is_not_back_until_it_is(leg: Leg, frame: str) -> None:
     hip = leg.attach().motor("leg.hip")
@@ -65,6 +68,7 @@ def test_a_drive_that_answers_but_is_not_heard_is_not_back_until_it_is(leg: Leg,
     assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_drives_that_are_slow_to_be_attached_are_not_away_when_all_are(rig: Leg) -> None:
     rig.plug()
     rig.sim.do(Late(instruction="sdo_reply", s=0.015))
@@ -74,6 +78,7 @@ def test_drives_that_are_slow_to_be_attached_are_not_away_when_all_are(rig: Leg)
     assert robot.group("leg").move_to([0.1, 0.1]) == pytest.approx([0.1, 0.1], abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "nuisance",
     [
@@ -90,6 +95,7 @@ def test_a_small_nuisance_is_forgiven(leg: Leg, nuisance: Command) -> None:
     assert hip.move_to(0.3) == pytest.approx(0.3, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_fault_that_lasts_cannot_be_cleared_and_one_that_is_over_can(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     hip.enable()
@@ -104,6 +110,7 @@ def test_a_fault_that_lasts_cannot_be_cleared_and_one_that_is_over_can(leg: Leg)
     assert (hip.state().fault, hip.state().enabled) == ("", True)
 
 
+@pytest.mark.slow
 def test_clearing_a_fault_does_not_enable_by_itself(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     hip.enable()
@@ -116,6 +123,7 @@ def test_clearing_a_fault_does_not_enable_by_itself(leg: Leg) -> None:
     assert words[2:5] == [0x06, 0x07, 0x10F]
 
 
+@pytest.mark.slow
 def test_S07_stop_of_a_drive_that_is_not_heard_says_so(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     leg.sim.do(Mute(ids=(HIP,)))
@@ -124,6 +132,7 @@ def test_S07_stop_of_a_drive_that_is_not_heard_says_so(leg: Leg) -> None:
         hip.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("act", ["move", "follow"])
 def test_a_drive_that_falls_silent_on_its_way_is_not_taken_for_blocked(rig: Leg, act: str) -> None:
     group = _patient(rig).group("leg")
@@ -137,6 +146,7 @@ def test_a_drive_that_falls_silent_on_its_way_is_not_taken_for_blocked(rig: Leg,
     assert isinstance(moving.wait().error, DeviceSilent)
 
 
+@pytest.mark.slow
 def test_a_drive_that_falls_silent_while_it_is_enabled_has_no_fault(rig: Leg) -> None:
     hip = _patient(rig).motor("leg.hip")
     rig.sim.do(Mute(ids=(HIP,), instruction="tpdo1"))

@@ -8,6 +8,7 @@ from trade.errors import ConfigurationError, WrongDevice
 __all__ = ["leg", "rig"]
 
 
+@pytest.mark.slow
 def test_another_drive_of_the_same_model_is_refused_and_both_are_named(leg: Leg) -> None:
     leg.configure(("id = 1\n", "id = 1\nserial_number = 4711\n"))
     next(device for device in leg.sim.devices if device.device_id == HIP).store.set("serial_number", 4712)
@@ -18,6 +19,7 @@ def test_another_drive_of_the_same_model_is_refused_and_both_are_named(leg: Leg)
     assert not leg.announced
 
 
+@pytest.mark.slow
 def test_another_firmware_of_a_drive_is_refused_and_both_are_named(leg: Leg) -> None:
     leg.configure(("id = 1\n", 'id = 1\nfirmware = "1.0"\n'))
     with pytest.raises(WrongDevice) as error:
@@ -26,6 +28,7 @@ def test_another_firmware_of_a_drive_is_refused_and_both_are_named(leg: Leg) -> 
     assert (wrong.key, wrong.expected, wrong.found) == ("firmware", "1.0", "0.1.0")
 
 
+@pytest.mark.slow
 def test_the_drive_that_the_file_means_is_attached(leg: Leg) -> None:
     leg.configure(("id = 1\n", 'id = 1\nfirmware = "0.1.0"\nserial_number = 4711\n'))
     next(device for device in leg.sim.devices if device.device_id == HIP).store.set("serial_number", 4711)

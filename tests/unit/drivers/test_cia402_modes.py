@@ -83,6 +83,7 @@ def swing(group: JointGroup) -> Outcome:
 # --- trajectories
 
 
+@pytest.mark.slow
 def test_drives_that_support_it_receive_a_trajectory_position_at_every_sync(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.move_to([0.3, 0.1])
@@ -97,6 +98,7 @@ def test_drives_that_support_it_receive_a_trajectory_position_at_every_sync(leg:
     assert max(positions(leg, HIP, mark)) == pytest.approx(0.7 * COUNTS_PER_RAD, rel=0.02)
 
 
+@pytest.mark.slow
 def test_nothing_is_sent_in_a_mode_that_the_drive_does_not_show_and_the_first_is_where_it_is(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.move_to([0.3, 0.1])
@@ -111,6 +113,7 @@ def test_nothing_is_sent_in_a_mode_that_the_drive_does_not_show_and_the_first_is
     assert before.data[2:] == here[2:6]  # so its target is where it is when the mode changes
 
 
+@pytest.mark.slow
 def test_positions_count_from_the_next_sync_on_and_are_reached_in_a_period(rig: Leg) -> None:
     rig.configure(('channel = "can0"', 'channel = "can0"\nrate_hz = 80'))
     rig.plug()
@@ -120,6 +123,7 @@ def test_positions_count_from_the_next_sync_on_and_are_reached_in_a_period(rig: 
     assert [e.data[4] - 256 for e in written(rig, 0x60C2, 2)] == [-4]
 
 
+@pytest.mark.slow
 def test_a_drive_in_position_mode_is_closer_to_its_trajectory_than_one_with_goals(
     rig: Leg, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,6 +144,7 @@ def test_a_drive_in_position_mode_is_closer_to_its_trajectory_than_one_with_goal
 # --- speeds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", TURNING)
 def test_S04_a_speed_that_is_not_renewed_ends_in_a_quick_stop_under_torque(rig: Leg, mode: int) -> None:
     rig.plug(prepare=only(PROFILE_POSITION, mode))
@@ -157,6 +162,7 @@ def test_S04_a_speed_that_is_not_renewed_ends_in_a_quick_stop_under_torque(rig: 
     hip.move_to(0.0)
 
 
+@pytest.mark.slow
 def test_speeds_rise_as_the_joint_may_accelerate(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     for _ in range(10):
@@ -166,6 +172,7 @@ def test_speeds_rise_as_the_joint_may_accelerate(leg: Leg) -> None:
     assert max(changes) <= 20 * COUNTS_PER_RAD / 100 + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", TURNING)
 def test_S22_a_speed_ends_within_the_range_also_while_nothing_is_measured(rig: Leg, mode: int) -> None:
     rig.configure(('channel = "can0"', 'channel = "can0"\nstale_after_s = 1.5'))
@@ -179,6 +186,7 @@ def test_S22_a_speed_ends_within_the_range_also_while_nothing_is_measured(rig: L
     assert rig.truth(HIP).position_rad <= 1.0 + 1 / COUNTS_PER_RAD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [*TURNING, PROFILE_POSITION])
 def test_S22_a_speed_ends_within_the_range_also_if_the_driver_freezes(
     rig: Leg, mode: int, monkeypatch: pytest.MonkeyPatch
@@ -203,6 +211,7 @@ def test_S22_a_speed_ends_within_the_range_also_if_the_driver_freezes(
     thaw.set()
 
 
+@pytest.mark.slow
 def test_S22_a_speed_comes_to_rest_at_the_end_of_the_range(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     wait_until(lambda: hip.set_velocity(2.0, valid_s=0.5) or hip.state().position_rad > 0.98, "it is at the end")
@@ -219,6 +228,7 @@ ASKS: dict[str, Callable[[Drive], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ASKS)
 @pytest.mark.parametrize("first", ["a trajectory", "a speed", "a move"])
 def test_a_mode_never_changes_while_the_drive_moves(leg: Leg, first: str, name: str) -> None:
@@ -243,6 +253,7 @@ def test_a_mode_never_changes_while_the_drive_moves(leg: Leg, first: str, name: 
     assert hip.state().fault == ""
 
 
+@pytest.mark.slow
 def test_a_drive_holds_its_position_after_a_trajectory_and_moves_again(leg: Leg) -> None:
     robot = leg.attach()
     group, hip = robot.group("leg"), robot.motor("leg.hip")
@@ -255,6 +266,7 @@ def test_a_drive_holds_its_position_after_a_trajectory_and_moves_again(leg: Leg)
     assert QUICK_STOP not in leg.controlwords(HIP, mark)
 
 
+@pytest.mark.slow
 def test_a_stop_of_a_trajectory_is_a_quick_stop_and_it_moves_again(leg: Leg) -> None:
     robot = leg.attach()
     group = robot.group("leg")
@@ -269,6 +281,7 @@ def test_a_stop_of_a_trajectory_is_a_quick_stop_and_it_moves_again(leg: Leg) -> 
     assert group.move_to([0.0, 0.0]) == pytest.approx([0.0, 0.0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_an_old_target_velocity_does_not_come_to_life_when_it_is_enabled(rig: Leg) -> None:
     rig.plug(prepare=only(PROFILE_POSITION, CYCLIC_VELOCITY))
     hip = rig.attach().motor("leg.hip")
@@ -285,6 +298,7 @@ def test_an_old_target_velocity_does_not_come_to_life_when_it_is_enabled(rig: Le
 # --- drives that lack something
 
 
+@pytest.mark.slow
 def test_a_drive_without_these_modes_gets_goals(rig: Leg) -> None:
     rig.plug(prepare=only(PROFILE_POSITION, HOMING))
     robot = rig.attach()
@@ -295,6 +309,7 @@ def test_a_drive_without_these_modes_gets_goals(rig: Leg) -> None:
     assert rig.goals(HIP)
 
 
+@pytest.mark.slow
 def test_a_drive_that_does_not_show_its_mode_is_not_enabled_in_it(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     leg.sim.do(Mute(ids=(HIP,), instruction="tpdo2"))
@@ -304,6 +319,7 @@ def test_a_drive_that_does_not_show_its_mode_is_not_enabled_in_it(leg: Leg) -> N
     assert not leg.events("torque_on", HIP, mark)
 
 
+@pytest.mark.slow
 def test_a_drive_that_would_relax_after_a_quick_stop_is_not_used_in_these_modes(rig: Leg) -> None:
     def stubborn(bus: Cia402Bus) -> None:
         for device in bus.devices:

@@ -15,6 +15,7 @@ from trade_drivers.vendors.cia402._motor import Drive
 __all__ = ["leg", "rig"]
 
 
+@pytest.mark.slow
 def test_enabling_passes_one_state_after_the_other_and_ends_halted_at_the_current_position(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     mark = written_now()
@@ -25,6 +26,7 @@ def test_enabling_passes_one_state_after_the_other_and_ends_halted_at_the_curren
     assert not leg.controlwords(KNEE, mark)
 
 
+@pytest.mark.slow
 def test_a_set_point_has_an_edge_and_the_edge_is_taken_back_when_it_was_taken(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     mark = written_now()
@@ -37,6 +39,7 @@ def test_a_set_point_has_an_edge_and_the_edge_is_taken_back_when_it_was_taken(le
     assert leg.goals(HIP, mark) == [round(goal * COUNTS_PER_RAD) for goal in (0.2, 0.4, 0.1)]
 
 
+@pytest.mark.slow
 def test_a_group_starts_together_and_arrives_together(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.enable()
@@ -49,6 +52,7 @@ def test_a_group_starts_together_and_arrives_together(leg: Leg) -> None:
     assert ended[0] - started == pytest.approx(ended[1] - started, rel=0.1)
 
 
+@pytest.mark.slow
 def test_servo_follows_newer_and_newer_goals(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.enable()
@@ -80,6 +84,7 @@ def shaken(leg: Leg, joint: int, since: float) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_streamed_at_the_rate_at_which_drives_take_goals(rig: Leg) -> None:
     leg = rig
     leg.plug(prepare=only(PROFILE_POSITION, HOMING))
@@ -99,6 +104,7 @@ def test_a_trajectory_is_streamed_at_the_rate_at_which_drives_take_goals(rig: Le
 ROUNDS = 5
 
 
+@pytest.mark.slow
 def test_a_move_takes_over_from_trajectories_whose_handshakes_alternate(rig: Leg) -> None:
     single = "".join(f'[group.{joint}]\njoints = ["leg.{joint}"]\n' for joint in ("hip", "knee"))
     rig.configure(("[group.leg]", f"{single}[group.leg]"))
@@ -128,6 +134,7 @@ def test_a_move_takes_over_from_trajectories_whose_handshakes_alternate(rig: Leg
     assert shaken(rig, KNEE, mark)
 
 
+@pytest.mark.slow
 def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
     rig.configure(('channel = "can0"', 'channel = "can0"\nrate_hz = 12'))
     rig.plug(prepare=only(PROFILE_POSITION, HOMING))
@@ -138,6 +145,7 @@ def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
     assert not rig.controlwords(HIP, mark)
 
 
+@pytest.mark.slow
 def test_S04_a_set_point_that_is_not_renewed_ends_in_a_halt(rig: Leg) -> None:
     leg = rig
     leg.plug(prepare=only(PROFILE_POSITION, HOMING))
@@ -150,6 +158,7 @@ def test_S04_a_set_point_that_is_not_renewed_ends_in_a_halt(rig: Leg) -> None:
     assert hip.state().position_rad < 0.9
 
 
+@pytest.mark.slow
 def test_the_frames_of_a_drive_are_mapped_in_the_order_drives_insist_on(leg: Leg) -> None:
     leg.attach()
     writes = [e.data for e in leg.frames("sdo_request", HIP) if e.data[0] & 0xE0 == 0x20]
@@ -168,6 +177,7 @@ def test_the_frames_of_a_drive_are_mapped_in_the_order_drives_insist_on(leg: Leg
     assert [place[2] for place in places if place[0] == 0x1400 and place[1] == 2] == [255]
 
 
+@pytest.mark.slow
 def test_home_takes_where_it_is_for_zero_and_the_next_move_is_in_the_usual_mode(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)
@@ -178,6 +188,7 @@ def test_home_takes_where_it_is_for_zero_and_the_next_move_is_in_the_usual_mode(
     assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_home_with_a_method_the_drive_does_not_know_is_a_fault_and_moves_nothing(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)
@@ -188,6 +199,7 @@ def test_home_with_a_method_the_drive_does_not_know_is_a_fault_and_moves_nothing
     assert not leg.events("motion_started", HIP, mark)
 
 
+@pytest.mark.slow
 def test_enable_ends_homing_and_the_waiting_call_raises(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)
@@ -199,6 +211,7 @@ def test_enable_ends_homing_and_the_waiting_call_raises(leg: Leg) -> None:
     assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_S22_home_too_fast_is_refused(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)
@@ -207,6 +220,7 @@ def test_S22_home_too_fast_is_refused(leg: Leg) -> None:
             hip.home(37, speed)
 
 
+@pytest.mark.slow
 def test_S22_the_limits_of_set_points_hold(leg: Leg) -> None:
     robot = leg.attach()
     hip, group = robot.motor("leg.hip"), robot.group("leg")

@@ -15,6 +15,7 @@ from trade_hil_sim.cia402 import Abort, AbortCode, Cia402Bus
 __all__ = ["leg", "rig"]
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_enabled_already_is_not_dropped_by_the_first_controlword(leg: Leg) -> None:
     robot = leg.attach()
     robot.motor("leg.hip").enable()
@@ -26,6 +27,7 @@ def test_a_drive_that_is_enabled_already_is_not_dropped_by_the_first_controlword
     assert not leg.events("torque_off", HIP)
 
 
+@pytest.mark.slow
 def test_a_drive_that_does_not_obey_is_a_fault_and_not_a_success(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     leg.sim.do(Mute(ids=(HIP,), instruction="rpdo1"))
@@ -33,6 +35,7 @@ def test_a_drive_that_does_not_obey_is_a_fault_and_not_a_success(leg: Leg) -> No
         hip.enable()
 
 
+@pytest.mark.slow
 def test_many_callers_at_once_do_not_mix_up_the_answers_of_the_dictionary(leg: Leg) -> None:
     robot = leg.attach()
     hip, knee = robot.motor("leg.hip"), robot.motor("leg.knee")
@@ -41,6 +44,7 @@ def test_many_callers_at_once_do_not_mix_up_the_answers_of_the_dictionary(leg: L
     assert not [error for error in errors if isinstance(error, DeviceFault)]
 
 
+@pytest.mark.slow
 def test_an_emergency_that_is_too_short_still_counts(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     hip.enable()
@@ -50,6 +54,7 @@ def test_an_emergency_that_is_too_short_still_counts(leg: Leg) -> None:
     wait_until(lambda: "4310h" in fault_of(hip), "its error is known")
 
 
+@pytest.mark.slow
 def test_a_drive_that_cannot_map_an_object_is_refused_and_not_read_one_field_off(rig: Leg) -> None:
     def without_torque(bus: Cia402Bus) -> None:
         for device in bus.devices:
@@ -68,6 +73,7 @@ def test_a_drive_that_cannot_map_an_object_is_refused_and_not_read_one_field_off
         rig.attach()
 
 
+@pytest.mark.slow
 def test_an_adapter_that_echoes_does_not_keep_commands_back(leg: Leg) -> None:
     leg.sim.do(Echo())
     hip = leg.attach().motor("leg.hip")
@@ -75,6 +81,7 @@ def test_an_adapter_that_echoes_does_not_keep_commands_back(leg: Leg) -> None:
     assert leg.goals(HIP) == [round(0.2 * COUNTS_PER_RAD)]
 
 
+@pytest.mark.slow
 def test_no_thread_but_the_one_of_the_bus_touches_the_library(leg: Leg) -> None:
     before = set(threading.enumerate())
     robot = leg.attach()
@@ -84,6 +91,7 @@ def test_no_thread_but_the_one_of_the_bus_touches_the_library(leg: Leg) -> None:
     assert not set(threading.enumerate()) - before
 
 
+@pytest.mark.slow
 def test_the_frame_with_the_controlword_counts_at_once_and_those_measured_at_every_sync(leg: Leg) -> None:
     leg.attach()
     types = {}

@@ -16,6 +16,8 @@ from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["leg", "rig"]
 
 QUICK_STOP = 0x02

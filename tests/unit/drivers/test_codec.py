@@ -162,6 +162,7 @@ SAME = st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just
 LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(GRAIN))
 
 
+@pytest.mark.slow
 @given(st.lists(LEGS, min_size=1, max_size=6))
 def test_no_profile_exceeds_the_limits_of_its_joint_nor_means_no_limit(legs: list[Leg]) -> None:
     for leg, profile in zip(legs, together(legs), strict=True):
@@ -169,6 +170,7 @@ def test_no_profile_exceeds_the_limits_of_its_joint_nor_means_no_limit(legs: lis
         assert 1 <= profile.accel_counts <= leg.accel_counts
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(GRAIN)), min_size=2, max_size=6)
 )
@@ -191,6 +193,7 @@ def test_the_public_names_exist() -> None:
         assert getattr(trade_drivers, name).__doc__
 
 
+@pytest.mark.slow
 def test_no_vendor_library_is_imported_before_a_bus_is_attached() -> None:
     imports = "import sys, trade_drivers, trade_drivers.vendors.dynamixel"
     code = f"{imports}; print({{'serial', 'dynamixel_sdk'}} & set(sys.modules))"

@@ -40,13 +40,17 @@ class Loop:
     asked: dict[tuple[str, int], int]
     """What the driver sends in a turn at most: name (of CAN frames) and bytes, how often."""
     answered: dict[tuple[str, int], int]
-    """What comes back for it."""
+    """What comes back for it; after a missing answer, a servo is asked for answers of another size for a while."""
 
 
 _ASKED_IN_TURN = ("temperature", "bus_voltage_current", "error", "iq")
 LOOPS = {
-    "dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("read", 94): 1}),
-    "feetech": Loop(TailRig, {("", 10): 1, ("", 8): 1}, {("sync_read", 12): 2, ("sync_read", 14): 2, ("read", 33): 1}),
+    "dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("sync_read", 29): 2, ("read", 94): 1}),
+    "feetech": Loop(
+        TailRig,
+        {("", 10): 1, ("", 8): 1},
+        {**{("sync_read", size): 2 for size in (12, 14, 16)}, ("read", 33): 1},
+    ),
     "cia402": Loop(
         lambda _, undo: Leg(undo), {("sync", 0): 1, ("heartbeat", 1): 1}, {("tpdo1", 8): 2, ("tpdo2", 7): 2}
     ),
@@ -108,6 +112,7 @@ def test_every_driver_of_a_bus_has_its_loop_here() -> None:
     assert {point.name for point in ours if issubclass(point.load(), Driver)} == set(LOOPS)
 
 
+@pytest.mark.slow
 def test_a_bus_cycle_sends_a_bounded_number_of_bytes(running: Running) -> None:
     before, missed, seen = running.turns, running.measured("bus_missed_answers"), len(running.rig.log)
     running.turn(TURNS)
@@ -131,6 +136,7 @@ def is_answer(one: Entry) -> bool:
     return one.kind == "sent" or (one.kind == "frame" and one.direction == "out")
 
 
+@pytest.mark.slow
 def test_bus_cycles_keep_no_memory(running: Running) -> None:
     """But for the last seconds, which faults are reported with: so it is looked at until that has grown no more.
 

@@ -33,6 +33,7 @@ def fine(curve: Curve) -> list[float]:
     return [curve.duration_s * step / 1000 for step in range(1001)]
 
 
+@pytest.mark.slow
 @given(points())
 def test_it_goes_through_its_points_at_the_speeds_given(given: tuple[list[float], list[float], list[float]]) -> None:
     times, positions, velocities = given
@@ -43,6 +44,7 @@ def test_it_goes_through_its_points_at_the_speeds_given(given: tuple[list[float]
     assert curve.at(-1) == curve.at(0)
 
 
+@pytest.mark.slow
 @given(points())
 def test_the_reported_extremes_are_those_of_the_curve(given: tuple[list[float], list[float], list[float]]) -> None:
     curve = Curve.through(*given)
@@ -83,6 +85,7 @@ def test_two_points_at_rest_give_the_standard_cubic() -> None:
     assert curve.pieces[0].accels() == pytest.approx((1.5, -1.5))  # six times the distance by the time squared
 
 
+@pytest.mark.slow
 @given(st.lists(WAYS, min_size=1, max_size=4))
 def test_joints_that_go_together_arrive_together_within_their_limits(ways: list[Way]) -> None:
     curves = there_together(ways)

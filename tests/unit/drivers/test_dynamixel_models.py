@@ -20,6 +20,7 @@ def plug(rig: Rig, pan: str, tilt: str) -> None:
     rig.plug()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_each_model_is_attached_and_moved(rig: Rig, model: str) -> None:
     plug(rig, model, model)

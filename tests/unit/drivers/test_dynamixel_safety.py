@@ -28,6 +28,7 @@ WATCHDOG_S = 0.3
 # --- S01 late is never
 
 
+@pytest.mark.slow
 def test_S01_a_command_that_expires_while_a_silent_joint_holds_the_bus_up_is_never_written(head: Rig) -> None:
     robot = head.attach()
     head.sim.do(trade_hil_sim.Mute(ids=(1, 2)))
@@ -78,6 +79,7 @@ def child(head: Rig, tmp_path: Path) -> Iterator[Child]:
     made.close()
 
 
+@pytest.mark.slow
 def test_S06_after_the_watchdog_only_an_explicit_enable_lets_it_move_again(head: Rig, child: Child) -> None:
     head.wait_for("motion_started", 1)
     child.signal(signal.SIGKILL)

@@ -38,6 +38,7 @@ def await_none(robot: AttachedRobot) -> None:
     wait_until(lambda: not opened(robot), "nothing is wrong any more")
 
 
+@pytest.mark.slow
 def test_a_fault_in_a_move_is_noted_with_what_was_measured_on_the_way(head: Rig) -> None:
     robot = head.attach()
     pan = robot.motor("neck.pan")
@@ -67,6 +68,7 @@ def test_a_fault_in_a_move_is_noted_with_what_was_measured_on_the_way(head: Rig)
     assert gone.lasted_s > 0
 
 
+@pytest.mark.slow
 def test_two_faults_of_one_joint_and_its_silence_are_three(head: Rig) -> None:
     robot = head.attach()
     head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
@@ -155,6 +157,7 @@ def test_a_fault_that_is_still_there_at_the_next_attach_is_the_same_and_one_that
     assert not gone.open
 
 
+@pytest.mark.slow
 def test_a_gripper_reports_its_faults(hand: HandRig) -> None:
     robot = hand.attach()
     robot.gripper("left.hand").activate()
@@ -164,6 +167,7 @@ def test_a_gripper_reports_its_faults(hand: HandRig) -> None:
     assert {"width_m", "current_a", "force_n"} <= set(robot.faults.fault(info.id).latest[-1].values)
 
 
+@pytest.mark.slow
 def test_faults_are_services_for_any_client_and_an_acknowledgement_names_the_client(
     head: Rig, start_container: Callable[..., Container]
 ) -> None:
@@ -196,6 +200,7 @@ def test_faults_are_services_for_any_client_and_an_acknowledgement_names_the_cli
     wait_until(lambda: healths() == wanted, "the registry says so")
 
 
+@pytest.mark.slow
 def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> None:
     robot = head.attach()
     bus: Any = robot._buses["neck"]

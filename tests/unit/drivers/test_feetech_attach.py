@@ -49,6 +49,7 @@ def test_a_servo_that_is_set_up_otherwise_is_refused_and_the_register_named(
     assert 'joint."tail.root"' in text
 
 
+@pytest.mark.slow
 def test_another_baud_rate_is_silence(rig: TailRig) -> None:
     rig.plug(Servo(1, baud=115_200), Servo(2, baud=115_200))
     assert "no device answers to id 1" in refused(rig)

@@ -182,6 +182,7 @@ def test_a_joint_unheard_on_its_way_gets_no_hold_beyond_its_last_goal() -> None:
     assert axis.hold_counts(10**9 + 200_000_000, BLIND_NS) == 2300
 
 
+@pytest.mark.slow
 def test_importing_the_driver_needs_no_serial_library() -> None:
     code = "import sys, trade_drivers, trade_drivers.vendors.feetech; print({'serial'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

@@ -46,6 +46,7 @@ def await_fault(robot: AttachedRobot, says: str) -> None:
 # --- answers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [
@@ -69,6 +70,7 @@ def test_a_few_bad_answers_go_unnoticed(tail: TailRig, robot: AttachedRobot, fau
     assert root.state().fault == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [0.033, 0.040, 0.060, 0.080, 0.1, 0.15])
 def test_a_late_answer_never_becomes_a_wrong_value(tail: TailRig, robot: AttachedRobot, late_s: float) -> None:
     robot.motor("tail.root").move_to(0.5)
@@ -93,12 +95,14 @@ def test_an_adapter_that_echoes_is_no_trouble(tail: TailRig) -> None:
     assert robot.motor("tail.tip").state().fault == ""
 
 
+@pytest.mark.slow
 def test_a_silent_joint_leaves_the_other_usable(tail: TailRig, robot: AttachedRobot) -> None:
     tail.sim.do(sim.Mute(ids=(1,)))
     wait_until(lambda: state(robot) is None, "it is silent")
     assert robot.motor("tail.tip").move_to(0.4) == pytest.approx(0.4, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_joint_that_fell_silent_gets_no_command_and_moves_no_farther_than_it_was_sent(
     tail: TailRig, robot: AttachedRobot
 ) -> None:
@@ -112,6 +116,7 @@ def test_a_joint_that_fell_silent_gets_no_command_and_moves_no_farther_than_it_w
     assert tail.truth().position_rad < 1.2
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_now_another_device_does_not_even_get_a_hold(tail: TailRig, robot: AttachedRobot) -> None:
     root = robot.motor("tail.root")
     root.enable()
@@ -130,6 +135,7 @@ def test_a_joint_that_is_now_another_device_does_not_even_get_a_hold(tail: TailR
 # --- its own protection
 
 
+@pytest.mark.slow
 def test_a_servo_that_was_too_hot_does_not_come_back_by_itself(tail: TailRig, robot: AttachedRobot) -> None:
     root = robot.motor("tail.root")
     root.move_to(0.3)
@@ -246,6 +252,7 @@ def test_S18_a_servo_that_relaxed_and_missed_an_exchange_gets_no_goal(tail: Tail
     assert not tail.events("torque_on", 1, limp.t)
 
 
+@pytest.mark.slow
 def test_S18_a_stop_of_a_servo_that_has_booted_limp_and_was_not_heard_since_sends_it_no_hold(
     tail: TailRig, robot: AttachedRobot
 ) -> None:

@@ -33,6 +33,7 @@ def tail(rig: TailRig) -> TailRig:
 # --- S06 the device has no watchdog: what a driver leaves behind
 
 
+@pytest.mark.slow
 def test_S06_no_servo_has_a_watchdog_so_no_goal_is_farther_ahead_than_the_joint_gets_until_the_next(
     tail: TailRig,
 ) -> None:
@@ -46,6 +47,7 @@ def test_S06_no_servo_has_a_watchdog_so_no_goal_is_farther_ahead_than_the_joint_
         assert abs(goal_of(write) - measured_before(log, write)) <= lead_counts(1.0)
 
 
+@pytest.mark.slow
 def test_S06_no_set_point_is_farther_ahead_than_the_joint_gets_until_the_next(tail: TailRig) -> None:
     root = tail.root()
     root.enable()
@@ -71,6 +73,7 @@ def test_S08_a_stop_of_a_relaxed_joint_sends_it_no_goal(tail: TailRig) -> None:
 # --- S11 locks
 
 
+@pytest.mark.slow
 def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: TailRig) -> None:
     root = tail.root()
     root.enable()

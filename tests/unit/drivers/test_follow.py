@@ -48,6 +48,7 @@ SLOW = through((0.0, [0.0, 0.0]), (4.0, [1.2, 0.5]))
 """At half its way after 2 s."""
 
 
+@pytest.mark.slow
 def test_it_goes_through_its_points_in_time_and_returns_at_rest(head: Rig, group: JointGroup) -> None:
     group.enable()
     mark = written_now()
@@ -62,11 +63,13 @@ def test_it_goes_through_its_points_in_time_and_returns_at_rest(head: Rig, group
     assert turns[0] > 0.4 * pan[-1][0]
 
 
+@pytest.mark.slow
 def test_the_joints_may_be_named_in_any_order(group: JointGroup) -> None:
     trajectory = through((0.0, [0.0, 0.0]), (0.8, [-0.2, 0.4]), joints=NAMES[::-1])
     assert group.follow(trajectory, WIDE) == pytest.approx([0.4, -0.2], abs=0.03)
 
 
+@pytest.mark.slow
 def test_with_velocities_it_is_as_fast_at_a_point_as_they_say(head: Rig, group: JointGroup) -> None:
     group.enable()
     rows = ((0.0, [0.0, 0.0], [0.0, 0.0]), (0.6, [0.3, 0.0], [0.0, 0.0]), (1.2, [0.6, 0.0], [0.0, 0.0]))
@@ -76,6 +79,7 @@ def test_with_velocities_it_is_as_fast_at_a_point_as_they_say(head: Rig, group: 
     assert any(abs(angle - 0.3) < 0.01 for angle in stood)  # without them it would have gone on
 
 
+@pytest.mark.slow
 def test_it_is_followed_far_more_closely_than_the_goals_alone_would_be(robot: AttachedRobot, group: JointGroup) -> None:
     seen: list[float] = []
     trajectory = through((0.0, [0.0, 0.0]), (1.0, [1.2, 0.0]), (2.0, [0.0, 0.0]))
@@ -108,6 +112,7 @@ class running_reports:  # noqa: N801 - reads as a function
         running.reset(self._token)
 
 
+@pytest.mark.slow
 def test_its_progress_rises_to_the_whole(group: JointGroup) -> None:
     heard: list[FollowProgress] = []
     with running_reports(heard.append):
@@ -178,6 +183,7 @@ def test_S22_it_begins_where_the_joints_are_or_not_at_all(head: Rig, group: Join
     assert not head.moves(since=mark)
 
 
+@pytest.mark.slow
 def test_S22_from_outside_the_range_it_comes_back_in_and_never_goes_farther_out(rig: Rig) -> None:
     rig.plug(Servo(1, position_counts=2048 + 1100), Servo(2))
     group = rig.attach().group("head")
@@ -220,6 +226,7 @@ def test_S08_stopping_one_joint_ends_it_for_all(head: Rig, robot: AttachedRobot,
     assert short_of_its_end(head)
 
 
+@pytest.mark.slow
 def test_a_new_one_takes_over_and_nothing_holds_in_between(head: Rig, group: JointGroup) -> None:
     first = started(head, group)
     wait_until(lambda: head.truth(1).position_rad > 0.5, "it is under way")
@@ -246,6 +253,7 @@ def test_a_move_of_one_joint_takes_over_and_the_others_hold(head: Rig, robot: At
     assert head.truth(2).position_rad < 0.45
 
 
+@pytest.mark.slow
 def test_a_joint_that_leaves_its_path_stops_all(head: Rig, group: JointGroup) -> None:
     following = started(head, group, Tolerances(path_rad=0.1))
     head.sim.do(trade_hil_sim.Jam(ids=(1,)))
@@ -256,6 +264,7 @@ def test_a_joint_that_leaves_its_path_stops_all(head: Rig, group: JointGroup) ->
     assert short_of_its_end(head)
 
 
+@pytest.mark.slow
 def test_a_joint_that_does_not_reach_the_end_is_reported(head: Rig, group: JointGroup) -> None:
     group.enable()
     following = Outcome(lambda: group.follow(through((0.0, [0.0, 0.0]), (0.5, [0.3, 0.0])), Tolerances(path_rad=9.0)))
@@ -265,6 +274,7 @@ def test_a_joint_that_does_not_reach_the_end_is_reported(head: Rig, group: Joint
     assert error.what == "goal"
 
 
+@pytest.mark.slow
 def test_a_joint_that_falls_silent_stops_the_others(head: Rig, group: JointGroup) -> None:
     following = started(head, group)
     head.sim.do(trade_hil_sim.Mute(ids=(1,)))
@@ -282,6 +292,7 @@ def test_S04_held_up_for_longer_than_a_set_point_holds_it_is_over(head: Rig) -> 
             holding_up.clear()
         return True
 
+    head.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nwatchdog_s = 1'))
     group = head.attach(healthy=healthy).group("head")
     following = started(head, group)
     holding_up.set()
@@ -290,6 +301,7 @@ def test_S04_held_up_for_longer_than_a_set_point_holds_it_is_over(head: Rig) -> 
     assert short_of_its_end(head)
 
 
+@pytest.mark.slow
 def test_S05_it_ends_with_the_session_it_belongs_to(head: Rig) -> None:
     with memory_system() as system:
         driver, caller = system.container("driver"), system.container("caller")
@@ -303,6 +315,7 @@ def test_S05_it_ends_with_the_session_it_belongs_to(head: Rig) -> None:
         assert not run.done() or run.exception() is not None
 
 
+@pytest.mark.slow
 def test_cancelled_it_stops(head: Rig) -> None:
     with memory_system() as system:
         driver, caller = system.container("driver"), system.container("caller")

@@ -181,6 +181,7 @@ def assert_nothing_sends_it_away(joint: Joint) -> None:
     assert abs(joint.rad - joint.rests_rad) < MOST_RAD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("act", [Joint.move, Joint.follow])
 def test_S06_held_up_in_a_cycle_it_sends_no_joint_farther_than_its_watchdog_lets_it_get(
     joint: Joint, act: Callable[[Joint], object]
@@ -194,6 +195,7 @@ def test_S06_held_up_in_a_cycle_it_sends_no_joint_farther_than_its_watchdog_lets
     assert "held up for 1." in str(error)
 
 
+@pytest.mark.slow
 def test_S06_held_up_in_a_cycle_a_stop_that_came_meanwhile_sends_no_joint_farther_either(joint: Joint) -> None:
     moving = joint.set_off(joint.move)
     with joint.held_up():
@@ -204,6 +206,7 @@ def test_S06_held_up_in_a_cycle_a_stop_that_came_meanwhile_sends_no_joint_farthe
     assert isinstance(moving.wait().error, DeviceFault | MotionStopped)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("act", [Joint.move, Joint.follow, Joint.turn])
 def test_S06_what_moved_when_its_host_was_suspended_does_not_continue(
     joint: Joint, act: Callable[[Joint], object], monkeypatch: pytest.MonkeyPatch
@@ -222,6 +225,7 @@ def test_S06_what_moved_when_its_host_was_suspended_does_not_continue(
         assert "held up for 3600." in str(error)
 
 
+@pytest.mark.slow
 def test_S06_a_driver_that_is_held_up_for_less_continues(joint: Joint) -> None:
     moving = joint.set_off(joint.move)
     job = _HoldUp(joint.motor)

@@ -30,6 +30,7 @@ def what() -> str:
     return f"test_host_lock:{next(_numbers)}"
 
 
+@pytest.mark.slow
 def test_the_second_process_learns_which_one_has_the_port_and_gets_it_when_that_is_killed(what: str) -> None:
     lock = HostLock(what, "head.toml: bus.neck")
     pipe = subprocess.PIPE

@@ -12,6 +12,7 @@ from trade_hil_sim import SimProcess
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "bus", "device"),
     [("head.toml", "rosie.neck", "rosie.neck.pan"), ("legs.toml", "rosie.legs", None)],

@@ -77,6 +77,7 @@ def test_a_damiao_is_refused_for_what_the_file_says(damiaos: MotorRig, change: t
     assert not [e for e in damiaos.frames() if e.direction == "in"]
 
 
+@pytest.mark.slow
 def test_an_odrive_without_a_watchdog_is_not_enabled(odrives: MotorRig) -> None:
     odrives.plug(prepare=lambda bus: setattr(bus.devices[0], "watchdog_s", None))
     root = odrives.attach().motor("tail.root")
@@ -87,6 +88,7 @@ def test_an_odrive_without_a_watchdog_is_not_enabled(odrives: MotorRig) -> None:
     assert not odrives.events("motion_started")
 
 
+@pytest.mark.slow
 def test_an_odrive_shows_its_watchdog_once_without_torque_and_only_then_holds(odrives: MotorRig) -> None:
     odrives.plug()
     root = odrives.attach().motor("tail.root")
@@ -102,6 +104,7 @@ def test_an_odrive_shows_its_watchdog_once_without_torque_and_only_then_holds(od
     assert not odrives.events("watchdog_expired", ROOT, again)
 
 
+@pytest.mark.slow
 def test_S18_an_odrive_found_moving_is_stopped_and_refused(odrives: MotorRig) -> None:
     odrives.plug(prepare=lambda bus: setattr(bus.devices[0], "watchdog_s", None))
     with odrives.listen() as other:
@@ -116,6 +119,7 @@ def test_S18_an_odrive_found_moving_is_stopped_and_refused(odrives: MotorRig) ->
     assert not odrives.targets(ROOT)
 
 
+@pytest.mark.slow
 def test_a_damiao_is_watched_from_attaching_on(damiaos: MotorRig) -> None:
     damiaos.plug()
     damiaos.attach()
@@ -123,6 +127,7 @@ def test_a_damiao_is_watched_from_attaching_on(damiaos: MotorRig) -> None:
         assert damiaos.truth(joint).watchdog == 8000  # 0.4 s in steps of 50 us
 
 
+@pytest.mark.slow
 def test_the_example_of_a_tail_moves_on_the_simulator(odrives: MotorRig) -> None:
     odrives.robot = load(Path(__file__).parents[3] / "examples" / "tail.toml")
     odrives.plug()

@@ -60,6 +60,7 @@ def message(can_id: int, data: bytes) -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
+@pytest.mark.slow
 def test_a_scan_names_the_motors_and_commands_nothing(wag: MotorRig) -> None:
     found = look(wag)
     model, firmware = MODELS[wag.kind]
@@ -72,11 +73,13 @@ def test_a_scan_names_the_motors_and_commands_nothing(wag: MotorRig) -> None:
     assert said == {"odrive": {"ask_get_version"}, "damiao": {"read_register", "refresh"}}[wag.kind]
 
 
+@pytest.mark.slow
 def test_a_motor_that_is_asked_for_alone(wag: MotorRig) -> None:
     assert [one.id for one in look(wag, ids=[TIP])] == [TIP]
     assert not look(wag, ids=[TIP + 1])
 
 
+@pytest.mark.slow
 def test_a_motor_under_torque_ends_the_scan(wag: MotorRig) -> None:
     wag.sim.devices[0].watchdog_s = None  # an ODrive's
     with wag.listen() as other:
@@ -86,6 +89,7 @@ def test_a_motor_under_torque_ends_the_scan(wag: MotorRig) -> None:
         look(wag)
 
 
+@pytest.mark.slow
 def test_an_unknown_model_is_shown_with_its_number(wag: MotorRig) -> None:
     wag.sim.do(WrongModel(ids=(ROOT,), number=77))
     root = look(wag, ids=[ROOT])[0]
@@ -93,12 +97,14 @@ def test_an_unknown_model_is_shown_with_its_number(wag: MotorRig) -> None:
     assert root.problem
 
 
+@pytest.mark.slow
 def test_their_numbers_are_set_by_other_tools(wag: MotorRig) -> None:
     with pytest.raises(ConfigurationError, match="its number is set by"):
         COMMISSIONERS[wag.kind]().set_id(wag.sim.port, 1_000_000, ROOT, 9)
     assert not wag.commanded()
 
 
+@pytest.mark.slow
 def test_an_odrive_without_a_number_is_shown_by_its_serial_number() -> None:
     address = message(63 << 5 | 6, bytes((63,)) + (0x384A31).to_bytes(6, "little"))
     with CanBus([Axis(5, t=time.monotonic())]) as sim, talking(sim.port, address):
@@ -108,6 +114,7 @@ def test_an_odrive_without_a_number_is_shown_by_its_serial_number() -> None:
     assert "it has no node number yet" in nameless.problem
 
 
+@pytest.mark.slow
 def test_an_odrive_whose_firmware_reports_no_version_is_shown_with_that() -> None:
     beat = message(7 << 5 | 1, struct.pack("<IBBBx", 0, 1, 0, 0))
     with CanBus([]) as sim, talking(sim.port, beat):
@@ -116,6 +123,7 @@ def test_an_odrive_whose_firmware_reports_no_version_is_shown_with_that() -> Non
     assert "older than 0.6" in old.problem
 
 
+@pytest.mark.slow
 def test_two_motors_of_one_number_are_not_taken_for_one() -> None:
     twin = Motor(1, t=time.monotonic())
     with CanBus([Motor(1, t=time.monotonic())]) as sim:
@@ -124,6 +132,7 @@ def test_two_motors_of_one_number_are_not_taken_for_one() -> None:
     assert "two motors answer to this number" in shared.problem
 
 
+@pytest.mark.slow
 def test_a_motor_that_answers_with_another_identifier_is_shown_with_it() -> None:
     fresh = Motor(1, t=time.monotonic())
     fresh._registers[7] = 0.0
@@ -132,6 +141,7 @@ def test_a_motor_that_answers_with_another_identifier_is_shown_with_it() -> None
     assert "answers as 0h; set its MST_ID (register 7) to 11h" in found.problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commissioner", [Cia402Driver.commissioner, DamiaoDriver.commissioner])
 def test_where_odrives_talk_no_other_vendor_is_asked(commissioner: Callable[[], Commissioner]) -> None:
     with CanBus([Axis(5, t=time.monotonic())]) as sim:
@@ -140,6 +150,7 @@ def test_where_odrives_talk_no_other_vendor_is_asked(commissioner: Callable[[], 
         assert not [frame for frame in frames(list(sim.log.entries)) if frame.source.startswith("client")]
 
 
+@pytest.mark.slow
 def test_drives_and_motors_on_one_bus_are_distinguished() -> None:
     with CanBus([Motor(2, t=time.monotonic()), Drive(9)]) as sim:
         assert [one.id for one in scan(COMMISSIONERS["damiao"](), sim.port)] == [2]
@@ -164,6 +175,7 @@ def test_one_frame_alone_identifies_no_device() -> None:
     assert Talk({5 << 5 | 1: [struct.pack("<IBBBx", 0, 1, 0, 0)]}).odrives == {}
 
 
+@pytest.mark.slow
 def test_another_firmware_than_the_files_is_refused(motor_rig: MotorRig) -> None:
     motor_rig.configure(("id = 1\n", 'id = 1\nfirmware = "9.9"\n'))
     motor_rig.plug()

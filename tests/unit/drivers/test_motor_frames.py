@@ -102,6 +102,7 @@ def test_the_known_vector_of_a_mit_command() -> None:
     assert reported == pytest.approx((0.9997, 0.4908, 19.902, 1.0, 0.2466), abs=5e-4)
 
 
+@pytest.mark.slow
 @given(
     position=st.floats(-12.5, 12.5),
     velocity=st.floats(-30, 30),

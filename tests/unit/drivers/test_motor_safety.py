@@ -1,5 +1,7 @@
 """The rules of motion for ODrives and Damiao motors, judged on frames: the numbers are those of docs/safety.md."""
 
+import pytest
+
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.motor_rig import ROOT, MotorRig, motor_rig, wag
 from trade.errors import (
@@ -12,6 +14,7 @@ __all__ = ["motor_rig", "wag"]
 # --- attaching and leaving
 
 
+@pytest.mark.slow
 def test_S19_shutdown_while_moving_stops_first_and_relaxes(wag: MotorRig) -> None:
     robot = wag.attach()
     root = robot.motor("tail.root")

@@ -53,6 +53,7 @@ def bus(request: pytest.FixtureRequest) -> Iterator[CanRig]:
         yield CanRig(request.param, undo)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["known", "heard"])
 def test_S20_a_second_driver_on_a_can_bus_sends_nothing_and_the_firsts_move_arrives(bus: CanRig, known: bool) -> None:
     motor, port = bus.attach(), "" if known else bus.elsewhere
@@ -72,6 +73,7 @@ def test_S20_a_second_driver_on_a_can_bus_sends_nothing_and_the_firsts_move_arri
     assert bus.senders() == {first}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["known", "heard"])
 def test_S20_a_scan_of_a_can_bus_that_has_a_driver_sends_nothing(bus: CanRig, known: bool) -> None:
     bus.attach()
@@ -81,6 +83,7 @@ def test_S20_a_scan_of_a_can_bus_that_has_a_driver_sends_nothing(bus: CanRig, kn
     assert bus.senders() == {first}
 
 
+@pytest.mark.slow
 def test_S20_a_can_bus_is_free_again_once_its_driver_has_left(bus: CanRig) -> None:
     for _ in range(2):
         bus.rig.attach(ports={bus.rig.robot.buses[0].name: bus.rig.sim.port}).close()

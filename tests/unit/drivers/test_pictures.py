@@ -31,6 +31,7 @@ def test_no_picture_that_breaks_off_is_taken_for_one(whole: bytes) -> None:
             picture(whole[:length])
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=200))
 def test_whatever_bytes_come_are_a_picture_or_refused(data: bytes) -> None:
     for start in (b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"):

@@ -117,6 +117,7 @@ def test_it_measures_what_its_probes_have(oven: Oven, sensor: Sensor) -> None:
     wait_until(lambda: sensor.read().quality == "doubtful", "a probe is beyond its range")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "over"),
     [(Mute(), Heal()), (Late(s=0.35), Heal()), (Truncate(missing=4), Heal()), (Unplug(), Replug())],
@@ -141,6 +142,7 @@ def test_a_file_that_says_another_number_of_probes_is_refused(oven: Oven, tmp_pa
         buses_of(read_robot(file), tmp_path)
 
 
+@pytest.mark.slow
 def test_the_contract_runs_on_it_as_on_hardware_and_prompts_nothing(installed: None, system: str) -> None:
     with SimProcess(OVEN) as sim:
         [(name, port)] = sim.ports.items()

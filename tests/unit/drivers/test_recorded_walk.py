@@ -16,6 +16,8 @@ from cantools.database import Database
 from tests.support.waiting import PATIENCE_S
 from tests.unit.drivers.legs import PATIENT, Leg, rig
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["rig"]
 
 JOINT = """

@@ -30,6 +30,7 @@ def tell(bus: RobotiqBus, *values: int) -> None:
     bus._line.nudge()
 
 
+@pytest.mark.slow
 def test_S18_attaching_to_a_gripper_that_holds_something_leaves_it_so(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04))
     tell(hand.sim, 0x0100, 0, 0)
@@ -40,6 +41,7 @@ def test_S18_attaching_to_a_gripper_that_holds_something_leaves_it_so(hand: Hand
     assert not hand.writes()
 
 
+@pytest.mark.slow
 def test_S18_a_gripper_found_moving_is_stopped(hand: HandRig) -> None:
     tell(hand.sim, 0x0100, 0, 0)
     hand.wait_for("activated")
@@ -61,6 +63,7 @@ def test_S18_a_gripper_found_activating_is_stopped(hand: HandRig) -> None:
     assert not hand.truth.activated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["attach", "brown-out", "replug", "silence"])
 def test_S19_nothing_but_activate_ever_activates(hand: HandRig, what: str) -> None:
     gripper = hand.gripper() if what == "attach" else hand.active()
@@ -89,6 +92,7 @@ def test_S19_nothing_but_activate_ever_activates(hand: HandRig, what: str) -> No
     assert events(hand.log, "activating", since=mark)
 
 
+@pytest.mark.slow
 def test_S19_a_brown_out_in_the_middle_of_a_move_ends_it_and_its_stop_does_not_activate(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))

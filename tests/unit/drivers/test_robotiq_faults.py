@@ -42,6 +42,7 @@ def closing(hand: HandRig, gripper: Gripper) -> Outcome:
     return moving
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [
@@ -61,6 +62,20 @@ def test_a_single_bad_answer_goes_unnoticed(hand: HandRig, gripper: Gripper, fau
     assert gripper.state().fault == ""
 
 
+@pytest.mark.slow
+def test_a_gripper_has_as_long_to_answer_as_its_measurements_may_be_old(tmp_path: Path) -> None:
+    with made_rig(tmp_path) as hand:
+        hand.configure(("baud = 115200", "baud = 115200\nstale_after_s = 2"))
+        hand.plug()
+        gripper = hand.active()
+        moving = closing(hand, gripper)
+        hand.sim.do(sim.Mute(count=6))
+        assert moving.wait().result.width_m == pytest.approx(0, abs=0.003)
+        hand.sim.do(sim.Mute(count=6))
+        assert gripper.open().width_m == pytest.approx(0.085, abs=0.003)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("late_s", [0.036, 0.05, 0.065, 0.07, 0.08, 0.1])
 def test_a_late_answer_never_becomes_a_wrong_value(hand: HandRig, gripper: Gripper, late_s: float, count: int) -> None:
@@ -85,11 +100,13 @@ def test_an_object_in_the_way_of_activation_does_not_block_without_end(hand: Han
     assert gripper.activate().activated
 
 
+@pytest.mark.slow
 def test_fingers_held_fast_are_holding(hand: HandRig, gripper: Gripper) -> None:
     hand.sim.do(sim.Jam())
     assert gripper.close().holding == "outside"
 
 
+@pytest.mark.slow
 def test_clear_fault_reports_a_fault_that_stays(hand: HandRig, gripper: Gripper) -> None:
     hand.sim.do(sim.Mute(instruction="read_write"))
     with pytest.raises(DeviceSilent):
@@ -100,6 +117,7 @@ def test_clear_fault_reports_a_fault_that_stays(hand: HandRig, gripper: Gripper)
     assert not gripper.state().activated
 
 
+@pytest.mark.slow
 def test_clearing_a_fault_moves_nothing(hand: HandRig, gripper: Gripper) -> None:
     moving = closing(hand, gripper)
     mark = written_now()
@@ -110,6 +128,7 @@ def test_clearing_a_fault_moves_nothing(hand: HandRig, gripper: Gripper) -> None
     assert not gripper.state().activated
 
 
+@pytest.mark.slow
 def test_an_unplugged_bus_is_named_and_comes_back_by_itself(hand: HandRig, gripper: Gripper) -> None:
     gripper.close()
     mark = written_now()
@@ -124,6 +143,7 @@ def test_an_unplugged_bus_is_named_and_comes_back_by_itself(hand: HandRig, gripp
     assert gripper.open().width_m == pytest.approx(0.085, abs=0.001)
 
 
+@pytest.mark.slow
 def test_fingers_that_still_move_when_the_bus_is_back_are_stopped(hand: HandRig, gripper: Gripper) -> None:
     moving = closing(hand, gripper)
     hand.sim.do(sim.Unplug())

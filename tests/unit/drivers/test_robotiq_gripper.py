@@ -43,6 +43,7 @@ def test_a_gripper_becomes_a_provider_in_the_group_named_after_it(hand: HandRig)
         robot.motor("left.hand")
 
 
+@pytest.mark.slow
 def test_an_object_is_held_and_the_position_of_the_fingers_shows_its_width(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04, stiffness_n_m=1e6))
     gripper = hand.active()
@@ -54,6 +55,7 @@ def test_an_object_is_held_and_the_position_of_the_fingers_shows_its_width(hand:
     assert gripper.open().holding == ""
 
 
+@pytest.mark.slow
 def test_a_hollow_object_is_held_from_inside(hand: HandRig) -> None:
     gripper = hand.active()
     gripper.close()
@@ -61,6 +63,7 @@ def test_a_hollow_object_is_held_from_inside(hand: HandRig) -> None:
     assert gripper.open().holding == "inside"
 
 
+@pytest.mark.slow
 def test_an_object_that_is_taken_away_is_noticed(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04))
     gripper = hand.active()
@@ -69,6 +72,7 @@ def test_an_object_that_is_taken_away_is_noticed(hand: HandRig) -> None:
     wait_until(lambda: not gripper.state().holding, "it is lost")
 
 
+@pytest.mark.slow
 def test_a_stop_keeps_what_is_held_and_follows_it_no_more(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04))
     gripper = hand.active()
@@ -82,6 +86,7 @@ def test_a_stop_keeps_what_is_held_and_follows_it_no_more(hand: HandRig) -> None
     assert not hand.truth.moving
 
 
+@pytest.mark.slow
 def test_a_stop_of_resting_fingers_writes_nothing(hand: HandRig) -> None:
     gripper = hand.active()
     mark = written_now()
@@ -89,6 +94,7 @@ def test_a_stop_of_resting_fingers_writes_nothing(hand: HandRig) -> None:
     assert not hand.writes(mark)
 
 
+@pytest.mark.slow
 def test_a_new_move_takes_over_and_the_old_caller_hears_of_it(hand: HandRig) -> None:
     gripper = hand.active()
     old = Outcome(lambda: gripper.close(0.02))
@@ -98,12 +104,14 @@ def test_a_new_move_takes_over_and_the_old_caller_hears_of_it(hand: HandRig) -> 
     assert "another move" in str(old.error)
 
 
+@pytest.mark.slow
 def test_a_move_to_where_it_is_going_already_is_a_move(hand: HandRig) -> None:
     gripper = hand.active()
     gripper.close()
     assert gripper.close().width_m == pytest.approx(0.0, abs=0.002)
 
 
+@pytest.mark.slow
 def test_a_deadline_that_passes_on_the_way_stops_the_fingers(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(0.02), deadline_s=1.0).wait()
@@ -113,6 +121,7 @@ def test_a_deadline_that_passes_on_the_way_stops_the_fingers(hand: HandRig) -> N
     assert hand.truth.width_m > 0.03
 
 
+@pytest.mark.slow
 def test_closing_the_driver_keeps_what_is_held(hand: HandRig) -> None:
     hand.sim.do(Put(width_m=0.04))
     robot = hand.attach()
@@ -124,6 +133,7 @@ def test_closing_the_driver_keeps_what_is_held(hand: HandRig) -> None:
     assert hand.truth.holding
 
 
+@pytest.mark.slow
 def test_closing_the_driver_stops_moving_fingers(hand: HandRig) -> None:
     robot = hand.attach()
     robot.gripper("left.hand").activate()

@@ -53,6 +53,7 @@ def test_S01_a_command_of_a_gripper_at_rest_that_expires_while_the_bus_is_held_u
     assert not hand.writes(mark)
 
 
+@pytest.mark.slow
 def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_stopped(hand: HandRig) -> None:
     gripper = hand.active()
     hand.sim.do(Mute(instruction="read_write"))
@@ -76,6 +77,7 @@ def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
     assert "no watchdog" in page[page.index("## Robotiq") :]
 
 
+@pytest.mark.slow
 def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: HandRig, gate: Gate) -> None:
     gripper = hand.active(healthy=gate)
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
@@ -96,6 +98,7 @@ def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: 
 # --- S07
 
 
+@pytest.mark.slow
 def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, gate: Gate) -> None:
     gripper = hand.active(healthy=gate)
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
@@ -127,6 +130,7 @@ def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -
     assert not hand.moves(mark)
 
 
+@pytest.mark.slow
 def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
@@ -138,6 +142,7 @@ def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand
     assert hand.truth.width_m > 0.03
 
 
+@pytest.mark.slow
 def test_S08_a_stop_of_a_silent_gripper_is_sent_without_a_reading_and_cannot_activate_it(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
@@ -182,6 +187,7 @@ def service(container: Container, name: str) -> Handle:
     return container.find(where(name=name, group="rosie.left.hand"), wait_s=20).with_(deadline_s=60)
 
 
+@pytest.mark.slow
 def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:
@@ -200,6 +206,7 @@ def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
         run.result()
 
 
+@pytest.mark.slow
 def test_S14_what_is_withdrawn_while_it_moves_says_so(
     hand: HandRig, gripper: Gripper, planner: Container, driver: Container
 ) -> None:
@@ -210,6 +217,7 @@ def test_S14_what_is_withdrawn_while_it_moves_says_so(
         run.result()
 
 
+@pytest.mark.slow
 def test_S05_what_is_held_when_its_session_ends_stays_held(
     hand: HandRig, gripper: Gripper, operator: Container
 ) -> None:

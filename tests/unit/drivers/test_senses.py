@@ -115,6 +115,7 @@ class Pixels:
         }
 
 
+@pytest.mark.slow
 def test_a_joint_that_has_moved_is_seen_elsewhere_and_the_others_are_not(
     stage: Stage, robot: AttachedRobot, camera: Camera
 ) -> None:
@@ -127,6 +128,7 @@ def test_a_joint_that_has_moved_is_seen_elsewhere_and_the_others_are_not(
     assert _top(after.where(LIMB, pan)) < _top(before.where(LIMB, pan)), "a positive angle turns it upwards"
 
 
+@pytest.mark.slow
 def test_the_fingers_of_a_gripper_are_seen_to_close_around_the_object(
     stage: Stage, robot: AttachedRobot, camera: Camera
 ) -> None:
@@ -156,6 +158,7 @@ def _gap(pixels: set[tuple[int, int]]) -> int:
     return max(right - left for left, right in pairwise(columns))
 
 
+@pytest.mark.slow
 def test_the_example_is_seen_to_move_in_a_simulator_of_its_own() -> None:
     file = Path(__file__).parents[3] / "examples" / "eye.toml"
     with (
@@ -180,6 +183,7 @@ def test_a_camera_that_does_not_answer_is_silent_and_is_back_by_itself(stage: St
     assert camera.image().data
 
 
+@pytest.mark.slow
 def test_a_picture_that_takes_too_long_is_none(tmp_path: Path) -> None:
     with ExitStack() as undo:
         stage = Stage(SEEN.replace("height_px = 120", "height_px = 120\ntimeout_s = 0.2"), tmp_path, undo)
@@ -200,6 +204,7 @@ def test_a_picture_that_trickles_in_is_given_up_in_time(tmp_path: Path) -> None:
             camera.image()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [Truncate(missing=20), Garbage(hex="00" * 8)], ids=["truncated", "garbage"])
 def test_an_incomplete_picture_is_never_returned(stage: Stage, camera: Camera, fault: faults.Command) -> None:
     stage.sims["eye"].do(fault)
@@ -209,6 +214,7 @@ def test_an_incomplete_picture_is_never_returned(stage: Stage, camera: Camera, f
     assert camera.image().data
 
 
+@pytest.mark.slow
 def test_a_frozen_camera_shows_an_old_picture(stage: Stage, robot: AttachedRobot, camera: Camera) -> None:
     stage.sims["eye"].do(Freeze())
     before = camera.image().data
@@ -290,6 +296,7 @@ def test_the_camera_has_its_group_and_no_other_kind_of_provider_does(robot: Atta
         robot.camera("neck.pan")
 
 
+@pytest.mark.slow
 def test_its_services_take_no_arguments(camera: Camera) -> None:
     from trade import where
     from trade.testing import memory_system

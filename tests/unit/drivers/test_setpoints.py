@@ -37,6 +37,7 @@ def test_S04_a_set_point_that_is_not_renewed_stops_the_joint(head: Rig, robot: A
     assert all(goal_counts(hold) < goal_counts(first) for hold in holds)
 
 
+@pytest.mark.slow
 def test_S04_it_ramps_to_its_stop_at_the_joints_acceleration(rig: Rig) -> None:
     rig.configure(('max_accel_rad_s2 = 20.0\n\n[joint."neck.tilt"]', 'max_accel_rad_s2 = 2.0\n\n[joint."neck.tilt"]'))
     rig.plug()
@@ -51,6 +52,7 @@ def test_S04_it_ramps_to_its_stop_at_the_joints_acceleration(rig: Rig) -> None:
     assert rest.t - held.t > 0.8 * 1.0 / 2.0
 
 
+@pytest.mark.slow
 def test_S04_motion_continues_if_its_set_point_is_renewed_in_time(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     pan.move_to(-1.4)
@@ -65,6 +67,7 @@ def test_S04_motion_continues_if_its_set_point_is_renewed_in_time(head: Rig, rob
     assert end_of(head, began) <= 1.4 + 0.01
 
 
+@pytest.mark.slow
 def test_S18_a_servo_that_browns_out_is_sent_no_set_point_after_it_has_booted_limp(
     head: Rig, robot: AttachedRobot
 ) -> None:
@@ -117,6 +120,7 @@ def test_S04_positions_that_stop_coming_stop_the_whole_group(rig: Rig) -> None:
     assert 0.01 < end_of(rig, device_id=1) < 0.8
 
 
+@pytest.mark.slow
 def test_S04_positions_that_keep_coming_are_followed(head: Rig, robot: AttachedRobot) -> None:
     group = robot.group("head")
     for step in range(1, 60):
@@ -154,6 +158,7 @@ def test_S08_a_stop_ends_a_set_point_and_what_was_under_way(head: Rig, gate: Gat
     assert all(goal_counts(entry) < 2048 + 1.3 * COUNTS_PER_RAD for entry in head.goals(1, mark))
 
 
+@pytest.mark.slow
 def test_S22_it_brakes_before_the_end_of_the_range(head: Rig, robot: AttachedRobot) -> None:
     robot.motor("neck.pan").set_velocity(2.5, 1.0)
     assert end_of(head) == pytest.approx(1.4, abs=0.01)
@@ -213,6 +218,7 @@ def test_S22_one_position_outside_refuses_the_whole_group(head: Rig, robot: Atta
     assert not head.moves()
 
 
+@pytest.mark.slow
 def test_a_set_point_takes_over_from_a_move_and_a_move_from_a_set_point(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     moving = Outcome(lambda: pan.move_to(1.3, 0.2))

@@ -34,6 +34,7 @@ max_accel_rad_s2 = 20.0
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("silent", [(), (5,)], ids=["all answer", "one is silent"])
 def test_S07_a_stop_waits_for_no_more_bytes_than_20_ms_carry(rig: Rig, silent: tuple[int, ...]) -> None:
     rig.robot = parse(BUS + "".join(JOINT.format(id=i) for i in range(1, JOINTS + 1)), "many.toml")

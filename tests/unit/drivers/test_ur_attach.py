@@ -17,6 +17,8 @@ from trade.errors import (
 from trade_hil_sim import Absent, BrownOut, Replug, Unplug, instructions
 from trade_hil_sim.ur._kinematics import pose_between
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 __all__ = ["arm_rig", "free_rig"]
 

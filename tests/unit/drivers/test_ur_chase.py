@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,6 +11,7 @@ from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
 SPEED, ACCEL, STEP_S = 1.0, 2.5, 0.002
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.floats(-3, 3), st.integers(1, 400)), min_size=1, max_size=5))
 @settings(max_examples=60, deadline=None)
 def test_it_keeps_its_limits_and_comes_to_rest_at_the_last_target(targets: list[tuple[float, int]]) -> None:
@@ -23,6 +25,7 @@ def test_it_keeps_its_limits_and_comes_to_rest_at_the_last_target(targets: list[
     assert seen[-1] == targets[-1][0]
 
 
+@pytest.mark.slow
 @given(st.floats(-3, 3))
 @settings(max_examples=60, deadline=None)
 def test_it_does_not_go_beyond_a_target_by_more_than_a_step_can_change(target: float) -> None:

@@ -36,6 +36,7 @@ class TestOlderArm(ArmContract):
             yield ArmRig(undo, SimArm("UR10", name="right"), OLDER).attach().arm("right")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "text", "most"), [("UR10", OLDER, 125), ("UR5e", ARM, 500)])
 def test_a_stream_has_the_rate_of_the_controller(model: str, text: str, most: int) -> None:
     with ExitStack() as undo:
@@ -48,6 +49,7 @@ def test_a_stream_has_the_rate_of_the_controller(model: str, text: str, most: in
         assert len(streamed) <= most * (streamed[-1] - streamed[0]) * 1.1 + 2
 
 
+@pytest.mark.slow
 def test_an_address_without_a_listener_is_named() -> None:
     with ExitStack() as undo, pytest.raises(ConfigurationError, match=r"127\.0\.0\.213"):
         attached(undo, "127.0.0.213")

@@ -13,6 +13,8 @@ from trade_drivers import Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Arm as SimArm
 from trade_hil_sim import HardwareFault, Heal, Jam
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 
 

@@ -35,6 +35,7 @@ __all__ = ["arm_rig", "free_rig"]
 # --- S01, S04
 
 
+@pytest.mark.slow
 def test_S01_a_command_whose_time_has_passed_is_never_sent(rig: ArmRig) -> None:
     with call(0.2) as expires_ns:
         sleep_past(expires_ns)
@@ -43,6 +44,7 @@ def test_S01_a_command_whose_time_has_passed_is_never_sent(rig: ArmRig) -> None:
     assert not rig.moves()
 
 
+@pytest.mark.slow
 def test_S01_what_waits_in_the_process_that_commands_expires_there(rig: ArmRig) -> None:
     rig.arm.move_joints([0.05, *AT_HOME[1:]])  # control is taken
     [pid] = children("control")
@@ -56,6 +58,7 @@ def test_S01_what_waits_in_the_process_that_commands_expires_there(rig: ArmRig) 
     assert not rig.moves(mark)
 
 
+@pytest.mark.slow
 def test_S04_a_set_point_that_is_not_renewed_ends_in_a_stop(rig: ArmRig) -> None:
     rig.arm.servo(FAR, 0.3)
     wait_until(lambda: rig.base_rad > 0.02, "it is under way")
@@ -86,6 +89,7 @@ class Driver:
         psutil.wait_procs(family, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill -9", "SIGSTOP"])
 def test_S06_without_its_driver_an_arm_that_follows_set_points_stops(free: ArmRig, tmp_path: Path, number: int) -> None:
     with ExitStack() as undo:
@@ -99,6 +103,7 @@ def test_S06_without_its_driver_an_arm_that_follows_set_points_stops(free: ArmRi
         assert not free.moves(events(free.log, "program_stopped", since=mark)[0].t)
 
 
+@pytest.mark.slow
 def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchdog_of_the_robot(rig: ArmRig) -> None:
     moving = rig.set_off()
     rig.sim.do(Local())  # its dashboard takes no orders
@@ -116,6 +121,7 @@ def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchd
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["move_joints", "servo", "follow"])
 def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_continue(
     rig: ArmRig, monkeypatch: pytest.MonkeyPatch, how: str
@@ -147,6 +153,7 @@ def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_continue(
 # --- S07, S08, S10
 
 
+@pytest.mark.slow
 def test_S07_a_stop_is_the_first_thing_the_controller_hears_however_many_wait(rig: ArmRig) -> None:
     moving = rig.set_off()
     exchange = rig.arm._exchange  # type: ignore[attr-defined]
@@ -172,6 +179,7 @@ def test_S07_a_stop_is_the_first_thing_the_controller_hears_however_many_wait(ri
     assert not rig.moves(mark)
 
 
+@pytest.mark.slow
 def test_S07_a_stop_and_the_state_are_answered_at_once_while_a_lost_controller_is_looked_for(rig: ArmRig) -> None:
     rig.arm.move_joints([0.05, *AT_HOME[1:]])  # control is taken
     [pid] = children("control")
@@ -186,6 +194,7 @@ def test_S07_a_stop_and_the_state_are_answered_at_once_while_a_lost_controller_i
     assert pid in children("control")  # no thread has waited for it
 
 
+@pytest.mark.slow
 def test_S07_a_driver_is_closed_while_a_silent_controller_is_looked_for(
     rig: ArmRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +220,7 @@ def test_S10_a_stop_goes_through_the_dashboard_and_the_process_that_commands(rig
     rig.comes_to_rest()
 
 
+@pytest.mark.slow
 def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(rig: ArmRig) -> None:
     moving = rig.set_off()
     [pid] = children("control")
@@ -222,6 +232,7 @@ def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(r
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_S10_a_dashboard_that_does_not_answer_does_not_hinder_a_stop(rig: ArmRig) -> None:
     moving = rig.set_off()
     rig.sim.do(Mute(instruction="dashboard"))
@@ -230,6 +241,7 @@ def test_S10_a_dashboard_that_does_not_answer_does_not_hinder_a_stop(rig: ArmRig
     rig.comes_to_rest()
 
 
+@pytest.mark.slow
 def test_S10_moves_are_asynchronous_so_that_a_stop_can_come_between(rig: ArmRig) -> None:
     rig.arm.move_joints([0.1, *AT_HOME[1:]])
     rig.arm.move_line([*rig.arm.state().pose[:2], rig.arm.state().pose[2] + 0.02, *rig.arm.state().pose[3:]])
@@ -258,6 +270,7 @@ def other(start_container: Callable[..., Container]) -> Container:
     return start_container("other")
 
 
+@pytest.mark.slow
 def test_S05_set_points_end_with_their_session(
     shared: ArmRig, planner: Container, start_container: Callable[..., Container]
 ) -> None:
@@ -274,6 +287,7 @@ def test_S05_set_points_end_with_their_session(
     planner.find(where(name="move_joints", group="ada.right")).with_(deadline_s=30)(AT_HOME)
 
 
+@pytest.mark.slow
 def test_S05_the_end_of_a_session_ends_freedrive(shared: ArmRig, start_container: Callable[..., Container]) -> None:
     guide = start_container("guide")
     guide.find(where(name="freedrive", group="ada.right")).with_(deadline_s=20)(True)

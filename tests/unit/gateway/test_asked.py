@@ -6,6 +6,8 @@ import subprocess
 import sys
 import threading
 
+import pytest
+
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade_gateway.process._signals import SignalEvent
 
@@ -30,6 +32,7 @@ def test_it_is_heard_by_all_who_wait_and_until_it_is_cleared() -> None:
 STRIKES = "import os, sys\nwhile True: os.kill(int(sys.argv[1]), int(sys.argv[2]))"
 
 
+@pytest.mark.slow
 def test_a_handler_may_set_it_while_its_own_thread_waits_for_it() -> None:
     """With an Event a few thousand signals are enough for one to strike while the thread has its lock."""
     asked, struck = SignalEvent(), [0]

@@ -195,6 +195,7 @@ def test_a_gripper_is_activated_and_not_calibrated(rosie: Rosie) -> None:
     assert "a gripper is not calibrated; activate it: `trade call rosie.left.hand.activate`" in str(error)
 
 
+@pytest.mark.slow
 def test_a_homing_offset_that_the_file_does_not_know_is_written_with_the_new_zero(rosie: Rosie) -> None:
     rosie.sim.devices[0].write(20, (100).to_bytes(4, "little"), 0.0)
     said = rosie.calibrate("neck.pan", "--zero-here", "--yes")

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.simulated_robots import HAND, HEAD, TAIL
+from trade import Container
 from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
@@ -204,6 +205,7 @@ def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
     assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
 
 
+@pytest.mark.slow
 def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].memory.set("max_position_limit", 2500)
@@ -225,6 +227,7 @@ def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: 
 WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
 
 
+@pytest.mark.slow
 def test_a_file_that_drivers_refuse_is_reported_for_all_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text(WRONG)
@@ -236,6 +239,7 @@ def test_a_file_that_drivers_refuse_is_reported_for_all_parts_and_ends_nothing(s
     assert f'{path}: gripper."left.hand".max_width_m: 85 is outside' in errors["bus hand"]
 
 
+@pytest.mark.slow
 def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     said = CliRunner().invoke(app, ["doctor", str(robot_file), "--json"])
     assert said.exit_code == 1
@@ -245,6 +249,21 @@ def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
         well = CliRunner().invoke(app, ["doctor", str(robot_file)])
     assert well.exit_code == 0, well.output
     assert "0 errors" in well.output
+
+
+@pytest.mark.slow
+def test_a_hub_that_has_ended_is_reported(system: str, start_container: Callable[..., Container]) -> None:
+    member = start_container("member")
+    assert [found.about for found in host.in_sight(member, system)] == [f"system {system}"]
+    hub = start_container("hub", hub="serve")
+    found = next(iter(host.in_sight(member, system)))
+    assert (found.about, found.level) == ("hub", "ok")
+    attached = start_container("attached")
+    hub.close()
+    found = next(iter(host.in_sight(member, system)))
+    assert (found.about, found.level, found.fix.startswith("trade hub;")) == ("hub", "warning", True)
+    lost = next(iter(host.in_sight(attached, system)))
+    assert (lost.level, "(the hub of this host)" in lost.text) == ("error", True)
 
 
 def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,6 +277,7 @@ def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pyt
     assert "no container is visible" not in said.stdout
 
 
+@pytest.mark.slow
 def test_a_client_with_bad_certificates_is_not_advised_to_connect_without(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -252,6 +252,7 @@ class ScriptedStand:
             file.writelines(line + b"\n" for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "after_repair", "verdict"),
     [

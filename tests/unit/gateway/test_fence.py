@@ -59,12 +59,14 @@ def staying() -> Iterator[Staying]:
     made.close()
 
 
+@pytest.mark.slow
 def test_a_child_that_does_not_end_on_request_is_killed(staying: Staying) -> None:
     staying.until(0.0, 0.5)
     assert staying.says() == "asked to leave"
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_S20_a_frozen_process_is_ended_while_it_is_frozen(staying: Staying) -> None:
     staying.until(0.0, 2.0)
     assert staying.says() == "asked to leave"  # so it has heard of both
@@ -72,6 +74,7 @@ def test_S20_a_frozen_process_is_ended_while_it_is_frozen(staying: Staying) -> N
     assert staying.process.wait(PATIENCE_S) == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_a_child_that_is_renewed_in_time_stays(staying: Staying) -> None:
     staying.until(0.5, 1.0)
     over_at = uptime_s() + 1.0

@@ -67,6 +67,7 @@ def test_more_than_five_options_are_grouped_in_panels(name: str) -> None:
     assert len(ungrouped) <= _MOST_UNGROUPED, f"{name}: give some of {ungrouped} a rich_help_panel"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_of_each_command_fits_a_narrow_terminal(name: str) -> None:
     shown = CliRunner().invoke(build(), [*name.split()[1:], "--help"], env={"COLUMNS": str(_WIDTH)})
@@ -75,6 +76,7 @@ def test_the_help_of_each_command_fits_a_narrow_terminal(name: str) -> None:
     assert [line for line in shown.output.splitlines() if len(line) > _WIDTH] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "expected", "other"),
     [("trade lo", {"lock", "locks", "logs"}, "up"), ("trade stream --h", {"--hz", "--help"}, "--json")],

@@ -155,6 +155,7 @@ def described(served: Opened, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_generated_client_in_python_calls_services(served: Opened, described: Path) -> None:
     folder = described.parent
@@ -168,6 +169,7 @@ def test_a_generated_client_in_python_calls_services(served: Opened, described: 
     assert called.stdout.split() == ["0.5", "InvalidArgument"], called.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("library", ["okhttp-gson", "native"])
 def test_a_generated_client_in_java_compiles(described: Path, library: str) -> None:
@@ -183,6 +185,7 @@ def test_a_generated_client_in_java_compiles(described: Path, library: str) -> N
     assert compiled.returncode == 0, compiled.stdout[-4000:]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_generated_types_in_typescript_compile(described: Path) -> None:
     folder = described.parent
@@ -193,6 +196,7 @@ def test_generated_types_in_typescript_compile(described: Path) -> None:
     assert checked.returncode == 0, checked.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="schemathesis needs Python 3.11")
 @pytest.mark.parametrize("mode", ["positive", "negative"])
 def test_answers_match_the_openapi_document(served: Opened, mode: str) -> None:

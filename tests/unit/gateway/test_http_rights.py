@@ -21,6 +21,7 @@ def served(tmp_path: Path) -> Iterator[Opened]:
         yield made
 
 
+@pytest.mark.slow
 def test_a_client_has_its_own_rights_and_not_those_of_the_http_gateway(served: Opened) -> None:
     anna, bert = served.client("anna"), served.client("bert")
     assert anna.call("robot.a.move", 1.0).status == 200
@@ -52,6 +53,7 @@ def test_a_client_does_not_see_what_it_may_not_read(served: Opened) -> None:
         assert heard(page)["service"]["group"] == "robot.a.again"
 
 
+@pytest.mark.slow
 def test_a_client_without_a_role_reads_nothing_of_the_system(served: Opened) -> None:
     bert, stranger = served.client("bert"), served.client("carl")
     for path in ("/containers", "/loads", "/sight", "/estops"):
@@ -61,6 +63,7 @@ def test_a_client_without_a_role_reads_nothing_of_the_system(served: Opened) -> 
     assert stranger.ask("POST", "/estop", {"reason": "smoke"}).status == 200  # to stop needs no role (S07)
 
 
+@pytest.mark.slow
 def test_locks_resuming_and_clearing_are_the_clients_rights_too(served: Opened) -> None:
     anna, bert, chief = (served.client(name).opened(lease_s=60) for name in ("anna", "bert", "chief"))
     assert bert.ask("POST", "/locks", {"group": "robot.a"}).title == "AccessDenied"
@@ -84,6 +87,7 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(served: Opened) 
     assert chief.ask("POST", "/estop/clear", {"ids": [given["id"]]}).body["complete"]
 
 
+@pytest.mark.slow
 def test_refusals_and_the_client_that_cleared_an_e_stop_are_on_record(
     served: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,13 +112,14 @@ def test_refusals_and_the_client_that_cleared_an_e_stop_are_on_record(
 def test_a_client_learns_its_identity_and_rights(served: Opened) -> None:
     anna, bert, chief = (served.client(name) for name in ("anna", "bert", "chief"))
     may_nothing = {"administers": False, "reads": False, "instruments": False}
-    assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing}
-    assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True)}
+    assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing, "over": []}
+    assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True), "over": ["*"]}
     may = {one["name"]: one["allowed"] for one in bert.ask("GET", "/services?group=robot.a").body}
     assert (may["where_is_it"], may["move"], may["stop"]) == (True, False, True)
     assert all(one["allowed"] for one in anna.ask("GET", "/services").body)
 
 
+@pytest.mark.slow
 def test_readers_request_locks_and_administrators_break_them(served: Opened) -> None:
     anna, bert, carl, chief = (served.client(name).opened(lease_s=60) for name in ("anna", "bert", "carl", "chief"))
     asked: list[tuple[str, str]] = []
@@ -133,6 +138,7 @@ def test_readers_request_locks_and_administrators_break_them(served: Opened) -> 
     own.release()
 
 
+@pytest.mark.slow
 def test_load_is_for_all_clients_and_subscriptions_are_for_readers_of_the_system(served: Opened) -> None:
     anna, chief = served.client("anna"), served.client("chief")
     assert {one["container"] for one in anna.ask("GET", "/loads").body} >= {"a", "b"}
@@ -152,6 +158,7 @@ def test_load_is_for_all_clients_and_subscriptions_are_for_readers_of_the_system
     watching.cancel()
 
 
+@pytest.mark.slow
 def test_the_log_is_sent_line_by_line_to_clients_that_read_the_system(served: Opened) -> None:
     with served.client("chief").socket() as page:
         say(page, do="logs", id=1, level=30)
@@ -176,6 +183,7 @@ def test_a_client_that_reads_the_system_sees_its_policy(served: Opened) -> None:
     assert (anna["roles"], anna["rights"]["call"], anna["rights"]["administer"]) == (["operator"], ["robot.a"], [])
 
 
+@pytest.mark.slow
 def test_traced_calls_are_reported_as_they_end_to_clients_that_read_the_system(served: Opened) -> None:
     anna, chief = served.client("anna"), served.client("chief")
     assert "a" in chief.ask("POST", "/tracing", {"on": True}).body["containers"]
@@ -237,6 +245,7 @@ def test_streams_are_the_clients_rights_too_and_end_with_them(served: Opened, tm
         assert denied["problem"]["title"] == "NoSuchService"
 
 
+@pytest.mark.slow
 def test_a_revoked_client_is_not_let_in_and_what_it_moves_stops(served: Opened, tmp_path: Path) -> None:
     anna = served.client("anna")
     with anna.socket() as page:

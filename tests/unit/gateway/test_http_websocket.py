@@ -49,6 +49,7 @@ def go_on(name: str = "a", number: int = 1) -> dict[str, object]:
     return {"do": "call", "id": number, "group": f"robot.{name}", "name": "go_on", "args": [1.0]}
 
 
+@pytest.mark.slow
 def test_calls_and_their_errors_are_answered_under_their_ids(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="call", id="slow", group="robot.axis", name="move_to", args={"value": 2.0}, deadline_s=60)
@@ -62,6 +63,7 @@ def test_calls_and_their_errors_are_answered_under_their_ids(served: Opened) -> 
         assert {"id": "slow", "result": 2.0} in reported
 
 
+@pytest.mark.slow
 def test_a_call_reports_its_progress(served: Opened) -> None:
     served.robot.system.container("walker").register(Walker(), "walker")
     served.robot.system.settle()
@@ -88,6 +90,7 @@ def test_a_result_that_json_cannot_express_ends_one_call_and_nothing_else(served
     assert (refused.status, refused.title) == (502, "InvalidResult")
 
 
+@pytest.mark.slow
 def test_S04_set_points_leave_in_the_order_in_which_they_came(served: Opened) -> None:
     wanted, left = [float(number) for number in range(60)], list[float]()
 
@@ -106,6 +109,7 @@ def test_S04_set_points_leave_in_the_order_in_which_they_came(served: Opened) ->
     assert left == wanted
 
 
+@pytest.mark.slow
 def test_S08_a_call_made_before_a_stop_never_begins_after_it(served: Opened) -> None:
     """All of it is sent at once: the stop overtakes what has not begun."""
     with served.client().socket() as page:
@@ -122,6 +126,7 @@ def test_S08_a_call_made_before_a_stop_never_begins_after_it(served: Opened) -> 
         assert served["a"].resource.moving
 
 
+@pytest.mark.slow
 def test_an_unreadable_message_is_answered_and_ends_nothing(served: Opened) -> None:
     with served.client().socket() as page:
         for nonsense in ("[", '{"do": "dance", "id": 1}', '{"do": "call", "id": 1}', '{"do":"estop","id":1,"x":2}'):
@@ -152,6 +157,7 @@ class Slow:
         self.inside -= 1
 
 
+@pytest.mark.slow
 def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(served: Opened) -> None:
     slow, many = Slow(), 400
     served.robot.joints["slow"] = slow  # type: ignore[assignment]
@@ -179,6 +185,7 @@ def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(s
         assert ask(page, do="call", id="again", group="robot.slow", name="stop") == {"id": "again", "result": None}
 
 
+@pytest.mark.slow
 def test_S05_what_a_page_moves_stops_when_it_closes_and_nothing_else_does(served: Opened) -> None:
     with served.client("bert").socket() as other:
         ask(other, **go_on("b"))
@@ -189,6 +196,7 @@ def test_S05_what_a_page_moves_stops_when_it_closes_and_nothing_else_does(served
         assert served["b"].resource.moving
 
 
+@pytest.mark.slow
 def test_S05_a_call_ends_with_the_page_that_made_it(served: Opened) -> None:
     served["a"].hold.clear()
     with served.client().socket() as page:
@@ -200,6 +208,7 @@ def test_S05_a_call_ends_with_the_page_that_made_it(served: Opened) -> None:
     assert served["a"].written == []
 
 
+@pytest.mark.slow
 def test_S05_a_frozen_page_is_dropped_although_its_connection_is_open(served: Opened) -> None:
     """It answers no pings and takes nothing more; a stream fills what lies between."""
     served.robot.system.container("walker").register(Walker(), "walker")
@@ -211,6 +220,7 @@ def test_S05_a_frozen_page_is_dropped_although_its_connection_is_open(served: Op
         assert served["a"].stopped.wait(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_a_call_is_cancelled_by_its_id(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="call", id=1, group="robot.axis", name="move_to", args=[1.0], deadline_s=300)
@@ -220,6 +230,7 @@ def test_a_call_is_cancelled_by_its_id(served: Opened) -> None:
         assert ask(page, do="cancel", id=3, which="nothing")["result"] == {"cancelled": False}
 
 
+@pytest.mark.slow
 def test_a_lock_belongs_to_its_page_and_ends_with_it(served: Opened) -> None:
     bert = served.client("bert")
     with served.client().socket() as page:
@@ -232,6 +243,7 @@ def test_a_lock_belongs_to_its_page_and_ends_with_it(served: Opened) -> None:
     wait_until(lambda: bert.call("robot.b.move", 1.0).status == 200, "it fell")
 
 
+@pytest.mark.slow
 def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(served: Opened) -> None:
     with served.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot.a")["result"]
@@ -245,6 +257,7 @@ def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(serv
         assert ask(page, **go_on())["result"] is None
 
 
+@pytest.mark.slow
 def test_a_stream_is_heard_until_it_is_ended(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=100)
@@ -257,6 +270,7 @@ def test_a_stream_is_heard_until_it_is_ended(served: Opened) -> None:
         assert refused["problem"]["title"] == "ConfigurationError"
 
 
+@pytest.mark.slow
 def test_a_stream_ends_with_its_service(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=10)
@@ -267,6 +281,7 @@ def test_a_stream_ends_with_its_service(served: Opened) -> None:
         assert reported["problem"]["title"] == "ServiceGone"
 
 
+@pytest.mark.slow
 def test_services_that_come_and_go_are_reported(served: Opened) -> None:
     with served.client().socket() as page:
         say(page, do="watch", id=1, group="robot", name="move", existing=True, occasions=["joined", "left"])
@@ -280,6 +295,7 @@ def test_services_that_come_and_go_are_reported(served: Opened) -> None:
         assert ask(page, do="cancel", id=2, which=1)["result"] == {"cancelled": True}
 
 
+@pytest.mark.slow
 def test_S07_a_page_with_all_it_may_have_under_way_can_stop(served: Opened) -> None:
     with served.client().socket() as page:
         for number in range(64):
@@ -302,6 +318,7 @@ def test_a_message_that_is_too_large_ends_the_connection_and_what_it_moves(serve
         assert served["a"].stopped.wait(20)
 
 
+@pytest.mark.slow
 def test_pages_show_their_token_as_a_subprotocol(served: Opened) -> None:
     anna = served.client()
     url = anna.url.replace("http", "ws") + "/ws"
@@ -315,6 +332,7 @@ def test_pages_show_their_token_as_a_subprotocol(served: Opened) -> None:
         assert b"NotAuthenticated" in why.value.response.body
 
 
+@pytest.mark.slow
 def test_a_page_of_another_site_is_not_let_in(served: Opened) -> None:
     with pytest.raises(InvalidStatus) as why:
         served.client().socket(origin="http://evil.example")
@@ -322,6 +340,7 @@ def test_a_page_of_another_site_is_not_let_in(served: Opened) -> None:
     assert b"WrongOrigin" in why.value.response.body
 
 
+@pytest.mark.slow
 def test_revoking_a_token_ends_its_connections(served: Opened) -> None:
     with served.client().socket() as page:
         ask(page, **go_on())
@@ -331,6 +350,7 @@ def test_revoking_a_token_ends_its_connections(served: Opened) -> None:
             heard(page)
 
 
+@pytest.mark.slow
 def test_a_closing_http_gateway_leaves_nothing_moving(served: Opened) -> None:
     with served.client().socket() as page:
         ask(page, **go_on())
@@ -338,6 +358,7 @@ def test_a_closing_http_gateway_leaves_nothing_moving(served: Opened) -> None:
         assert served["a"].stopped.wait(20)
 
 
+@pytest.mark.slow
 def test_a_connection_that_asks_nothing_is_closed(served: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
     place = urlsplit(served.gateway.url)

@@ -14,13 +14,13 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner, Result
 
+from trade import _atomic_file
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway.cli import build
 from trade_gateway.cli.rights._pki import app
 from trade_gateway.pki import _authority
 from trade_gateway.pki._authority import Authority, Issued, NameRevoked, NameTaken, NoAuthority
-from trade_gateway.process import _atomic_file
 
 
 @pytest.fixture
@@ -370,6 +370,7 @@ def test_the_commands_say_what_is_wrong(folder: Path) -> None:
     assert said("issue", "x", "--hours", "0", "--ca", folder).exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_refusal_is_a_line_on_standard_error(folder: Path) -> None:
     import sys
 

@@ -162,6 +162,7 @@ def test_each_joint_is_recorded_once_with_the_group_it_belongs_to(recorder: Reco
     assert "/rosie.neck.pan/joints" not in seen.by_topic
 
 
+@pytest.mark.slow
 def test_the_stamp_of_joints_is_when_they_were_measured(record: Record) -> None:
     seen = record(lambda sink: "/rosie.head/joints" in sink.by_topic)
     message = next(one for one in seen.messages if one.channel.topic == "/rosie.head/joints")
@@ -169,6 +170,7 @@ def test_the_stamp_of_joints_is_when_they_were_measured(record: Record) -> None:
     assert message.arrived_ns - message.stamp_ns >= 500_000_000
 
 
+@pytest.mark.slow
 def test_what_arrived_later_is_later_in_the_file_also_when_the_clock_is_put_back(
     record: Record, robot: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +189,7 @@ def _move(container: Container, *args: object) -> None:
     container.find(where(name="move_to", group="rosie.neck.pan"), wait_s=PATIENCE_S)(*args)
 
 
+@pytest.mark.slow
 def test_calls_are_reported_without_arguments_and_samples_are_no_calls(record: Record, robot: Container) -> None:
     record(lambda sink: robot._parts.caller.spans is not None)
     _move(robot, 0.5, "swordfish")
@@ -236,6 +239,7 @@ def test_locks_are_sent_whenever_they_change(record: Record, robot: Container) -
     record(lambda sink: not sink.by_topic["/locks"][-1]["locks"])
 
 
+@pytest.mark.slow
 def test_changes_of_health_and_e_stops_are_reported_with_their_ends(
     record: Record, robot: Container, pan: Motor
 ) -> None:
@@ -252,6 +256,7 @@ def test_changes_of_health_and_e_stops_are_reported_with_their_ends(
     assert estop is not None
 
 
+@pytest.mark.slow
 def test_a_service_that_fails_is_reported_once_until_it_answers_again(record: Record, pan: Motor) -> None:
     record(lambda sink: bool(sink.by_topic["/rosie.head/joints"]))
     pan.sick = True
@@ -264,6 +269,7 @@ def test_a_service_that_fails_is_reported_once_until_it_answers_again(record: Re
     ]
 
 
+@pytest.mark.slow
 def test_the_fault_of_a_joint_is_reported_once_and_so_is_its_end(record: Record, pan: Motor) -> None:
     record(lambda sink: bool(sink.by_topic["/rosie.head/joints"]))
     pan.fault = "hot"
@@ -276,6 +282,7 @@ def test_the_fault_of_a_joint_is_reported_once_and_so_is_its_end(record: Record,
     ]
 
 
+@pytest.mark.slow
 def test_a_provider_that_leaves_and_comes_back_is_recorded_again(
     record: Record, robot: Container, head: JointGroup
 ) -> None:
@@ -292,6 +299,7 @@ def _lines(*words: str) -> tuple[int, list[Any], str]:
     return done.exit_code, [json.loads(line) for line in done.stdout.splitlines()], done.stderr + str(done.exception)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("head")
 def test_the_command_says_what_it_records_how_far_it_is_and_what_there_is(tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
@@ -313,6 +321,7 @@ def test_the_command_says_what_it_records_how_far_it_is_and_what_there_is(tmp_pa
             jsonschema_rs.validate(json.loads(schema.data), json.loads(message.data))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("head")
 def test_a_full_disk_is_reported_with_an_exit_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_progress, "RecordingFile", partial(RecordingFile, opened=lambda path: FullDisk(path, 15_000)))

@@ -97,6 +97,7 @@ def trade(*words: str) -> Any:
     return CliRunner().invoke(app, list(words))
 
 
+@pytest.mark.slow
 def test_rules_run_report_their_firings_are_listed_and_leave(
     run: Callable[..., Any], desk: Desk, file: Path, start_container: StartContainer
 ) -> None:
@@ -115,6 +116,7 @@ def test_rules_run_report_their_firings_are_listed_and_leave(
     assert running.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_a_changed_file_counts_and_a_wrong_one_does_not(run: Callable[..., Any], file: Path) -> None:
     running = run()
     assert message(running)["rule"] == "alone"
@@ -129,12 +131,14 @@ def test_a_changed_file_counts_and_a_wrong_one_does_not(run: Callable[..., Any],
     assert message(running) == {"reloaded": str(file)}
 
 
+@pytest.mark.slow
 def test_a_dry_run_calls_nothing(run: Callable[..., Any], desk: Desk) -> None:
     fired = message(run("--dry-run"))
     assert (fired["rule"], fired["dry_run"], fired["steps"][0]["result"]) == ("alone", True, "would be called")
     assert desk.noted == []
 
 
+@pytest.mark.slow
 def test_a_file_is_tried_out_without_calling_anything(desk: Desk, file: Path) -> None:
     said = trade("rules", "test", str(file))
     text = re.sub(r"\s+", " ", said.stdout)
@@ -147,6 +151,7 @@ def test_a_file_is_tried_out_without_calling_anything(desk: Desk, file: Path) ->
     assert desk.noted == []
 
 
+@pytest.mark.slow
 def test_a_wrong_file_is_said_before_anything_is_done(file: Path, system: str) -> None:
     file.write_text("[rule.x]\n")
     for command in ("test", "run"):
@@ -155,6 +160,7 @@ def test_a_wrong_file_is_said_before_anything_is_done(file: Path, system: str) -
         assert "rule.x: when is missing" in str(said.exception)
 
 
+@pytest.mark.slow
 def test_an_empty_list_of_rules_is_reported(desk: Desk) -> None:
     assert "no rules run" in trade("rules", "list").stdout
     assert json.loads(trade("rules", "list", "--json").stdout) == []
@@ -165,6 +171,7 @@ def test_help_has_an_example(command: str) -> None:
     assert f"For example: trade rules {command}" in re.sub(r"\s+", " ", trade("rules", command, "--help").stdout)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_rules_that_have_ended(run: Callable[..., Any], start_container: StartContainer) -> None:
     running, looker = run(), start_container("looker")
     looker.find(where(group="rules", name="rules"), wait_s=20)

@@ -16,7 +16,7 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.cli.hardware._scan import _numbers
-from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
+from trade_hil_sim import Arm, DynamixelBus, Mute, Servo, UrBus, writes
 from trade_hil_sim.damiao import DamiaoBus, Motor
 from trade_hil_sim.odrive import Axis, OdriveBus
 
@@ -45,6 +45,7 @@ def test_ids_are_numbers_and_ranges() -> None:
         _numbers("1-x", "--ids")
 
 
+@pytest.mark.slow
 def test_a_scan_shows_a_line_for_each_device(line: DynamixelBus) -> None:
     said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "1-3")
     assert said.exit_code == 0, said.output
@@ -67,6 +68,7 @@ def test_finding_no_container_has_an_exit_code_of_its_own(line: DynamixelBus) ->
     assert "no device answers" in said.output
 
 
+@pytest.mark.slow
 def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: DynamixelBus, tmp_path: Path) -> None:
     words = ("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "1-2", "--write", tmp_path / "new.toml")
     assert trade(*words).exit_code == 0
@@ -91,6 +93,7 @@ def test_contradictions_within_one_robot_file_are_reported(second: dict[str, obj
         first_file([("/dev/a", one), ("/dev/a", other)], Path("new.toml"))
 
 
+@pytest.mark.slow
 def test_an_id_is_set_where_the_device_is_found(line: DynamixelBus) -> None:
     said = trade("set-id", "--port", line.port, "--from", 2, "--to", 5)
     assert said.exit_code == 0, said.output
@@ -102,6 +105,16 @@ def test_another_model_than_the_one_meant_is_left_alone(line: DynamixelBus) -> N
     error = trade("set-id", "--port", line.port, "--from", 2, "--to", 5, "--model", "XM430-W350").exception
     assert "is XL430-W250, not XM430-W350" in str(error)
     assert [servo.device_id for servo in line.devices] == [1, 2]
+
+
+def test_a_device_whose_model_could_not_be_read_is_left_alone(line: DynamixelBus) -> None:
+    line.do(Mute(ids=(2,), instruction="read", count=3))
+    words = ("--port", line.port, "--baud", 1_000_000, "--from", 2, "--to", 5, "--model", "XM430-W350")
+    error = trade("set-id", *words).exception
+    assert isinstance(error, ConfigurationError), error
+    assert "answers a ping but no read" in str(error)
+    assert [servo.device_id for servo in line.devices] == [1, 2]
+    assert not writes(line.log.entries)
 
 
 def test_a_rate_is_set_where_the_device_is_found(line: DynamixelBus) -> None:
@@ -119,6 +132,7 @@ def test_an_arm_is_asked_for_by_its_host(tmp_path: Path) -> None:
     assert robot.buses[0].port == sim.port
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bus", "device", "model"), [(OdriveBus, Axis, "ODrive S1"), (DamiaoBus, Motor, "DM4310")], ids=["odrive", "damiao"]
 )

@@ -79,6 +79,7 @@ def opened(path: Path, reported: list[str]) -> Iterator[Callable[[], StateStore]
     made[-1].close()
 
 
+@pytest.mark.slow
 def test_the_last_save_is_available_to_the_next_process(opened: Callable[[], StateStore], reported: list[str]) -> None:
     store = opened()
     assert store.load("a") == {}
@@ -203,6 +204,7 @@ def _whole(path: Path) -> int:
     return turn
 
 
+@pytest.mark.slow
 def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: Path) -> None:
     *killed, done = _saver(tmp_path, "step by step").communicate(timeout=100)[0].split()
     assert (set(killed), done) == ({str(-signal.SIGKILL)}, "0")
@@ -211,6 +213,7 @@ def test_killed_at_each_step_of_a_save_the_last_complete_save_is_kept(tmp_path: 
     assert outcomes == sorted(outcomes)
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_every_confirmed_save_is_kept(tmp_path: Path) -> None:
     path, dice = tmp_path / "state.sqlite", random.Random(7)
     for _ in range(4):

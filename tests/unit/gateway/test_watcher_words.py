@@ -38,6 +38,7 @@ def base(start_container: StartContainer) -> Container:
     return container
 
 
+@pytest.mark.slow
 def test_notifications_are_listed_and_cancelled(base: Container) -> None:
     dock, is_low = base.find(where(name="dock")), base.find(where(name="is_low"))
     noted = base.every(60, dock.bind(0.3), if_=is_low)
@@ -52,6 +53,7 @@ def test_notifications_are_listed_and_cancelled(base: Container) -> None:
     assert json.loads(trade("notifications", "--json").stdout) == []
 
 
+@pytest.mark.slow
 def test_hooks_are_listed_and_detached(base: Container) -> None:
     dock = base.find(where(name="dock"))
     hook = base.after_service(dock, base.find(where(name="saw")))

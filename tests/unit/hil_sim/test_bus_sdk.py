@@ -29,6 +29,7 @@ def test_ping_answers_model_and_an_absent_id_is_silence(sdk: SimpleNamespace) ->
     assert sdk.ph.ping(sdk.port, 9)[1] == dynamixel_sdk.COMM_RX_TIMEOUT
 
 
+@pytest.mark.slow
 def test_a_broadcast_ping_finds_all_servos(sdk: SimpleNamespace) -> None:
     assert sdk.ph.broadcastPing(sdk.port) == ({1: [1060, 45], 2: [1060, 45], 3: [1060, 45]}, 0)
 
@@ -135,6 +136,7 @@ def test_bulk_write_writes_different_registers_of_each(sdk: SimpleNamespace, gro
     assert [(e.device_id, e.moves) for e in writes(bus.log.entries)] == [(1, True), (2, False)]
 
 
+@pytest.mark.slow
 def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 65, 1) == OK
     assert sdk.ph.reboot(sdk.port, 1) == OK
@@ -143,6 +145,7 @@ def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace) -> None:
     assert sdk.ph.read1ByteTxRx(sdk.port, 1, 65) == (0, *OK)
 
 
+@pytest.mark.slow
 def test_factory_reset_spares_id_and_baud_on_request(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write4ByteTxRx(sdk.port, 2, 24, 99) == OK
     assert sdk.ph.factoryReset(sdk.port, 2, 0x02) == OK
@@ -216,6 +219,7 @@ def test_a_new_id_is_known_at_once_by_its_new_name(sdk: SimpleNamespace) -> None
     assert sdk.ph.ping(sdk.port, 30) == (1060, *OK)
 
 
+@pytest.mark.slow
 def test_at_another_baud_rate_no_servo_answers(bus: DynamixelBus, open_sdk: Any) -> None:
     slow = open_sdk(bus, baud=57_600)
     assert slow.ph.ping(slow.port, 1)[1] == dynamixel_sdk.COMM_RX_TIMEOUT
@@ -231,6 +235,7 @@ def test_two_servos_of_one_id_answer_on_top_of_each_other(make_bus: Any, open_sd
     bus = make_bus(Servo(1), Servo(1, position_counts=1000), 2)
     sdk = open_sdk(bus)
     assert sdk.ph.read4ByteTxRx(sdk.port, 1, POSITION)[1] != 0
+    wait_until(lambda: any(e.kind == "sent" for e in bus.log.entries), "they have answered")  # later than it waits
     assert len(next(e for e in bus.log.entries if e.kind == "sent").data) == 30
     assert sdk.ph.ping(sdk.port, 2) == (1060, *OK)
 

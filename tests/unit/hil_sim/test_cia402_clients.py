@@ -339,6 +339,7 @@ def leg(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_robot_file_with_a_can_bus_is_simulated_in_a_process(leg: Path, connect: Any) -> None:
     with SimProcess(leg) as sim:
         port = sim.ports["leg"]
@@ -365,6 +366,7 @@ def test_a_robot_file_with_a_can_bus_is_simulated_in_a_process(leg: Path, connec
             assert control.device(5).hardware_error == 0x2310
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "hint"),
     [

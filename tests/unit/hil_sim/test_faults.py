@@ -56,6 +56,7 @@ def test_a_muted_device_obeys_but_does_not_answer(sdk: SimpleNamespace, bus: Dyn
     assert sdk.ph.read1ByteTxRx(sdk.port, 1, 65) == (1, 0, 0)
 
 
+@pytest.mark.slow
 def test_a_whole_bus_can_be_muted(bus: DynamixelBus, read: Any) -> None:
     bus.do(Mute())
     assert [read(k)[1] for k in (1, 2, 3)] == [TIMEOUT] * 3
@@ -63,6 +64,7 @@ def test_a_whole_bus_can_be_muted(bus: DynamixelBus, read: Any) -> None:
     assert read() == GOOD
 
 
+@pytest.mark.slow
 def test_a_fault_can_be_counted_skipped_and_bound_to_an_instruction(
     sdk: SimpleNamespace, bus: DynamixelBus, read: Any
 ) -> None:
@@ -171,6 +173,7 @@ def test_a_swapped_device_reports_another_model(sdk: SimpleNamespace, bus: Dynam
     assert sdk.ph.ping(sdk.port, 2) == (1060, 0, 0)
 
 
+@pytest.mark.slow
 def test_a_brown_out_switches_torque_off_and_keeps_eeprom(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 9, 0) == (0, 0)
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 64, 1) == (0, 0)

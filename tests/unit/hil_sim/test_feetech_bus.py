@@ -130,6 +130,7 @@ def test_meaningless_and_unaddressed_messages_are_not_answered(bus: FeetechBus, 
     assert nothing(bus, data)
 
 
+@pytest.mark.slow
 def test_at_status_level_0_only_pings_and_reads_are_answered(bus: FeetechBus) -> None:
     talk(bus, encode(1, 3, bytes((8, 0))))
     assert nothing(bus, encode(1, 3, bytes((41, 5))))
@@ -179,6 +180,7 @@ def test_packets_may_break_anywhere() -> None:
     assert found == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_the_program_brings_it_up_from_a_robot_file(tmp_path: Path) -> None:
     file = tmp_path / "tail.toml"
     file.write_text(TAIL)
@@ -190,6 +192,7 @@ def test_the_program_brings_it_up_from_a_robot_file(tmp_path: Path) -> None:
         assert process.control.device("tail.tip").position_rad == pytest.approx(1.534, abs=0.001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("before", "after", "complaint"),
     [("STS3215", "STS9999", "is not simulated; there is STS3215"), ("port =", "baud = 9600\nport =", "is no rate of")],

@@ -29,6 +29,7 @@ def ping(port: str, device_id: int, baud: int = 1_000_000) -> bytes:
         return line.read(14)
 
 
+@pytest.mark.slow
 def test_it_simulates_all_buses_of_a_robot_file(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         assert set(sim.ports) == {"neck", "arm"}
@@ -45,6 +46,7 @@ def test_it_simulates_all_buses_of_a_robot_file(robot_file: Path) -> None:
     sim.close()
 
 
+@pytest.mark.slow
 def test_what_it_logged_outlives_it_if_a_file_was_named(robot_file: Path, tmp_path: Path) -> None:
     with SimProcess(robot_file, log=tmp_path / "log", directory=tmp_path / "ports", buses=["neck"]) as sim:
         assert sim.ports == {"neck": str(tmp_path / "ports" / "neck")}
@@ -55,6 +57,7 @@ def test_what_it_logged_outlives_it_if_a_file_was_named(robot_file: Path, tmp_pa
     assert len(read_log(tmp_path / "log")) >= 3
 
 
+@pytest.mark.slow
 def test_its_times_are_this_process_times(robot_file: Path) -> None:
     import time
 
@@ -65,6 +68,7 @@ def test_its_times_are_this_process_times(robot_file: Path) -> None:
         assert len(instructions(sim.entries(), since=before, until=after)) == 1
 
 
+@pytest.mark.slow
 def test_faults_come_in_while_it_runs(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         sim.control.brown_out([1])
@@ -72,6 +76,7 @@ def test_faults_come_in_while_it_runs(robot_file: Path) -> None:
         assert sim.control.device("neck.pan").torque is False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "d"
@@ -90,6 +95,7 @@ def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: sign
     assert list(place.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_it_ends_when_its_parent_is_killed(robot_file: Path) -> None:
     code = """
 import sys
@@ -110,6 +116,7 @@ sys.stdin.read()
         shutil.rmtree(port.parent)
 
 
+@pytest.mark.slow
 def test_it_ends_when_standard_input_does(robot_file: Path) -> None:
     command = [*COMMAND, str(robot_file), "--stdin"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -121,6 +128,7 @@ def test_it_ends_when_standard_input_does(robot_file: Path) -> None:
         assert process.wait(20) == 0
 
 
+@pytest.mark.slow
 def test_a_robot_file_it_cannot_use_is_reported_on_standard_error(robot_file: Path, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match=r"nothere\.toml"):
         SimProcess(tmp_path / "nothere.toml")
@@ -131,12 +139,14 @@ def test_a_robot_file_it_cannot_use_is_reported_on_standard_error(robot_file: Pa
     assert ended.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_help_says_how_to_talk_to_it(robot_file: Path) -> None:
     said = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
     for word in ("--bus", "--log", "--control", "--unpaced", "--parent", "--stdin", '{"do": "mute", "ids": [1]}'):
         assert word in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "done"),
     [
@@ -152,6 +162,7 @@ def test_one_that_runs_is_struck_by_a_command(robot_file: Path, words: str, done
         assert [one.name for one in sim.entries()[before:] if one.name in done] == done
 
 
+@pytest.mark.slow
 def test_the_state_is_shown_by_a_command(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         assert strike(str(sim.control_path), "absent ids=1 on=false") == (0, "", "")
@@ -159,6 +170,7 @@ def test_the_state_is_shown_by_a_command(robot_file: Path) -> None:
         assert (code, json.loads(said.splitlines()[0])["name"]) == (0, "neck")
 
 
+@pytest.mark.slow
 def test_a_refusal_of_the_simulator_is_reported_in_one_line(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         for words, why in (
@@ -193,6 +205,7 @@ def test_wrong_arguments_are_reported_in_one_line_before_anything_is_sent(
     assert why in problem
 
 
+@pytest.mark.slow
 def test_a_command_without_matching_service_says_where_it_searched(tmp_path: Path) -> None:
     code, _, problem = strike(str(tmp_path / "none"), "heal")
     assert (code, problem.count("\n")) == (1, 1)
@@ -206,6 +219,7 @@ def strike(control: str, words: str) -> tuple[int, str, str]:
     return ended.returncode, ended.stdout, ended.stderr
 
 
+@pytest.mark.slow
 def test_help_lists_every_fault() -> None:
     said = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
     for word, kind in kinds_of(Command).items():
@@ -226,6 +240,7 @@ def short() -> Iterator[Path]:
         yield Path(folder)
 
 
+@pytest.mark.slow
 def test_only_folders_of_its_kind_whose_owner_is_gone_are_removed(
     robot_file: Path, short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

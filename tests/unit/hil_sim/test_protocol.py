@@ -90,6 +90,7 @@ def test_a_joined_answer_ends_each_block_with_the_crc_of_all_before_it() -> None
     assert int.from_bytes(whole[-2:], "little") == crc16(whole[:-2])
 
 
+@pytest.mark.slow
 @given(st.binary())
 def test_stuffing_and_unstuffing_are_inverse(body: bytes) -> None:
     assert unstuff(stuff(body)) == body
@@ -101,6 +102,7 @@ def test_encoding_and_decoding_are_inverse(packet: Packet) -> None:
     assert PacketReader().feed(encode(packet.device_id, packet.instruction, packet.params)) == [packet]
 
 
+@pytest.mark.slow
 @given(st.lists(PACKETS, max_size=5), st.data())
 def test_packets_are_read_wherever_the_chunks_break(packets: list[Packet], data: st.DataObject) -> None:
     stream = b"".join(encode(p.device_id, p.instruction, p.params) for p in packets)
@@ -110,6 +112,7 @@ def test_packets_are_read_wherever_the_chunks_break(packets: list[Packet], data:
     assert reader.skipped == 0
 
 
+@pytest.mark.slow
 @given(st.lists(st.binary(max_size=20) | PARAMS | PACKETS, max_size=8), st.data())
 def test_any_bytes_in_any_chunks_read_alike(parts: list[bytes | Packet], data: st.DataObject) -> None:
     stream = b"".join(p if isinstance(p, bytes) else encode(p.device_id, p.instruction, p.params) for p in parts)

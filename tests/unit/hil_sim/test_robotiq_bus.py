@@ -74,6 +74,7 @@ def truth(line: RobotiqBus) -> sim.GripperTruth:
 # --- pymodbus
 
 
+@pytest.mark.slow
 def test_pymodbus_activates_grips_and_releases(line: RobotiqBus, pymodbus: ModbusSerialClient) -> None:
     line.do(sim.Put(width_m=0.04))
     pymodbus.write_registers(COMMAND, [0x0100, 0, 0], device_id=9)
@@ -89,6 +90,7 @@ def test_pymodbus_activates_grips_and_releases(line: RobotiqBus, pymodbus: Modbu
     assert not truth(line).holding
 
 
+@pytest.mark.slow
 def test_pymodbus_hears_nothing_of_a_bad_request_as_the_manual_says(pymodbus: ModbusSerialClient) -> None:
     with pytest.raises(ModbusIOException):
         pymodbus.read_holding_registers(0, count=1, device_id=9)
@@ -111,6 +113,7 @@ def test_pymodbus_hears_an_exception_of_a_gripper_that_has_them(make_line: Calla
 # --- minimalmodbus
 
 
+@pytest.mark.slow
 def test_minimalmodbus_activates_and_closes(line: RobotiqBus, minimal: minimalmodbus.Instrument) -> None:
     minimal.write_register(COMMAND, 0x0100, functioncode=6)
     wait_until(lambda: minimal.read_register(STATUS) == 0x3100)
@@ -143,6 +146,7 @@ def ask(port: serial.Serial, request: str, size: int) -> str:
     return port.read(size).hex(" ", -2).upper()
 
 
+@pytest.mark.slow
 def test_the_frames_of_the_manual_by_hand(line: RobotiqBus, port: serial.Serial) -> None:
     assert ask(port, "091003E80003060000000000007330", 8) == "0910 03E8 0003 0130"
     assert ask(port, "091003E800030601000000000072E1", 8) == "0910 03E8 0003 0130"
@@ -160,6 +164,7 @@ def test_a_request_with_a_wrong_check_sum_is_not_obeyed(line: RobotiqBus, port: 
     assert [entry.name for entry in sim.instructions(line.log.entries)] == ["damaged"]
 
 
+@pytest.mark.slow
 def test_a_broadcast_is_obeyed_and_not_answered(
     make_line: Callable[..., RobotiqBus],
 ) -> None:
@@ -213,6 +218,7 @@ def test_the_log_says_what_could_move_and_what_could_not(make_line: Callable[...
     assert len(sim.writes(line.log.entries, register="position_request")) == 2
 
 
+@pytest.mark.slow
 def test_unplugging_takes_the_port_away_and_the_gripper_stays_as_it_was(
     line: RobotiqBus, pymodbus: ModbusSerialClient
 ) -> None:

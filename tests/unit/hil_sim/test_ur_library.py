@@ -39,6 +39,7 @@ def run(controller: UrBus, program: str) -> Any:
     return json.loads(next(line for line in reversed(done.stdout.splitlines()) if line.startswith(("[", "{"))))
 
 
+@pytest.mark.slow
 def test_the_receive_interface_reads_a_stream_that_advances(controller: UrBus) -> None:
     reported = run(
         controller,
@@ -122,6 +123,7 @@ def until(true):
 """
 
 
+@pytest.mark.slow
 def test_the_control_interface_moves_in_joint_space_and_along_a_line(controller: UrBus) -> None:
     reported = run(
         controller,
@@ -203,6 +205,7 @@ print(json.dumps([ok, running, stopped, r.getActualQ()[0] - q[0]]))
     assert 0.02 < way < 1.0
 
 
+@pytest.mark.slow
 def test_a_stream_of_set_points_arrives_whole_and_is_followed(controller: UrBus) -> None:
     reported = run(
         controller,

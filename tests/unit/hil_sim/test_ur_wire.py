@@ -218,6 +218,7 @@ def dashboard(controller: UrBus, *lines: str) -> list[str]:
         return answers
 
 
+@pytest.mark.slow
 def test_after_a_reboot_the_arm_is_off_and_power_and_brakes_are_asked_for(controller: UrBus) -> None:
     controller.do(BrownOut())
     wait_until(lambda: controller.state().plugged, "it has booted")

@@ -108,6 +108,7 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
     assert stand.container.locks() == []
 
 
+@pytest.mark.slow
 def test_an_unanswered_ros_service_raises_ros_unreachable_before_the_deadline(stand: Stand) -> None:
     """By default the bridge waits as long as a call lasts."""
     lab = Lab(stand)
@@ -238,6 +239,7 @@ class RosArm:
 
     def _do(self, goal: Goal) -> Outcome:
         self.goals.append(goal.message["trajectory"])
+        goal.feedback({"joint_names": ["a", "b"]})
         goal.when_canceled(self.canceled.set)
         self.goes.set()
         if self.holds:
@@ -274,6 +276,7 @@ def test_joints_of_ros_are_read_by_their_names(stand: Stand, arm: RosArm) -> Non
     assert (a.velocity_rad_s, a.effort_nm) == (0.1, None)
 
 
+@pytest.mark.slow
 def test_joints_of_ros_move_no_quicker_than_they_may(stand: Stand, arm: RosArm) -> None:
     found(stand, "lab.arm", "move_to")([0.5, -0.25])
     [trajectory] = arm.goals
@@ -286,12 +289,14 @@ def test_joints_of_ros_move_no_quicker_than_they_may(stand: Stand, arm: RosArm) 
         found(stand, "lab.arm", "move_to")([0.5])
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_sent_to_ros_in_the_joint_order_of_the_call(stand: Stand, arm: RosArm) -> None:
     points = [{"time_from_start_s": t, "positions_rad": [t, -t]} for t in (0.0, 1.0)]
     found(stand, "lab.arm", "follow")({"joints": ["lab.arm.b", "lab.arm.a"], "points": points})
     assert [point["positions"] for point in arm.goals[0]["points"]] == [[0.0, 0.0], [-1.0, 1.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["move_to", "follow"])
 def test_a_motion_in_ros_is_answered_with_where_the_joints_are_at_its_end(stand: Stand, arm: RosArm, how: str) -> None:
     points = [{"time_from_start_s": 1.0, "positions_rad": [0.4, -0.4]}]
@@ -299,12 +304,23 @@ def test_a_motion_in_ros_is_answered_with_where_the_joints_are_at_its_end(stand:
     assert found(stand, "lab.arm", how)(args[how]) == [0.4, -0.4]
 
 
+@pytest.mark.slow
 def test_a_motion_in_ros_after_which_nothing_is_heard_is_an_error_that_says_so(stand: Stand, arm: RosArm) -> None:
     arm.dies = True
     began = time.monotonic()
     with pytest.raises(RosUnreachable, match=r"has ended, but for .* no state of a, b arrived"):
         found(stand, "lab.arm", "move_to").with_(deadline_s=2.0)([0.4, -0.4])
     assert time.monotonic() - began < PATIENCE_S
+
+
+def test_the_feedback_of_a_motion_in_ros_is_the_progress_of_the_call(stand: Stand, arm: RosArm) -> None:
+    arm.holds = True
+    run = found(stand, "lab.arm", "move_to").start([0.5, 0.5])
+    wait_until(lambda: run.progress() is not None)
+    assert run.progress()["joint_names"] == ["a", "b"]
+    found(stand, "lab.arm", "stop")()
+    with pytest.raises(MotionStopped):
+        run.result(PATIENCE_S)
 
 
 def test_what_ros_aborts_is_a_fault(stand: Stand, arm: RosArm) -> None:
@@ -323,6 +339,7 @@ def test_a_stop_cancels_the_goal_and_the_call_says_so(stand: Stand, arm: RosArm)
     assert isinstance(ended[0], MotionStopped)
 
 
+@pytest.mark.slow
 def test_S07_a_stop_waits_for_no_goal_that_is_on_its_way_and_cancels_it_when_it_arrives(
     stand: Stand, arm: RosArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,6 +363,7 @@ def test_S07_a_stop_waits_for_no_goal_that_is_on_its_way_and_cancels_it_when_it_
     assert isinstance(ended[0], MotionStopped)
 
 
+@pytest.mark.slow
 def test_S03_a_goal_in_ros_is_canceled_with_the_session_of_who_asked(stand: Stand, arm: RosArm) -> None:
     arm.holds = True
     person = stand.memory.container("person")
@@ -356,6 +374,7 @@ def test_S03_a_goal_in_ros_is_canceled_with_the_session_of_who_asked(stand: Stan
     assert arm.canceled.wait(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_S09_an_e_stop_cancels_a_goal_in_ros(stand: Stand, arm: RosArm) -> None:
     arm.holds = True
     moves, _ = apart(lambda: found(stand, "lab.arm", "move_to")([0.5, 0.5]))

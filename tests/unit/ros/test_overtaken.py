@@ -62,6 +62,7 @@ def test_a_topic_is_no_way_to_a_stop(stand: Stand) -> None:
     wait_until(lambda: any("Use [[to_ros.service]]" in line for line in stand.said))
 
 
+@pytest.mark.slow
 def test_S14_while_ros_is_lost_stops_stay_pending_and_its_devices_count_as_moving(stand: Stand) -> None:
     bridge = stand.up(DRIVE)
     heard: list[Any] = []

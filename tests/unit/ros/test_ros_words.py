@@ -11,6 +11,8 @@ import pytest
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Container, Settings, where
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "ros.toml"
 ROOT = Path(__file__).parents[3]
 STARTED = """

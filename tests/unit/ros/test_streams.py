@@ -3,6 +3,8 @@
 import threading
 from typing import Any
 
+import pytest
+
 from tests.support.waiting import wait_until
 from tests.unit.ros.arms import FakeJoints
 from tests.unit.ros.robots import Stand
@@ -40,6 +42,7 @@ def test_a_record_is_published_by_the_names_of_its_fields_or_as_the_file_says(st
     assert messages[0]["header"]["stamp"]["sec"] > 1_600_000_000
 
 
+@pytest.mark.slow
 def test_nothing_is_published_while_the_service_fails_and_again_when_it_does_not(stand: Stand) -> None:
     stand.up(
         '[[to_ros.stream]]\nservice = "rosie.head.state"\ntopic = "/head"\ntype = "std_msgs/msg/Float64"\n'

@@ -346,6 +346,7 @@ def test_calls_sent_at_once_all_pass_and_follow_behind_stops(star: Star) -> None
         one.undeclare()
 
 
+@pytest.mark.slow
 def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Path) -> None:
     rules = acl(policy, namespace=SYSTEM, subject="usernames", calls_hz=10)
     with contextlib.ExitStack() as stack:
@@ -429,6 +430,7 @@ def join(certificates: Path, policy: Policy, tmp_path: Path) -> Iterator[Join]:
         yield start
 
 
+@pytest.mark.slow
 def test_containers_do_all_they_may_under_the_rules(
     join: Join, eventually: Callable[[Callable[[], bool]], bool]
 ) -> None:

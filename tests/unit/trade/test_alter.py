@@ -199,6 +199,7 @@ def test_a_consultant_is_left_out_while_it_is_ill(here: Container, there: Contai
     assert asked.get(timeout=20) == ()
 
 
+@pytest.mark.slow
 def test_ten_thousand_services_reach_another_container(
     here: Container, there: Container, eventually: Eventually
 ) -> None:
@@ -218,6 +219,7 @@ _wire = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.fixed_dictionaries({}, optional={"meta": _wire, "health": _wire, "kinds": _wire}))
 def test_an_entry_with_anything_in_its_new_fields_is_taken_or_dropped(reported: dict[str, Any]) -> None:
     info = ProviderInfo(revision=1, groups=("a",), kind="A", host="h", pid=1, services=())

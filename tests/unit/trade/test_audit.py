@@ -96,6 +96,7 @@ class Mind:
         return call(self._home, "reach", angle_rad)
 
 
+@pytest.mark.slow
 def test_what_comes_of_a_call_has_the_id_of_the_one_that_began_it_all_in_every_record(
     here: Container, there: Container, folder: Path, start_container: Start
 ) -> None:
@@ -155,6 +156,7 @@ def test_wrong_arguments_are_a_refusal(here: Container, there: Container, folder
     assert reported(there, folder) == [("refused", "rosie.arm.reach", "InvalidArgument")]
 
 
+@pytest.mark.slow
 def test_grants_and_refusals_of_locks_are_written_down(
     here: Container, there: Container, start_container: Start, folder: Path
 ) -> None:
@@ -298,6 +300,7 @@ def test_a_disabled_audit_record_adds_no_interceptor_and_no_file(
     assert list(tmp_path.glob("**/*.sqlite")) == []
 
 
+@pytest.mark.slow
 def test_without_a_record_the_core_loads_no_database() -> None:
     program = "import sys, trade; sys.exit('sqlite3' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0

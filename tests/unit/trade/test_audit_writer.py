@@ -168,6 +168,7 @@ def test_a_writer_closed_as_its_file_can_be_written_again_writes_what_waits_and_
     assert [row.what for row in rows(path)] == ["began", "rosie.step", "ended"]
 
 
+@pytest.mark.slow
 def test_a_writer_closed_while_another_process_holds_its_file_ends(
     write: Write, path: Path, eventually: Eventually
 ) -> None:
@@ -184,6 +185,7 @@ def test_a_writer_closed_while_another_process_holds_its_file_ends(
     assert [row.what for row in rows(path)] == ["began"]
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_indeed_loses_what_does_not_fit_and_breaks_nothing(path: Path) -> None:
     program = f"""
 import resource, logging
@@ -341,6 +343,7 @@ def test_a_clock_that_jumped_far_drops_nothing_for_its_age(
 # --- its end
 
 
+@pytest.mark.slow
 def test_killed_at_any_step_it_leaves_a_record_that_verifies(path: Path) -> None:
     """The writer is ended by the kernel before and after each thing that it asks of the database."""
     program = f"""
@@ -405,6 +408,7 @@ print(steps, verdict.head.seq)
     assert rows > steps  # most of those that were ended had added something
 
 
+@pytest.mark.slow
 def test_its_process_killed_under_load_leaves_a_record_that_verifies_and_can_be_added_to(path: Path) -> None:
     program = f"""
 import trade._audit.writer as writing

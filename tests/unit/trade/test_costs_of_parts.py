@@ -130,6 +130,7 @@ def test_calls_and_started_calls_are_two_messages(here: Container, there: Contai
             run.result(20)
 
 
+@pytest.mark.slow
 def test_what_calls_of_another_container_leave_behind_does_not_grow(here: Container, there: Container) -> None:
     """But for what is kept so that no call runs twice: so it is reading that is looked at."""
     angle = known(here, there, name="angle")
@@ -187,6 +188,7 @@ with memory_system() as system:
 """
 
 
+@pytest.mark.slow
 def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
     if shutil.which("strace") is None:
         pytest.fail("there is no strace") if os.environ.get("CI") == "true" else pytest.skip("there is no strace")
@@ -314,6 +316,7 @@ def test_a_renewal_is_one_call_to_each_container_however_many_locks(
 # --- looking up, joining
 
 
+@pytest.mark.slow
 def test_find_takes_the_same_steps_among_ten_services_and_among_two_thousand(here: Container) -> None:
     def steps() -> int:
         find: Callable[[], object] = lambda: here.find(where(name="move", group="robot.j3"))  # noqa: E731
@@ -361,6 +364,7 @@ def test_join_heartbeat_and_shutdown_have_a_bounded_cost_per_container(
     assert heard.bytes <= MOST_BYTES_OF_A_LEAVE * containers
 
 
+@pytest.mark.slow
 def test_a_container_takes_no_more_threads_however_many_others_there_are(system: MemorySystem) -> None:
     def threads() -> int:
         gc.collect()

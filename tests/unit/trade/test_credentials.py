@@ -29,6 +29,7 @@ def peers(container: Container) -> int:
     return len(container._parts.transport._session.info.peers_zid())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])
 @pytest.mark.parametrize("credentials", OTHERS, ids=str)
 def test_a_container_with_other_credentials_is_not_linked_and_sees_nothing(
@@ -51,6 +52,7 @@ def test_a_container_with_the_same_credentials_is_linked(start_container: Any) -
     assert other.find(where(name="echo"), wait_s=20)(3) == 3
 
 
+@pytest.mark.slow
 def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: pytest.LogCaptureFixture) -> None:
     endpoint = free_endpoint()
     start_container("there", credentials=ALICE, listen=[endpoint])
@@ -63,6 +65,7 @@ def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: 
         outsider.system.connect(endpoint)
 
 
+@pytest.mark.slow
 def test_an_endpoint_that_lets_us_in_is_not_warned_of(start_container: Any, caplog: pytest.LogCaptureFixture) -> None:
     endpoint = free_endpoint()
     start_container("there", listen=[endpoint])
@@ -89,11 +92,12 @@ def test_containers_of_one_user_share_a_secret_readable_only_by_that_user(here: 
     assert len(user_secret()[1]) > 40
 
 
+@pytest.mark.slow
 def test_another_user_cannot_join_through_the_loopback_port(
     here: Container, system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another user has another runtime folder, and so another secret."""
-    [entry] = (tmp_path / "runtime" / "trade" / system).iterdir()
+    [entry] = (tmp_path / "runtime" / "trade" / system).glob("tcp_*")
     endpoint = entry.read_text().split()[0]
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))
     with Container(Settings.read(container="intruder", connect=[endpoint])) as intruder:
@@ -137,6 +141,7 @@ def test_S21_a_laboratory_network_is_listened_on_only_on_purpose() -> None:
             Settings.read(environment=environment, listen=LAN, system="lab", credentials=ALICE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("credentials", "seen"), [("alice:pass:word", True), ("alice:wrong", False), ("", False)])
 def test_the_command_line_lists_containers_only_with_their_credentials(
     start_container: Any, monkeypatch: pytest.MonkeyPatch, credentials: str, seen: bool

@@ -35,6 +35,7 @@ def channel() -> Iterator[Queue]:
     made.close()
 
 
+@pytest.mark.slow
 def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
     done = threading.Semaphore(0)
     at_once: list[int] = []

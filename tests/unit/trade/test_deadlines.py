@@ -57,6 +57,7 @@ def found(here: Container, name: str) -> Handle:
     return here.find(where(name=name, group="robot"), wait_s=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["call", "start", "acall"])
 def test_an_overrun_is_an_unknown_outcome(here: Container, there: Container, gate: Any, how: str) -> None:
     there.register(gate, "robot")
@@ -73,6 +74,7 @@ def test_an_overrun_is_a_timeout_error(here: Container, there: Container, gate: 
         found(here, "pass_through").with_(deadline_s=0.05)()
 
 
+@pytest.mark.slow
 def test_an_answer_after_the_deadline_disturbs_no_later_call(here: Container, there: Container, gate: Any) -> None:
     there.register(gate, "robot")
     here.find(where(name="clock", container="there"), wait_s=20)()
@@ -129,6 +131,7 @@ def inner(request: pytest.FixtureRequest, here: Container, there: Container) -> 
     return motor, {name: found(here, name) for name in ("move", "stop", "left")}
 
 
+@pytest.mark.slow
 def test_a_nested_call_has_what_is_left_of_the_outer_one(here: Container, there: Container, inner: Any) -> None:
     there.register(Outer(), "robot")
     relay = found(here, "relay").with_(deadline_s=100)
@@ -136,6 +139,7 @@ def test_a_nested_call_has_what_is_left_of_the_outer_one(here: Container, there:
     assert relay(inner[1]["left"], 20.0) <= 20
 
 
+@pytest.mark.slow
 def test_a_nested_call_after_the_deadline_never_runs(here: Container, there: Container, inner: Any) -> None:
     motor, services = inner
     outer = Outer()
@@ -147,6 +151,7 @@ def test_a_nested_call_after_the_deadline_never_runs(here: Container, there: Con
     assert motor.moves == 0
 
 
+@pytest.mark.slow
 def test_a_nested_stop_after_the_deadline_is_sent_and_answered(here: Container, there: Container, inner: Any) -> None:
     motor, services = inner
     outer = Outer()
@@ -161,6 +166,7 @@ def test_a_stop_knows_no_deadline(offer: Any) -> None:
     assert offer(Motor())("stop").with_(deadline_s=5)() is None
 
 
+@pytest.mark.slow
 def test_S01_a_call_that_arrives_late_never_runs(start_program: Any, here: Container, tmp_path: Path) -> None:
     log = tmp_path / "log"
     program = start_program(COUNTING, str(log))
@@ -178,6 +184,7 @@ def test_S01_a_call_that_arrives_late_never_runs(start_program: Any, here: Conta
     assert log.read_text().splitlines() == ["moved", "moved"]
 
 
+@pytest.mark.slow
 def test_S01_a_first_call_to_a_frozen_container_never_runs(start_program: Any, here: Container, tmp_path: Path) -> None:
     log = tmp_path / "log"
     program = start_program(COUNTING, str(log))
@@ -194,6 +201,7 @@ def test_S01_a_first_call_to_a_frozen_container_never_runs(start_program: Any, h
     assert log.read_text().splitlines() == ["moved"]
 
 
+@pytest.mark.slow
 def test_a_stop_sent_to_a_frozen_container_runs_when_it_wakes(
     start_program: Any, here: Container, tmp_path: Path, eventually: Any
 ) -> None:
@@ -264,9 +272,9 @@ def test_calls_end_at_their_deadlines_although_others_begin_while_they_are_looke
     gc.callbacks.append(interrupt)
     gc.set_threshold(1)
     try:
-        caller._end_overdue(1)
+        caller._end_overdue()
     finally:
         gc.set_threshold(*before)
         gc.callbacks.remove(interrupt)
-        caller._end_overdue(1)
+        caller._end_overdue()
     assert {*range(5000)} <= {*ended}

@@ -14,6 +14,8 @@ from trade._protocol.keys import estop_key
 from trade._protocol.messages import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Stopped, TradeError
 
+pytestmark = pytest.mark.slow
+
 Eventually = Callable[[Callable[[], bool]], bool]
 PATIENCE_S = 30.0
 

@@ -153,6 +153,7 @@ def test_an_error_that_cannot_be_sent_whole_still_arrives(
     assert here.find(where(name="clock", container="there"))() > 0  # and the thread that ran it continues
 
 
+@pytest.mark.slow
 def test_a_service_that_raises_system_exit_does_not_use_up_threads(here: Container, there: Container) -> None:
     there.register(Raiser(SystemExit(1)), "robot")
     go = here.find(where(name="go"), wait_s=20)
@@ -169,6 +170,7 @@ def test_a_deadline_that_passed_inside_a_service_is_not_reported_as_its_own(here
     assert error.service == "inner"
 
 
+@pytest.mark.slow
 def test_an_error_of_a_type_the_caller_does_not_know_says_what_it_was(start_program: Any, here: Container) -> None:
     program = start_program(
         """

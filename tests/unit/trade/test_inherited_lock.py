@@ -45,6 +45,7 @@ def lamp(there: Container) -> Container:
     return there
 
 
+@pytest.mark.slow
 def test_a_child_calls_under_the_lock_of_its_parent_until_it_is_given_back(
     lamp: Container, here: Container, start_program: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,6 +66,7 @@ def test_a_child_calls_under_the_lock_of_its_parent_until_it_is_given_back(
         assert program.ends() == 0
 
 
+@pytest.mark.slow
 def test_S08_a_child_resumes_as_the_owner_of_the_lock_does(
     there: Container, here: Container, start_container: Callable[..., Container], eventually: Eventually
 ) -> None:

@@ -113,6 +113,7 @@ def test_renewals_continue_after_one_to_a_container_that_left(robot: Robot, monk
     kept.release()
 
 
+@pytest.mark.slow
 def test_a_renewal_that_was_under_way_says_nothing_of_what_was_taken_since(robot: Robot) -> None:
     """It asks for the number of a part that was given back, and taken again under another one."""
     keeper, lock = robot.me.locking.lease_client, robot.me.lock([robot.find("a")], lease_s=60).acquire()
@@ -131,6 +132,7 @@ class _Answered:
         return self._live
 
 
+@pytest.mark.slow
 def test_a_part_lost_while_waiting_for_the_rest_makes_no_lock(robot: Robot) -> None:
     taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
     lock, outcome = robot.me.lock(WHOLE, wait_s=30, lease_s=60), list[BaseException]()
@@ -153,6 +155,7 @@ def test_a_part_lost_while_waiting_for_the_rest_makes_no_lock(robot: Robot) -> N
     wait_until(lambda: robot.other.locks() == [])
 
 
+@pytest.mark.slow
 def test_S14_a_device_that_could_not_be_stopped_cannot_be_locked_until_resume(robot: Robot) -> None:
     robot["a"].stop_fails = True
     lock = robot.me.lock(WHOLE, lease_s=4).acquire()
@@ -176,9 +179,12 @@ def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot
         robot.find("a", "stop", robot.other)()
         with pytest.raises(Stopped):
             robot.find("a")(0.2)
+        [stop] = robot.other.call(where(name="stops", container=robot.find("a").container))
+        assert (stop.resource, stop.by, stop.estop) == ("a", "tester", False)
         with pytest.raises(LockedByOther):
             robot.other.resume(WHOLE)
         assert robot.me.resume(WHOLE) == ["a"]
+        assert robot.other.call(where(name="stops", container=robot.find("a").container)) == []
         assert robot.find("a")(0.3) == 0.3
 
 

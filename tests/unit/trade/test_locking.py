@@ -264,6 +264,7 @@ def test_request_release_reaches_the_owner(robot: Robot) -> None:
     assert robot.other.request_release(WHOLE, "again") == []
 
 
+@pytest.mark.slow
 def test_P52_of_two_waiting_clients_the_one_with_the_higher_priority_comes_first(robot: Robot) -> None:
     turns = list[str]()
 
@@ -372,6 +373,7 @@ def walker(robot: Robot) -> Callable[[str], Handle]:
     return lambda name: robot.me.find(where(name=name, group="walker"), wait_s=20).with_(deadline_s=1.5)
 
 
+@pytest.mark.slow
 def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
@@ -382,6 +384,7 @@ def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     assert robot.me.locks() == []
 
 
+@pytest.mark.slow
 def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) -> None:
     """As containers in other languages do, whose wait may be the deadline of the call."""
     acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
@@ -389,6 +392,7 @@ def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) 
         robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], LockRequest(wait_s=1.5))
 
 
+@pytest.mark.slow
 def test_a_service_that_waits_in_vain_fails_before_the_deadline_of_its_call(
     walker: Callable[[str], Handle],
 ) -> None:
@@ -413,12 +417,14 @@ def test_a_single_handle_is_refused_with_what_to_write_instead(robot: Robot) -> 
         robot.me.lock(handle).acquire()
 
 
+@pytest.mark.slow
 def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
     for nothing in ([], where(group="robot", name="where_is_it")):
         with pytest.raises(ConfigurationError):
             robot.me.lock(nothing).acquire()
 
 
+@pytest.mark.slow
 def test_S16_a_lock_of_an_unknown_group_suggests_a_known_group(robot: Robot) -> None:
     with pytest.raises(NoSuchService, match="Did you mean robot") as refused:
         robot.me.lock(where(group="robt"), wait_s=0).acquire()
@@ -426,6 +432,7 @@ def test_S16_a_lock_of_an_unknown_group_suggests_a_known_group(robot: Robot) -> 
     assert not isinstance(refused.value, ConfigurationError)
 
 
+@pytest.mark.slow
 def test_S16_a_lock_waits_until_its_group_is_complete(robot: Robot) -> None:
     head = robot.system.container("head")
     joints = [Joint(name) for name in ("pan", "tilt")]
@@ -446,6 +453,7 @@ def test_S16_a_lock_waits_until_its_group_is_complete(robot: Robot) -> None:
         lock.release()
 
 
+@pytest.mark.slow
 def test_S16_a_lock_of_an_incomplete_group_names_the_missing_member_at_its_timeout(robot: Robot) -> None:
     joint, head = Joint("pan"), robot.system.container("head")
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
@@ -459,6 +467,7 @@ def test_S16_a_lock_of_an_incomplete_group_names_the_missing_member_at_its_timeo
     assert robot.me.locks() == []
 
 
+@pytest.mark.slow
 def test_S16_a_lock_taken_while_its_driver_leaves_waits_for_the_next_one(robot: Robot) -> None:
     def joints() -> list[Joint]:
         pair = [Joint(name) for name in ("pan", "tilt")]
@@ -485,6 +494,7 @@ def test_S16_a_lock_taken_while_its_driver_leaves_waits_for_the_next_one(robot: 
     lock.release()
 
 
+@pytest.mark.slow
 def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) -> None:
     joint = Joint("pan")
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
@@ -496,6 +506,7 @@ def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) 
         assert lock.resources == ("pan",)
 
 
+@pytest.mark.slow
 def test_S17_reading_stays_open_unless_it_is_locked_by_its_handle(robot: Robot) -> None:
     read, mine = robot.find("a", "where_is_it", robot.other), robot.find("a", "where_is_it")
     with robot.me.lock(WHOLE):
@@ -506,6 +517,7 @@ def test_S17_reading_stays_open_unless_it_is_locked_by_its_handle(robot: Robot) 
             read()
 
 
+@pytest.mark.slow
 def test_each_client_may_stop(robot: Robot) -> None:
     with pytest.raises(ConfigurationError, match="cannot be locked"):
         robot.me.lock([robot.find("a", "stop")]).acquire()

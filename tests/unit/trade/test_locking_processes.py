@@ -11,6 +11,8 @@ from tests.support.waiting import wait_until
 from trade import Container, Resource, permit, service, where
 from trade.errors import LockLost
 
+pytestmark = pytest.mark.slow
+
 
 class Joint:
     def __init__(self, name: str) -> None:

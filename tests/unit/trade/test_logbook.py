@@ -24,6 +24,7 @@ def _record(text: str, *args: object, **options: Any) -> logging.LogRecord:
     return logging.LogRecord("trade", logging.WARNING, __file__, 1, text, args, options.get("exc_info"))
 
 
+@pytest.mark.slow
 def test_lines_of_other_processes_are_gathered(here: Container, start_program: Callable[..., Any]) -> None:
     babbler = start_program(BABBLES)
     here.find(where(name="log_lines", container="babbler"), wait_s=20)

@@ -39,6 +39,7 @@ def driver(start_program: Any) -> Any:
     return program
 
 
+@pytest.mark.slow
 def test_a_call_in_flight_ends_when_its_callee_is_killed(here: Container, driver: Any) -> None:
     hang = found(here, "hang").with_(deadline_s=3600)
     runs = [hang.start() for _ in range(3)]
@@ -49,6 +50,7 @@ def test_a_call_in_flight_ends_when_its_callee_is_killed(here: Container, driver
             run.result()
 
 
+@pytest.mark.slow
 def test_a_blocked_caller_is_freed_when_its_callee_is_killed(here: Container, driver: Any, eventually: Any) -> None:
     import threading
 
@@ -65,6 +67,7 @@ def test_a_blocked_caller_is_freed_when_its_callee_is_killed(here: Container, dr
     killer.join()
 
 
+@pytest.mark.slow
 def test_an_asyncio_caller_is_freed_when_its_callee_is_killed(here: Container, driver: Any) -> None:
     hang = found(here, "hang").with_(deadline_s=3600)
 
@@ -78,6 +81,7 @@ def test_an_asyncio_caller_is_freed_when_its_callee_is_killed(here: Container, d
         asyncio.run(lose_it())
 
 
+@pytest.mark.slow
 def test_after_its_container_was_killed_a_service_is_gone(here: Container, driver: Any) -> None:
     hang = found(here, "hang")
     run = hang.start()
@@ -90,6 +94,7 @@ def test_after_its_container_was_killed_a_service_is_gone(here: Container, drive
         hang.start().result()
 
 
+@pytest.mark.slow
 def test_a_restarted_callee_is_found_again_without_restarting_the_caller(
     here: Container, driver: Any, start_program: Any
 ) -> None:
@@ -106,6 +111,7 @@ def test_a_restarted_callee_is_found_again_without_restarting_the_caller(
         first()
 
 
+@pytest.mark.slow
 def test_a_frozen_callee_is_lost_after_its_lease_and_back_when_it_wakes(here: Container, driver: Any) -> None:
     pid = found(here, "pid")
     run = found(here, "hang").with_(deadline_s=3600).start()
@@ -121,6 +127,7 @@ def test_a_frozen_callee_is_lost_after_its_lease_and_back_when_it_wakes(here: Co
     assert found(here, "pid") == pid
 
 
+@pytest.mark.slow
 def test_what_is_known_of_a_clock_is_void_once_its_container_was_out_of_sight(here: Container, driver: Any) -> None:
     """A computer that sleeps stops its clock: an expiry reckoned by the old offset would be too late."""
     hang = found(here, "hang")
@@ -136,6 +143,7 @@ def test_what_is_known_of_a_clock_is_void_once_its_container_was_out_of_sight(he
     assert caller.peer(address).clock_known
 
 
+@pytest.mark.slow
 def test_the_death_of_one_container_leaves_calls_to_others_alone(
     here: Container, there: Container, driver: Any, gate: Any
 ) -> None:
@@ -162,6 +170,7 @@ def test_a_container_that_closes_ends_the_calls_it_runs(here: Container, there: 
     closing.join()
 
 
+@pytest.mark.slow
 def test_a_callee_does_not_notice_that_its_caller_died(here: Container, start_program: Any, gate: Any) -> None:
     here.register(gate, "robot")
 

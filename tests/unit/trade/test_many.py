@@ -50,6 +50,7 @@ def test_a_constraint_is_called_like_the_one_service_it_means(here: Container, o
     assert here.call(where(name="set_level"), level=6) == 6
 
 
+@pytest.mark.slow
 def test_a_constraint_that_means_none_or_several_is_not_called(here: Container) -> None:
     lamps = [Lamp(), Lamp()]
     for lamp in lamps:

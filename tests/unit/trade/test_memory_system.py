@@ -79,13 +79,14 @@ def test_over_slow_links_started_calls_can_be_driven_to_their_end() -> None:
         assert system.clock.monotonic_ns() == 4 * 3600 * 10**9
 
 
+@pytest.mark.slow
 def test_the_page_on_testing_does_what_it_says() -> None:
     page = Path(__file__).parents[3] / "docs" / "testing.md"
     known: dict[str, Any] = {"pytest": pytest, "errors": errors}
     for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         exec(program, known)
     tests = [value for name, value in known.items() if name.startswith("test_")]
-    assert len(tests) == 6
+    assert len(tests) == 9
     for test in tests:
         test()
 
@@ -261,6 +262,7 @@ def losing(*payloads_of: str) -> Callable[[InFlightMessage], bool]:
 def test_a_lost_announcement_is_known_with_the_next_one() -> None:
     with memory_system() as system:
         a, b = system.container("a"), system.container("b")
+        system.settle()
         end = system.lose(losing("Lamp"))
         b.register(Lamp(), "lost")
         end()
@@ -326,6 +328,7 @@ def held(container: Container) -> Iterator[None]:
         unlocked.set()
 
 
+@pytest.mark.slow
 def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_often(
     monkeypatch: pytest.MonkeyPatch, eventually: Eventually
 ) -> None:
@@ -347,6 +350,7 @@ def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_of
         ghost.close()
 
 
+@pytest.mark.slow
 def test_a_container_that_asks_in_vain_still_receives_signs_of_life(lamp: Lamp, eventually: Eventually) -> None:
     with memory_system() as system:
         a = system.container("a")

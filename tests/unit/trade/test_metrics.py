@@ -47,6 +47,7 @@ def there(start_container: Start) -> Container:
     return container
 
 
+@pytest.mark.slow
 def test_strangers_take_a_bounded_number_of_descriptors_and_threads(there: Container) -> None:
     before, strangers = threading.active_count(), list[socket.socket]()
     try:
@@ -118,6 +119,7 @@ def test_refusals_are_counted_by_reason(here: Container, there: Container, tmp_p
     assert found["trade_refusals_total", "AccessDenied"] == 2
 
 
+@pytest.mark.slow
 def test_locks_and_e_stops_are_as_they_are_now(here: Container, there: Container) -> None:
     here.find(where(name="reach"), wait_s=20)
     with here.lock(where(group="rosie.arm")):
@@ -153,6 +155,7 @@ def test_the_record_says_how_far_it_is(here: Container, start_container: Start, 
     assert found["trade_call_seconds_count", "rosie.arm.reach"] == 1
 
 
+@pytest.mark.slow
 def test_the_port_is_free_again_when_the_containeris_closed(there: Container, start_container: Start) -> None:
     place = f"127.0.0.1:{there.metrics_port}"
     with pytest.raises(ConfigurationError, match="a port of its own"):
@@ -174,6 +177,7 @@ def test_when_off_nothing_is_counted_and_no_service_is_wrapped(here: Container, 
     assert there.metrics_port == 0
 
 
+@pytest.mark.slow
 def test_the_core_loads_the_library_only_if_it_is_wanted() -> None:
     program = "import sys, trade; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0

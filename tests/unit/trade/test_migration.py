@@ -172,6 +172,7 @@ def test_a_provider_moves_to_the_least_busy_of_several_matching_containers(
     assert count.container == "new-2"
 
 
+@pytest.mark.slow
 def test_a_container_that_does_not_report_its_load_comes_last(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_departing, "_ASK_S", 0.2)
     for name in ("new-1", "new-2", "new-3"):

@@ -73,6 +73,7 @@ def test_what_was_offered_there_has_moved_though_the_answer_was_lost(scene: Scen
     assert moved.container == "new"
 
 
+@pytest.mark.slow
 def test_a_provider_stays_withdrawn_after_lost_contact_until_a_user_decides(scene: Scene) -> None:
     count, _ = scene.counter()
     in_between(scene, lambda: cut_calls(scene, source="old"))
@@ -86,6 +87,7 @@ def test_a_provider_stays_withdrawn_after_lost_contact_until_a_user_decides(scen
     assert scene.asker.call(where(name="count")) == 4
 
 
+@pytest.mark.slow
 def test_a_death_before_the_offer_leaves_the_decision_to_a_user(scene: Scene) -> None:
     count, _ = scene.counter()
     in_between(scene, lambda: scene.memory.kill("new"))
@@ -131,6 +133,7 @@ def test_what_its_owner_registers_again_serves_again(scene: Scene) -> None:
     assert again() == 1
 
 
+@pytest.mark.slow
 def test_calls_while_it_moves_back_and_forth_are_each_counted_once(scene: Scene) -> None:
     """By the object's own count: what was answered is in the state that moves on."""
     scene.counter()

@@ -88,6 +88,7 @@ def test_a_stop_that_holds_is_not_forgotten_by_moving(scene: Scene) -> None:
     assert scene.asker.migrate(services["turn"], to="new")
 
 
+@pytest.mark.slow
 def test_nothing_migrates_during_an_e_stop(scene: Scene) -> None:
     count, _ = scene.counter()
     scene.asker.estop("smoke")

@@ -9,6 +9,8 @@ import pytest
 from tests.support.waiting import wait_until
 from trade import Container, NotificationInfo, service
 
+pytestmark = pytest.mark.slow
+
 POLICY = """
 [roles.keeper]
 register = ["rosie"]

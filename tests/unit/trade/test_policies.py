@@ -189,6 +189,7 @@ def naive(roles: Sequence[Role], identities: Mapping[str, Sequence[str]], who: s
     )
 
 
+@pytest.mark.slow
 @given(policies(), NAMES, st.sampled_from(VERBS), GROUPS)
 def test_decisions_are_those_of_reading_every_rule(
     made: tuple[list[Role], dict[str, list[str]], list[str]], who: str, verb: str, group: str

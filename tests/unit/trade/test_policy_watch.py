@@ -12,6 +12,8 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["memory", "policy"]
 
 

@@ -45,6 +45,7 @@ def dial() -> Iterator[Callable[[int], bool]]:
         sock.close()
 
 
+@pytest.mark.slow
 def test_connections_beyond_the_limit_are_dropped_until_others_have_gone(
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -87,6 +88,7 @@ def test_a_guard_that_is_closed_lets_all_in(door: socket.socket, dial: Callable[
     assert dial(port)
 
 
+@pytest.mark.slow
 def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
     system: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

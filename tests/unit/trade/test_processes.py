@@ -175,11 +175,13 @@ def test_a_look_up_alone_makes_a_program_part_of_the_system(start_program: Any, 
     assert program.errors() == ""
 
 
+@pytest.mark.slow
 def test_two_programs_have_containers_of_different_names(start_program: Any) -> None:
     programs = [start_program("say(trade.container().name); hear()") for _ in range(2)]
     assert len({program.heard() for program in programs}) == 2
 
 
+@pytest.mark.slow
 def test_importing_starts_nothing(start_program: Any) -> None:
     program = start_program("import threading; say(threading.active_count(), trade._container.default._default)")
     assert program.heard() == "1 None"
@@ -218,17 +220,20 @@ for _ in range(4):
 """
 
 
+@pytest.mark.slow
 def test_a_process_ends_cleanly_under_live_containers_and_blocked_calls(start_program: Any) -> None:
     program = start_program(BUSY + "\nsay('ending')")
     assert program.heard() == "ending"
     assert (program.ends(), program.errors()) == (0, "")
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_ends_with_its_own_error(start_program: Any) -> None:
     program = start_program(BUSY + "\nraise SystemExit(7)")
     assert (program.ends(), program.errors()) == (7, "")
 
 
+@pytest.mark.slow
 def test_a_process_may_end_while_another_thread_closes_its_containers(start_program: Any) -> None:
     program = start_program(
         """
@@ -242,6 +247,7 @@ def test_a_process_may_end_while_another_thread_closes_its_containers(start_prog
     assert (program.ends(), program.errors()) == (0, "")
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_a_blocked_call_at_once_and_the_next_call_works(
     start_program: Any, here: Container, gate: Any
 ) -> None:
@@ -268,6 +274,7 @@ def test_an_interrupt_ends_a_blocked_call_at_once_and_the_next_call_works(
     assert program.ends() == 0
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_waiting_for_a_started_call_and_for_a_service(
     start_program: Any, here: Container, gate: Any
 ) -> None:
@@ -335,6 +342,7 @@ if sys.argv[1] == "open":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["os._exit(0)", "sys.exit(0)"])
 @pytest.mark.parametrize("state", ["open", "closed"])
 def test_a_forked_child_refuses_every_use_and_leaves_the_parent_alone(
@@ -351,6 +359,7 @@ def test_a_forked_child_refuses_every_use_and_leaves_the_parent_alone(
     assert program.ends() == 0
 
 
+@pytest.mark.slow
 def test_a_child_forked_before_the_first_container_may_have_one(start_program: Any, unwatched: str) -> None:
     program = start_program(
         """
@@ -367,6 +376,7 @@ def test_a_child_forked_before_the_first_container_may_have_one(start_program: A
     assert [program.heard(), program.heard()] == ["1", "child 0"]
 
 
+@pytest.mark.slow
 def test_a_spawned_child_is_a_program_like_any_other(here: Container) -> None:
     here.register(Lamp(), "hall")
     source = "import trade; print(trade.find(trade.where(name='brightness'), wait_s=30)())"

@@ -195,6 +195,7 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
         assert {info.name for info in second.containers()} == {"here", "second"}
 
 
+@pytest.mark.slow
 def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
     from trade._transport.endpoints import free_endpoint
 

@@ -37,6 +37,7 @@ def test_a_container_that_broadcasts_is_found_by_one_that_discovers(apart: tuple
     assert clock_of(one, "b")() > 0
 
 
+@pytest.mark.slow
 def test_the_order_of_the_switches_does_not_matter(apart: tuple[Container, Container]) -> None:
     one, other = apart
     other.system.set_discovery(True)
@@ -44,6 +45,7 @@ def test_the_order_of_the_switches_does_not_matter(apart: tuple[Container, Conta
     assert clock_of(other, "a")() > 0
 
 
+@pytest.mark.slow
 def test_the_link_outlives_both_switches(apart: tuple[Container, Container]) -> None:
     one, other = apart
     one.system.set_broadcast(True)
@@ -55,6 +57,7 @@ def test_the_link_outlives_both_switches(apart: tuple[Container, Container]) -> 
     assert clock.alive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", ["set_broadcast", "set_discovery"])
 def test_one_switch_alone_links_no_container(apart: tuple[Container, Container], switch: str) -> None:
     for container in apart:
@@ -63,6 +66,7 @@ def test_one_switch_alone_links_no_container(apart: tuple[Container, Container],
         clock_of(apart[0], "b", wait_s=1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", ["set_broadcast", "set_discovery"])
 def test_what_is_switched_off_again_is_off(apart: tuple[Container, Container], switch: str) -> None:
     one, other = apart
@@ -74,6 +78,7 @@ def test_what_is_switched_off_again_is_off(apart: tuple[Container, Container], s
         clock_of(other, "a", wait_s=4.0)
 
 
+@pytest.mark.slow
 def test_switching_twice_is_switching_once(apart: tuple[Container, Container]) -> None:
     for container in apart:
         for on in (True, True, False, False):
@@ -81,6 +86,7 @@ def test_switching_twice_is_switching_once(apart: tuple[Container, Container]) -
             container.system.set_discovery(on)
 
 
+@pytest.mark.slow
 def test_containers_of_other_systems_are_not_linked(start_container: Any) -> None:
     from trade._transport.zenoh import ZenohTransport
 
@@ -103,12 +109,14 @@ def test_a_container_is_connected_while_it_runs(apart: tuple[Container, Containe
     assert clock_of(other, "a")() > 0
 
 
+@pytest.mark.slow
 def test_an_endpoint_may_be_a_name(apart: tuple[Container, Container]) -> None:
     one, other = apart
     one.system.connect(f"tcp/localhost:{Endpoint.read(other.settings.listen[0]).port}")
     assert clock_of(one, "b")() > 0
 
 
+@pytest.mark.slow
 def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -> None:
     empty = free_endpoint()
     with pytest.raises(CannotConnect, match=r"nothing accepts connections there\. Is it up") as raised:
@@ -117,6 +125,7 @@ def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -
     assert isinstance(raised.value, ConnectionError)
 
 
+@pytest.mark.slow
 def test_connecting_to_something_else_says_that_it_does_not_let_us_in(here: Container) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as other,
@@ -136,6 +145,7 @@ def test_S21_a_network_is_not_reached_by_connecting_at_run_time(here: Container)
         here.system.connect("tcp/192.168.1.5:7450")
 
 
+@pytest.mark.slow
 def test_what_was_connected_is_linked_again_after_its_restart(start_container: Any, here: Container) -> None:
     endpoint = free_endpoint()
     settings = {"listen": [endpoint], "connect": [endpoint]}
@@ -148,6 +158,7 @@ def test_what_was_connected_is_linked_again_after_its_restart(start_container: A
     assert clock_of(here, "there").key.address == again.address
 
 
+@pytest.mark.slow
 def test_disconnecting_says_that_an_open_link_stays(apart: tuple[Container, Container]) -> None:
     one, other = apart
     endpoint = other.settings.listen[0]
@@ -160,6 +171,7 @@ def test_disconnecting_says_that_an_open_link_stays(apart: tuple[Container, Cont
     assert clock() > 0
 
 
+@pytest.mark.slow
 def test_what_was_disconnected_is_dialled_no_more(start_container: Any, here: Container, eventually: Any) -> None:
     endpoint = free_endpoint()
     settings = {"listen": [endpoint], "connect": [endpoint]}
@@ -216,6 +228,7 @@ def test_a_closed_container_has_no_switches(here: Container) -> None:
         here.system.set_discovery(True)
 
 
+@pytest.mark.slow
 def test_toggling_discovery_and_broadcast_a_hundred_times_loses_no_call(
     start_program: Any, here: Container, tmp_path: Path
 ) -> None:

@@ -108,6 +108,7 @@ def ask(start_program: Any, here: Container) -> Callable[..., Any]:
     return lambda name, *args: here.find(where(name=name, group="robot"), wait_s=20)(*args)
 
 
+@pytest.mark.slow
 def test_results_of_unknown_types_are_records(ask: Callable[..., Any]) -> None:
     snapshot = ask("snapshot")
     assert (snapshot.pose.x_m, snapshot.pose.y_m) == (1.5, 0.25)
@@ -203,6 +204,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_what_a_program_defines_is_known_by_the_name_it_is_imported_by(
     tmp_path: Path, system: str, here: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ def clocks(looking: Container, name: str, count: int) -> list[Handle]:
     return looking.services(wanted)
 
 
+@pytest.mark.slow
 def test_the_registry_shows_both_containers_of_one_name(twins: tuple[Container, Container], here: Container) -> None:
     handles = clocks(here, "twin", 2)
     assert {handle.key.address for handle in handles} == {twin.address for twin in twins}
@@ -53,6 +54,8 @@ def test_when_one_of_two_of_a_name_ends_the_other_stays(twins: tuple[Container, 
     assert handles[other.address]() > 0
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_local_path")
 def test_answers_to_two_callers_of_one_name_do_not_cross(
     twins: tuple[Container, Container], here: Container, open_raw: Any
 ) -> None:
@@ -98,6 +101,7 @@ def test_an_address_of_another_host_is_reported_by_name(start_container: Any, sy
         start_container("far", listen=["tcp/127.0.0.1:0", "tcp/192.0.2.77:7450"], **lan)
 
 
+@pytest.mark.slow
 def test_a_name_is_resolved_when_it_is_dialled(start_container: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     endpoint = free_endpoint()
     server = start_container("server", listen=[endpoint], connect=[endpoint])

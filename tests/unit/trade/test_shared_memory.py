@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import pytest
+
 from trade import Container, where
 
 OFFERS = """
@@ -24,6 +26,8 @@ OFFERS = """
 """
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_local_path")
 def test_announcing_many_services_takes_no_pool_and_a_large_result_does(here: Container, start_program: Any) -> None:
     program = start_program(OFFERS)
     handle = here.find(where(name="picture", group="house.room39"), wait_s=30)

@@ -82,6 +82,10 @@ class Brain:
         return which(value)
 
     @service(effect="read")
+    def picture(self, size: int) -> bytes:
+        return bytes(size)
+
+    @service(effect="read")
     def itself(self) -> Handle:
         return self.home
 
@@ -166,6 +170,10 @@ def test_calls_give_results_and_errors_of_their_own_types(two: Two) -> None:
         two.find("middle")(Point(0, 0), 3)
 
 
+def test_large_results_cross(two: Two) -> None:
+    assert len(two.anna.find(where(name="picture"))(300_000)) == 300_000
+
+
 def test_deadline_lineage_and_who_it_is_for_go_along(two: Two) -> None:
     with two.anna.open_session("page"):
         two.find("who").with_(deadline_s=5)(note="x")
@@ -185,6 +193,7 @@ def test_progress_comes_back_and_cancelling_goes_there(two: Two) -> None:
     assert two.brain.cancelled.is_set()
 
 
+@pytest.mark.slow
 def test_handles_of_what_is_shared_are_translated_and_others_do_not_cross(two: Two) -> None:
     move, middle = two.find("move"), two.find("middle")
     assert two.find("apply")(move, 0.5) == 0.5
@@ -263,6 +272,7 @@ def test_S03_a_client_that_was_gone_when_its_call_came_moves_nothing(two: Two) -
     assert not two.joint.resource.moving
 
 
+@pytest.mark.slow
 def test_S03_a_killed_federation_gateway_leaves_no_motion(two: Two) -> None:
     two.find("go_on")(1.0)
     two.lab.kill(two.ours)
@@ -337,6 +347,7 @@ def test_an_owner_at_home_keeps_the_lock_and_is_asked_to_release_it(two: Two) ->
     assert asked[1:] == [("planner/planner", "mine")]
 
 
+@pytest.mark.slow
 def test_a_client_waiting_in_another_system_gets_the_lock_when_it_is_released_at_home(two: Two) -> None:
     with two.planner.lock(where(group="rosie.head")) as held:
         lock = two.anna.lock(where(group="rosie.head"), wait_s=30)
@@ -350,6 +361,7 @@ def test_a_client_waiting_in_another_system_gets_the_lock_when_it_is_released_at
     lock.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["broken at home", "broken there", "owner dies", "border dies"])
 def test_a_lock_that_is_lost_on_one_side_is_lost_on_both_and_what_it_moves_stops(two: Two, how: str) -> None:
     lost = threading.Event()
@@ -416,6 +428,7 @@ def test_S09_one_that_is_open_when_the_border_opens_crosses_too(two: Two) -> Non
 # --- both ways
 
 
+@pytest.mark.slow
 def test_what_is_shared_is_not_shared_back_nor_further(two: Two) -> None:
     two.anna.register(Brain(), "clinic.map")
     two.settle()

@@ -12,6 +12,8 @@ import zenoh
 from trade import Container, where
 from trade._transport.credentials import user_secret
 
+pytestmark = pytest.mark.slow
+
 WARM_UP, PASSERS, TIMES = 20, 20, 5
 MOST_BYTES = 2500
 """Of each; the transport keeps 5 KiB or more of a link that it does not let go of."""

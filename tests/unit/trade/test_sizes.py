@@ -29,6 +29,7 @@ def test_sixteen_mebibytes_pass_both_ways(offer: Any) -> None:
     assert offer(Store())("echo").with_(deadline_s=60)(data) == data
 
 
+@pytest.mark.slow
 def test_arguments_beyond_the_limit_are_refused_and_not_a_byte_is_sent(offer: Any) -> None:
     store = Store()
     echo = offer(store)("echo")
@@ -42,6 +43,7 @@ def test_arguments_beyond_the_limit_are_refused_and_not_a_byte_is_sent(offer: An
     assert store.calls == 0
 
 
+@pytest.mark.slow
 def test_a_result_beyond_the_limit_is_an_error_of_the_call(here: Container, there: Container) -> None:
     there.register(Store(), "robot")
     make = here.find(where(name="make"), wait_s=20)

@@ -116,6 +116,7 @@ def test_no_stop_is_refused_for_the_length_of_its_reason(driver: Container, lamp
     assert driver.estop_clear(["1234abcd"]).complete
 
 
+@pytest.mark.slow
 def test_what_is_asked_of_many_is_one_estop(driver: Container, start_container: StartContainer, lamp: Lamp) -> None:
     others = [start_container(f"arm{number}") for number in range(6)]
     for other in others:
@@ -271,6 +272,7 @@ def strangers() -> Iterator[list[socket.socket]]:
         one.close()
 
 
+@pytest.mark.slow
 def test_silent_strangers_shut_no_client_out_and_are_dropped(
     driver: Container, lamp: Lamp, strangers: list[socket.socket]
 ) -> None:
@@ -316,6 +318,7 @@ def test_requests_of_one_identity_are_bounded_and_others_are_heard(start_contain
     wait_until(lambda: "error" not in asked(container, b'{"v":1,"ask":"open","by":"anna/panel"}\n')[0])
 
 
+@pytest.mark.slow
 def test_a_stranger_has_a_second(driver: Container) -> None:
     with dial(driver) as sock:
         sock.sendall(b'{"v":1,')

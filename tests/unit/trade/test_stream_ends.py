@@ -137,6 +137,7 @@ def test_streams_end_with_their_container(start_container: Any) -> None:
             stream.next(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_a_listener_whose_container_ends_is_forgotten(start_container: Any, eventually: Any) -> None:
     here, there, battery = start_container("here"), start_container("there"), Battery()
     there.register(battery, "rosie")
@@ -275,6 +276,7 @@ def test_a_source_refuses_a_listener_that_bypasses_the_policy(start_container: A
         start_container("here").stream(where(name="count", group="rosie"))
 
 
+@pytest.mark.slow
 def test_a_listener_that_loses_the_right_gets_no_more_samples(start_container: Any, tmp_path: Any) -> None:
     there = start_container("there", policy=policy_file(tmp_path, 'read = ["rosie"]'))
     there.register(Battery(), "rosie")
@@ -303,6 +305,7 @@ hear()
 """
 
 
+@pytest.mark.slow
 def test_a_source_that_is_killed_is_lost(start_container: Any, start_program: Any) -> None:
     program = start_program(SOURCE)
     assert program.heard() == "up"

@@ -76,6 +76,7 @@ def test_containers_with_certificates_find_each_other_and_prove_who_they_are(
     assert (links(arm), links(planner)) == ([("tls", "planner")], [("tls", "arm")])
 
 
+@pytest.mark.slow
 def test_containers_that_hear_of_each_other_link_to_each_other(start_container: Any, papers: Papers) -> None:
     """The one in the middle is the only one that the others know."""
     middle = tls_endpoint()
@@ -86,6 +87,7 @@ def test_containers_that_hear_of_each_other_link_to_each_other(start_container: 
     wait_until(lambda: links(other) == [("tls", "middle"), ("tls", "one")], "the two are linked")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["127.0.0.1", "localhost"])
 def test_a_container_connects_by_certificate_while_it_runs(start_container: Any, papers: Papers, by: str) -> None:
     endpoint = tls_endpoint()
@@ -97,6 +99,7 @@ def test_a_container_connects_by_certificate_while_it_runs(start_container: Any,
     assert links(planner) == [("tls", "arm")]
 
 
+@pytest.mark.slow
 def test_containers_with_certificates_discover_each_other(start_container: Any, papers: Papers) -> None:
     nowhere = [tls_endpoint()]
     one, other = (start_container(f"c-{name}", tls=papers.of(name), connect=nowhere) for name in ("one", "other"))
@@ -107,6 +110,7 @@ def test_containers_with_certificates_discover_each_other(start_container: Any, 
     wait_until(lambda: ("tls", "one") in links(other), "the two are linked")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])
 def test_a_container_with_a_certificate_of_another_authority_is_not_linked_and_sees_nothing(
     start_container: Any, papers: Papers, strangers: Papers, first: int
@@ -118,6 +122,7 @@ def test_a_container_with_a_certificate_of_another_authority_is_not_linked_and_s
     assert all(sees_no_other(container) for container in containers)
 
 
+@pytest.mark.slow
 def test_an_endpoint_that_refuses_a_certificate_is_warned_of(
     start_container: Any, papers: Papers, strangers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -132,6 +137,7 @@ def test_an_endpoint_that_refuses_a_certificate_is_warned_of(
         outsider.system.connect(endpoint)
 
 
+@pytest.mark.slow
 def test_an_endpoint_that_takes_a_certificate_is_not_warned_of(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -144,6 +150,7 @@ def test_an_endpoint_that_takes_a_certificate_is_not_warned_of(
     assert caplog.text == ""
 
 
+@pytest.mark.slow
 def test_containers_of_other_systems_are_invisible_whatever_their_certificates(
     start_container: Any, papers: Papers
 ) -> None:
@@ -209,6 +216,7 @@ def is_linked(container: Container, name: str, expected: bool) -> None:
         assert links(container) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("honest", [True, False], ids=["the right key", "a wrong key"])
 def test_the_right_name_with_a_wrong_key_is_not_linked_if_it_opens_all_the_same(
     start_container: Any, open_bare: OpenBare, papers: Papers, strangers: Papers, tmp_path: Path, honest: bool
@@ -220,6 +228,7 @@ def test_the_right_name_with_a_wrong_key_is_not_linked_if_it_opens_all_the_same(
     is_linked(planner, "arm", honest)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("honest", [True, False], ids=["for the host", "for another host"])
 def test_a_container_at_an_address_outside_its_certificate_is_not_linked(
     start_container: Any, open_bare: OpenBare, papers: Papers, monkeypatch: pytest.MonkeyPatch, honest: bool
@@ -233,6 +242,7 @@ def test_a_container_at_an_address_outside_its_certificate_is_not_linked(
     is_linked(planner, "arm", honest)
 
 
+@pytest.mark.slow
 def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewed(
     start_container: Any, papers: Papers, gate: Any
 ) -> None:
@@ -263,6 +273,7 @@ def test_a_container_warns_at_start_of_a_certificate_that_ends_soon(
         assert ("the certificate of arm ends" in caplog.text) == reported
 
 
+@pytest.mark.slow
 def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -277,6 +288,7 @@ def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
     assert "start this container again before" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_end_of_a_certificate_is_reported_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -310,6 +322,7 @@ def test_a_folder_that_this_user_may_not_enter_is_named_with_its_owner(
     assert "trade pki issue" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_with_and_without_certificates_are_not_linked_and_it_says_so(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -320,6 +333,7 @@ def test_with_and_without_certificates_are_not_linked_and_it_says_so(
     assert sees_no_other(certified)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("of", "seen"), [("papers", True), ("strangers", False), ("", False)])
 def test_the_command_line_lists_nothing_without_a_certificate_of_the_authority(
     start_container: Any, request: pytest.FixtureRequest, papers: Papers, of: str, seen: bool
@@ -510,6 +524,7 @@ planner = ["viewer"]
 """
 
 
+@pytest.mark.slow
 def test_with_a_policy_a_container_gets_nothing_from_identities_outside_it(
     start_container: Any, papers: Papers, tmp_path: Path
 ) -> None:

@@ -218,6 +218,7 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
 
     there.register(Queue(), "q")
     here.find(where(name="follow"), wait_s=20)
+    here.find(where(name="set_tracing", group="trade", container="there"), wait_s=20)
     here.set_tracing(True)
     first = here.find(where(name="hold")).start()
     assert entered.wait(20)
@@ -245,6 +246,7 @@ def test_what_is_secret_is_in_no_trace(here: Container, there: Container, arm: A
 # --- the tree
 
 
+@pytest.mark.slow
 def test_the_tree_has_lock_nested_call_hook_event_and_log_line(
     here: Container, there: Container, arm: Arm, start_container: Any
 ) -> None:

@@ -181,6 +181,7 @@ _foreign = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.sampled_from(["type", "$ref", "anyOf", "$defs", "properties", "enum"]), _foreign), _foreign)
 def test_foreign_schemas_break_nothing(schema: dict[str, Any], more: Any) -> None:
     info = ServiceInfo(

@@ -30,6 +30,7 @@ def host(here: Container, open_raw: Any) -> Iterator[Announcer]:
     announcer.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("providers", "services"), [(10_000, 1), (1000, 10)])
 def test_ten_thousand_services_are_known_to_running_and_to_late_containers(
     here: Container, start_container: Any, host: Announcer, eventually: Any, providers: int, services: int
@@ -41,6 +42,7 @@ def test_ten_thousand_services_are_known_to_running_and_to_late_containers(
     assert eventually(lambda: len(late.services(where(group="panels"))) == 10_000)
 
 
+@pytest.mark.slow
 def test_a_late_container_knows_the_services_left_after_most_were_withdrawn(
     here: Container, start_container: Any, host: Announcer, eventually: Any
 ) -> None:
@@ -74,6 +76,7 @@ class Panel:
         return value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [False, True])
 def test_an_immediate_call_to_a_new_service_is_answered(
     here: Container, there: Container, start_container: Callable[[str], Container], eventually: Any, late: bool

@@ -76,6 +76,7 @@ _bytes = (
 _DECODERS = [decode_call, decode_reply, decode_provider]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
 @given(data=_bytes)
 def test_any_bytes_are_a_message_or_malformed(decode: Any, data: bytes) -> None:
@@ -247,6 +248,7 @@ GONE = {
 }
 
 
+@pytest.mark.slow
 def test_a_flood_of_nonsense_is_counted_while_calls_continue(
     here: Container, there: Container, open_raw: Any, eventually: Any
 ) -> None:
@@ -312,6 +314,7 @@ class Safe:
 DEEPER: Final = [b"\x91" * depth + b"\xc0" for depth in (100, *range(850, 1000))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["echo", "unlock"])
 def test_arguments_however_deep_are_refused_and_answered_also_where_one_is_secret(
     here: Container, echo: Echo, open_raw: Any, eventually: Any, name: str
@@ -380,6 +383,7 @@ def test_an_entry_under_a_pattern_never_makes_a_service(
     assert still_works(here, raw)
 
 
+@pytest.mark.slow
 def test_a_late_joiner_survives_malformed_entries_in_the_registry(
     here: Container, start_container: Any, open_raw: Any, echo: Echo
 ) -> None:
@@ -457,6 +461,7 @@ def test_an_answer_on_behalf_of_another_container_is_ignored(
     assert forged.key.address == FORGED  # that one was asked alone, then
 
 
+@pytest.mark.slow
 def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_no_other(
     here: Container,
     there: Container,

@@ -16,7 +16,7 @@ from trade_gateway.ros.ros1 import Ros1, _action_client
 
 TEST = "actionlib/action/Test"
 ENDLESS, ABORTS, HANGS = 0, -1, -2
-SUCCEEDED, PREEMPTED, ABORTED, RECALLED = 3, 2, 4, 8
+SUCCEEDED, PREEMPTED, ABORTED, REJECTED, RECALLED = 3, 2, 4, 5, 8
 
 
 def server(stand: Stand, name: str = "mover", job: str = "act") -> Peer:
@@ -37,6 +37,7 @@ def pursue(graph: Ros1, goal: int, heard: list[int] | None = None) -> Pursuit:
 # --- theirs
 
 
+@pytest.mark.slow
 def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
@@ -46,6 +47,7 @@ def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -
     assert heard == list(range(1, len(heard) + 1))
 
 
+@pytest.mark.slow
 def test_a_goal_is_canceled(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
@@ -56,23 +58,27 @@ def test_a_goal_is_canceled(graph: Ros1, stand: Stand) -> None:
     assert (outcome.how, outcome.text) == (Ended.CANCELED, "as you wish")
 
 
+@pytest.mark.slow
 def test_a_goal_that_the_server_aborts_says_so(graph: Ros1, stand: Stand) -> None:
     server(stand)
     assert pursue(graph, ABORTS).wait(PATIENCE_S) == Outcome(Ended.ABORTED, {"result": ABORTS}, "too far")
 
 
+@pytest.mark.slow
 def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
     server(stand, job="reject")
     with pytest.raises(RosRefused, match="/move: not now"):
         pursue(graph, 1).wait(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_an_action_without_a_server_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_action_client, "_THERE_S", 0.2)
     with pytest.raises(RosUnreachable, match="/move: no node serves this action"):
         pursue(graph, 1)
 
 
+@pytest.mark.slow
 def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_yet(graph: Ros1, stand: Stand) -> None:
     server(stand)
     goal = pursue(graph, ENDLESS)
@@ -82,6 +88,7 @@ def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
 
 
+@pytest.mark.slow
 def test_a_goal_whose_server_is_killed_fails_and_the_next_server_takes_goals(graph: Ros1, stand: Stand) -> None:
     heard: list[int] = []
     first = server(stand)
@@ -111,6 +118,7 @@ class Lossy:
         self.real.close()
 
 
+@pytest.mark.slow
 def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     peer = server(stand)
     goal = pursue(graph, ENDLESS)
@@ -121,6 +129,7 @@ def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypa
     peer.wait_for("preempted")
 
 
+@pytest.mark.slow
 def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
@@ -131,6 +140,7 @@ def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) ->
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
 
 
+@pytest.mark.slow
 def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
     graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +158,7 @@ def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
     peer.wait_for("preempted")
 
 
+@pytest.mark.slow
 def test_calls_in_progress_are_canceled_when_we_close(graph: Ros1, stand: Stand) -> None:
     peer = server(stand)
     heard: list[int] = []
@@ -205,6 +216,7 @@ def mover(graph: Ros1) -> Mover:
     return made
 
 
+@pytest.mark.slow
 def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) -> None:
     mover.go_on.clear()
     began = time.monotonic()
@@ -216,6 +228,25 @@ def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) ->
     assert began < mover.times[0] < time.monotonic()
 
 
+@pytest.mark.slow
+def test_a_client_learns_why_its_goal_is_rejected_and_the_one_before_it_continues(graph: Ros1, stand: Stand) -> None:
+    mover = Mover()
+    mover.go_on.clear()
+
+    def refuse(message: dict[str, int]) -> Outcome | None:
+        return Outcome(Ended.ABORTED, {"result": -7}, "too far") if message["goal"] > 9 else None
+
+    graph.act("/move", TEST, mover.do, refuse)
+    first = client(stand, 3)
+    wait_until(lambda: mover.came, "it has begun")
+    second = client(stand, 10, "other")
+    assert second.wait_for("done") == {"goal": 10, "state": REJECTED, "result": -7, "text": "too far"}
+    mover.go_on.set()
+    assert first.wait_for("done")["state"] == SUCCEEDED
+    assert [number for number, _ in mover.came] == [3]
+
+
+@pytest.mark.slow
 def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand: Stand) -> None:
     peer = stand.peer("planner")
     peer.do("advertise", "/move/goal", "actionlib/TestActionGoal", True)
@@ -232,6 +263,7 @@ def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand:
     assert set(mover.came) == {(4, "/planner")}
 
 
+@pytest.mark.slow
 def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
     peer = client(stand, ENDLESS)
     peer.wait_for("active")
@@ -239,6 +271,7 @@ def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
     assert peer.wait_for("done") == {"goal": ENDLESS, "state": PREEMPTED, "result": 1, "text": "stopped"}
 
 
+@pytest.mark.slow
 def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover, stand: Stand) -> None:
     peer = stand.peer("planner")
     peer.do("advertise", "/move/goal", "actionlib/TestActionGoal")
@@ -255,11 +288,13 @@ def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover,
     wait_until(lambda: mover.canceled, "it is canceled")
 
 
+@pytest.mark.slow
 def test_a_client_receives_reports_of_failures(mover: Mover, stand: Stand) -> None:
     reported = client(stand, ABORTS).wait_for("done")
     assert (reported["state"], reported["text"]) == (ABORTED, "a joint is stuck")
 
 
+@pytest.mark.slow
 def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand: Stand) -> None:
     graph.act("/move", TEST, lambda goal: Outcome(Ended.SUCCEEDED, {"resolt": 1}))
     reported = client(stand, 1).wait_for("done")
@@ -267,6 +302,7 @@ def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand:
     assert "has no resolt" in reported["text"]
 
 
+@pytest.mark.slow
 def test_a_later_goal_of_any_client_ends_the_one_before_and_is_done(mover: Mover, stand: Stand) -> None:
     first = client(stand, ENDLESS, "first")
     first.wait_for("active")
@@ -276,6 +312,7 @@ def test_a_later_goal_of_any_client_ends_the_one_before_and_is_done(mover: Mover
     assert mover.came == [(ENDLESS, "/first"), (2, "/second")]
 
 
+@pytest.mark.slow
 def test_a_goal_that_waits_for_the_end_of_another_is_recalled_by_the_next(graph: Ros1, stand: Stand) -> None:
     go_on = threading.Event()
     done: list[int] = []
@@ -311,6 +348,7 @@ def _states(graph: Ros1, stand: Stand) -> int:
     return seen[-1]
 
 
+@pytest.mark.slow
 def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -> None:
     mover = Mover()
     action = graph.act("/move", TEST, mover.do)
@@ -321,6 +359,7 @@ def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -
     assert mover.canceled == [ENDLESS]
 
 
+@pytest.mark.slow
 def test_our_two_ends_understand_each_other(mover: Mover, graph: Ros1) -> None:
     heard: list[int] = []
     assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(Ended.SUCCEEDED, {"result": 3}, "done")

@@ -56,6 +56,7 @@ def test_our_node_listens_on_loopback_if_the_master_does_unless_configured(
     assert made["ROS_MASTER_URI"] == master
 
 
+@pytest.mark.slow
 def test_our_node_ends_when_its_parent_is_killed(stand: Stand) -> None:
     parent = subprocess.Popen(
         [sys.executable, "-c", LIVES, stand.uri], stdout=subprocess.PIPE, env={**os.environ, "ROS_IP": "127.0.0.1"}
@@ -70,6 +71,7 @@ def test_our_node_ends_when_its_parent_is_killed(stand: Stand) -> None:
     wait_until(lambda: not node.is_running() or node.status() == psutil.STATUS_ZOMBIE, "it ends")
 
 
+@pytest.mark.slow
 def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> None:
     graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {"success": True})
     node = our_node()
@@ -85,6 +87,7 @@ def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> Non
     assert our_node() == node
 
 
+@pytest.mark.slow
 def test_our_node_is_killed_at_once_when_frozen_and_restarted(graph: Ros1) -> None:
     before = our_node()
     began = time.monotonic()
@@ -114,12 +117,14 @@ def test_a_heart_beats_whatever_others_wait_for_until_no_work_is_done_at_all(mon
         reader.join(PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: Ros1) -> None:
     folder = Path(_child.__file__).parent / "_node"
     versions = {path.name.split(".")[1] for path in folder.glob("__pycache__/*.pyc")}
     assert versions <= {sys.implementation.cache_tag}
 
 
+@pytest.mark.slow
 def test_our_port_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
     graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
     listening = [at.laddr.ip for at in our_node().net_connections() if at.status == psutil.CONN_LISTEN]

@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 PROGRAM = """
 import socket, sys, threading, time
 from trade_gateway.ros.ros1._node._peers import Peers

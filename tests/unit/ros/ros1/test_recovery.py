@@ -35,6 +35,7 @@ def answers(graph: Ros1) -> bool:
 # --- nodes
 
 
+@pytest.mark.slow
 def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Stand) -> None:
     watch = Watch(graph)
     peer = stand.peer("arm")
@@ -47,6 +48,7 @@ def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Sta
     assert "/trade" not in {name for name, _ in watch.reported}
 
 
+@pytest.mark.slow
 def test_a_node_that_ends_is_reported_gone(graph: Ros1, stand: Stand) -> None:
     watch = Watch(graph)
     peer = stand.peer("arm")
@@ -55,6 +57,7 @@ def test_a_node_that_ends_is_reported_gone(graph: Ros1, stand: Stand) -> None:
     watch.until("/arm", there=False)
 
 
+@pytest.mark.slow
 def test_a_new_subscriber_gets_the_existing_ones_and_an_ended_one_none(graph: Ros1, stand: Stand) -> None:
     first = Watch(graph)
     stand.peer("arm")
@@ -67,6 +70,7 @@ def test_a_new_subscriber_gets_the_existing_ones_and_an_ended_one_none(graph: Ro
     assert ("/leg", True) not in first.reported
 
 
+@pytest.mark.slow
 def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
     graph.subscribe("/state", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
@@ -81,6 +85,7 @@ def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros
 # --- the master
 
 
+@pytest.mark.slow
 def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
@@ -112,6 +117,7 @@ def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(gra
     watch.until("/old", there=False)
 
 
+@pytest.mark.slow
 def test_a_master_that_was_replaced_unnoticed_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
     graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: answers(graph), "its service is found")
@@ -125,6 +131,7 @@ def test_a_master_that_was_replaced_unnoticed_gets_all_registrations_again(graph
     assert peer.wait_for("called")["success"]
 
 
+@pytest.mark.slow
 def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> None:
     stand.kill_master()
     graph = start_ros1()
@@ -143,6 +150,7 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
 # --- our node
 
 
+@pytest.mark.slow
 def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
     graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
@@ -167,6 +175,7 @@ def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open
     wait_until(lambda: answers(graph), "its service is found")
 
 
+@pytest.mark.slow
 def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("mover")
     peer.do("act", "/move")
@@ -183,6 +192,7 @@ def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> Non
     assert goal.wait(PATIENCE_S).how is Ended.CANCELED
 
 
+@pytest.mark.slow
 def test_a_result_that_arrives_while_our_node_is_dead_is_delivered(graph: Ros1, stand: Stand) -> None:
     killed: list[bool] = []
 
@@ -199,6 +209,7 @@ def test_a_result_that_arrives_while_our_node_is_dead_is_delivered(graph: Ros1, 
     assert killed
 
 
+@pytest.mark.slow
 def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: Stand, start_ros1: Any) -> None:
     first = start_ros1()
     first.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
@@ -212,6 +223,7 @@ def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: S
         second.call("/lights", TRIGGER, {}, PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_our_node_does_not_take_the_name_of_another(stand: Stand, start_ros1: Any) -> None:
     peer = stand.peer("trade")
     graph = start_ros1()

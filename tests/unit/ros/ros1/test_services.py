@@ -18,6 +18,7 @@ TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
 
 
+@pytest.mark.slow
 def test_a_ros_service_is_called(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/SetBool")
@@ -25,6 +26,7 @@ def test_a_ros_service_is_called(graph: Ros1, stand: Stand) -> None:
     assert graph.call("/close", SET_BOOL, {"data": True}, 30) == {"success": True, "message": "/trade asked True"}
 
 
+@pytest.mark.slow
 def test_the_error_of_a_ros_service_is_reported(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/Trigger", "fail")
@@ -33,6 +35,7 @@ def test_the_error_of_a_ros_service_is_reported(graph: Ros1, stand: Stand) -> No
         graph.call("/close", TRIGGER, {}, 30)
 
 
+@pytest.mark.slow
 def test_a_service_of_another_type_is_refused(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/Trigger")
@@ -41,11 +44,13 @@ def test_a_service_of_another_type_is_refused(graph: Ros1, stand: Stand) -> None
         graph.call("/close", SET_BOOL, {"data": True}, 30)
 
 
+@pytest.mark.slow
 def test_a_service_without_a_server_is_unreachable(graph: Ros1) -> None:
     with pytest.raises(RosUnreachable, match="/close: no node offers it"):
         graph.call("/close", TRIGGER, {}, 30)
 
 
+@pytest.mark.slow
 def test_a_service_whose_node_was_killed_is_unreachable(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/close", "std_srvs/Trigger")
@@ -55,6 +60,7 @@ def test_a_service_whose_node_was_killed_is_unreachable(graph: Ros1, stand: Stan
         graph.call("/close", TRIGGER, {}, 30)
 
 
+@pytest.mark.slow
 def test_a_service_that_never_answers_is_given_up_and_others_are_not_held_up(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/hang", "std_srvs/Trigger", "hang")
@@ -80,6 +86,7 @@ def test_a_service_that_never_answers_is_given_up_and_others_are_not_held_up(gra
     assert graph.call("/close", TRIGGER, {}, 30)["success"]
 
 
+@pytest.mark.slow
 def test_a_node_calls_our_service(graph: Ros1, stand: Stand) -> None:
     graph.serve("/lights", SET_BOOL, lambda request, who, at: {"success": request["data"], "message": f"for {who}"})
     peer = stand.peer("caller")
@@ -87,6 +94,7 @@ def test_a_node_calls_our_service(graph: Ros1, stand: Stand) -> None:
     assert peer.wait_for("called") == {"success": True, "message": "for /caller"}
 
 
+@pytest.mark.slow
 def test_a_node_receives_the_error_of_our_service(graph: Ros1, stand: Stand) -> None:
     def fail(request: Message, who: str, at: float) -> Message:
         raise RuntimeError("the bulb is gone")
@@ -97,6 +105,7 @@ def test_a_node_receives_the_error_of_our_service(graph: Ros1, stand: Stand) -> 
     assert "the bulb is gone" in peer.wait_for("failed")
 
 
+@pytest.mark.slow
 def test_requests_are_answered_in_order_and_fail_when_the_service_is_withdrawn(graph: Ros1, stand: Stand) -> None:
     begun, go_on = threading.Semaphore(0), threading.Event()
 
@@ -168,6 +177,7 @@ def test_a_request_that_stops_waits_for_no_other_and_is_refused_for_nothing() ->
     assert in_order == [f"/{asked}" for asked in range(own, own + 40)]
 
 
+@pytest.mark.slow
 def test_a_service_that_stops_is_called_however_many_other_calls_are_under_way(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("gripper")
     peer.do("serve", "/hang", "std_srvs/Trigger", "hang")
@@ -208,6 +218,7 @@ def is_forgotten(graph: Ros1) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_a_service_is_offered_once(graph: Ros1) -> None:
     graph.serve("/lights", TRIGGER, lambda request, who, at: {}).close()
     graph.serve("/lights", TRIGGER, lambda request, who, at: {})
@@ -215,6 +226,7 @@ def test_a_service_is_offered_once(graph: Ros1) -> None:
         graph.serve("/lights", TRIGGER, lambda request, who, at: {})
 
 
+@pytest.mark.slow
 def test_parameters_of_a_namespace_are_read_and_set(graph: Ros1) -> None:
     graph.set_parameter("/arm", "limits/speed", 0.5, 30)
     graph.set_parameter("/arm", "joints", ["pan", "tilt"], 30)
@@ -222,11 +234,13 @@ def test_parameters_of_a_namespace_are_read_and_set(graph: Ros1) -> None:
     assert graph.parameters("/arm", 30) == {"limits/speed": 0.5, "joints": ["pan", "tilt"], "enabled": True}
 
 
+@pytest.mark.slow
 def test_a_namespace_without_parameters_is_refused(graph: Ros1) -> None:
     with pytest.raises(RosRefused, match="/leg"):
         graph.parameters("/leg", 30)
 
 
+@pytest.mark.slow
 def test_a_value_that_ros_cannot_express_is_refused(graph: Ros1) -> None:
     for value in (None, 2**40, [None], object()):
         with pytest.raises(RosRefused, match="/arm/x"):

@@ -25,6 +25,7 @@ def send_until(graph_sends: Any, heard: Any) -> None:
     wait_until(look, "it was heard")
 
 
+@pytest.mark.slow
 def test_a_node_hears_what_is_published_here(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("listener")
     peer.do("hear", "/joints", "sensor_msgs/JointState")
@@ -38,6 +39,7 @@ def test_a_node_hears_what_is_published_here(graph: Ros1, stand: Stand) -> None:
     assert (reported["name"], reported["position"], reported["velocity"]) == (["pan"], [0.25], [])
 
 
+@pytest.mark.slow
 def test_what_a_node_publishes_is_heard_here_with_its_name(graph: Ros1, stand: Stand) -> None:
     heard: list[Any] = []
     graph.subscribe("/joints", JOINTS, lambda message, who: heard.append((message, who)))
@@ -50,6 +52,7 @@ def test_what_a_node_publishes_is_heard_here_with_its_name(graph: Ros1, stand: S
     assert (message["header"]["frame_id"], message["name"], message["position"]) == ("base", ["pan"], [0.25])
 
 
+@pytest.mark.slow
 def test_a_late_subscriber_gets_the_last_message_of_a_latched_topic(graph: Ros1, stand: Stand) -> None:
     topic = graph.advertise("/map", TEXT, latched=True)
     topic.send({"data": "old"})
@@ -59,6 +62,7 @@ def test_a_late_subscriber_gets_the_last_message_of_a_latched_topic(graph: Ros1,
     assert peer.wait_for("heard")["data"] == "new"
 
 
+@pytest.mark.slow
 def test_the_last_message_of_a_latched_ros_topic_is_received(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("mapper")
     peer.do("advertise", "/map", "std_msgs/String", True)
@@ -69,6 +73,7 @@ def test_the_last_message_of_a_latched_ros_topic_is_received(graph: Ros1, stand:
     wait_until(lambda: heard == [("kept", "/mapper")], "it was heard")
 
 
+@pytest.mark.slow
 def test_S01_what_was_published_before_is_no_command(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("pilot")
     peer.do("advertise", "/go", "std_msgs/String", True)
@@ -87,6 +92,7 @@ def test_S01_what_was_published_before_is_no_command(graph: Ros1, stand: Stand) 
     assert set(heard) == {"new"}
 
 
+@pytest.mark.slow
 def test_a_listener_that_is_frozen_delays_no_other(graph: Ros1, stand: Stand) -> None:
     slow, quick = stand.peer("slow"), stand.peer("quick")
     for peer in (slow, quick):
@@ -99,6 +105,7 @@ def test_a_listener_that_is_frozen_delays_no_other(graph: Ros1, stand: Stand) ->
     send_until(lambda: topic.send({"data": "last"}), lambda: any(one["data"] == "last" for one in quick.all("heard")))
 
 
+@pytest.mark.slow
 def test_a_slow_callback_gets_the_newest_message(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
     begun, go_on = threading.Event(), threading.Event()
@@ -126,6 +133,7 @@ def _sent(topic: Any, number: int, seen: list[str]) -> bool:
     return str(number) in seen
 
 
+@pytest.mark.slow
 def test_a_closed_subscription_hears_nothing_and_another_continues(graph: Ros1) -> None:
     first: list[str] = []
     second: list[str] = []
@@ -139,6 +147,7 @@ def test_a_closed_subscription_hears_nothing_and_another_continues(graph: Ros1) 
     assert "b" not in first
 
 
+@pytest.mark.slow
 def test_a_topic_that_is_closed_and_opened_at_once_is_heard_at_both_ends(graph: Ros1, stand: Stand) -> None:
     peer = stand.peer("arm")
     peer.do("hear", "/state", "std_msgs/String")
@@ -157,17 +166,20 @@ def test_a_topic_that_is_closed_and_opened_at_once_is_heard_at_both_ends(graph: 
         topic.close()
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused_where_it_is_sent(graph: Ros1) -> None:
     with pytest.raises(ConfigurationError, match="has no dada"):
         graph.advertise("/text", TEXT).send({"dada": "x"})
 
 
+@pytest.mark.slow
 def test_a_name_that_is_none_of_ros_is_refused(graph: Ros1) -> None:
     for name in ("text", "/", "/a b", "/1st", "/a/", "", "/a\n"):
         with pytest.raises(ConfigurationError, match="is not a global name"):
             graph.advertise(name, TEXT)
 
 
+@pytest.mark.slow
 def test_a_topic_cannot_be_of_two_types_here(graph: Ros1) -> None:
     graph.subscribe("/one", TEXT, lambda message, who: None)
     with pytest.raises(ConfigurationError, match="is open as std_msgs/String already"):

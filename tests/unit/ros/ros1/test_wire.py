@@ -55,6 +55,7 @@ def types(tmp_path_factory: pytest.TempPathFactory) -> Types:
     return Types(1, [folder])
 
 
+@pytest.mark.slow
 def test_types_are_named_and_summed_as_ros_does(types: Types) -> None:
     need_ros1()
     around = [made for action in ACTIONS for made in action_types(types, action)]

@@ -116,6 +116,7 @@ def test_gids_are_those_that_rmw_zenoh_makes(of: str, expected: str) -> None:
 # --- other hands
 
 
+@pytest.mark.slow
 @given(st.integers(0, 232), names, types, hashes)
 def test_keys_are_those_of_another_package(domain_id: int, name: str, type_name: str, type_hash: str) -> None:
     assert data_key(domain_id, name, type_name, type_hash) == pamoja.entity_key(domain_id, name, type_name, type_hash)
@@ -131,6 +132,7 @@ def test_names_are_taken_that_another_package_takes(name: str) -> None:
     assert taken == (pamoja.is_valid_name(name) and pamoja.is_fully_qualified(name))
 
 
+@pytest.mark.slow
 @given(
     st.integers(0, 232), sessions, st.integers(1, 10**6), st.sampled_from(list(Kind)[1:]), names, names, types, hashes
 )

@@ -24,6 +24,7 @@ class Reports:
         return [there for name, there in self.all if name == node]
 
 
+@pytest.mark.slow
 def test_a_new_watcher_is_notified_of_the_nodes_already_present(graph: Ros2, peer: Process) -> None:
     peer.ask("listen", topic="/present")  # its node is one with its endpoint
     peer.hear("listening", topic="/present")
@@ -44,6 +45,7 @@ def test_a_node_in_a_namespace_has_its_whole_name(graph: Ros2, router: Router, o
     wait_until(lambda: reported.of("/arm/left/driver") == [True, False], "it is reported gone")
 
 
+@pytest.mark.slow
 def test_a_killed_node_is_reported_as_gone(graph: Ros2, router: Router, start_peer: Callable[..., Process]) -> None:
     reported = Reports()
     graph.watch_nodes(reported)
@@ -147,6 +149,7 @@ def test_the_node_watch_does_not_report_its_own_node(
     assert not reported.of("/trade")
 
 
+@pytest.mark.slow
 def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     reported = Reports()
     graph.watch_nodes(reported)
@@ -156,6 +159,7 @@ def test_another_domain_is_not_seen(graph: Ros2, router: Router, open_graph: Cal
     assert not reported.of("/far")
 
 
+@pytest.mark.slow
 def test_a_closed_watch_receives_no_more_notifications(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:

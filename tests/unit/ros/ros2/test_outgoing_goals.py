@@ -63,6 +63,7 @@ class RawServer:
         return [payload for asked, payload in self.asked if asked == part]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("status", "how"), [(4, Ended.SUCCEEDED), (5, Ended.CANCELED), (6, Ended.ABORTED)], ids=str)
 def test_the_action_client_uses_the_ros_wire_format(graph: Ros2, raw: zenoh.Session, status: int, how: Ended) -> None:
     server = RawServer(raw, "theirs", accepts=True, result=bytes([status, 0, 0, 0]) + numbers(1, 2, 3))
@@ -100,6 +101,7 @@ def test_cancel_sends_the_goal_id_to_the_action_server(graph: Ros2, raw: zenoh.S
     assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
 
 
+@pytest.mark.slow
 def test_S07_a_goal_that_is_canceled_without_a_router_is_canceled_when_there_is_one(
     own_router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,6 +159,7 @@ def test_S05_a_goal_that_may_have_begun_can_be_canceled_by_who_sent_it_too(
     wait_until(lambda: len(server.of("cancel_goal")) == 2, "it gets another cancel request")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "answers", "end"),
     [

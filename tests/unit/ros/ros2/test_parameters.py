@@ -128,11 +128,13 @@ def test_a_refusal_says_why(graph: Ros2, offering: Offering) -> None:
         graph.set_parameter("/camera", "gain", 9.0, LONG_S)
 
 
+@pytest.mark.slow
 def test_a_node_without_the_services_is_unreachable(graph: Ros2) -> None:
     with pytest.raises(RosUnreachable, match="/missing/list_parameters"):
         graph.parameters("/missing", LONG_S)
 
 
+@pytest.mark.slow
 def test_our_own_node_has_none_and_says_so(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     asks = open_graph(router, node="/asks")
     others = {"describe_parameters": "DescribeParameters", "set_parameters_atomically": "SetParametersAtomically"}

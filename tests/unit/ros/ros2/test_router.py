@@ -16,6 +16,7 @@ ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
 
 
+@pytest.mark.slow
 def test_endpoints_created_without_a_router_work_once_the_router_starts(
     own_router: Router, open_graph: Callable[..., Ros2], start_peer: Callable[..., Process]
 ) -> None:
@@ -38,6 +39,7 @@ def test_endpoints_created_without_a_router_work_once_the_router_starts(
     until_heard(lambda: peer.ask("publish", topic="/from_them", data="at last"), lambda: heard)
 
 
+@pytest.mark.slow
 def test_a_router_that_was_killed_and_started_again_finds_all_as_it_was(
     own_router: Router, open_graph: Callable[..., Ros2], start_peer: Callable[..., Process]
 ) -> None:

@@ -45,12 +45,14 @@ def calling(graph: Ros2, name: str, times: int) -> Iterator[None]:
     assert answered == [{"sum": 0}] * times
 
 
+@pytest.mark.slow
 def test_a_peer_node_calls_a_service_of_the_graph(graph: Ros2, peer: Process) -> None:
     graph.serve("/add_ours", ADD, add)
     peer.ask("add", service="/add_ours", a=2, b=-3)
     assert peer.hear("added")["sum"] == -1
 
 
+@pytest.mark.slow
 def test_we_call_a_service_of_another_node(graph: Ros2, peer: Process) -> None:
     peer.ask("serve", service="/add_theirs")
     peer.hear("serving", service="/add_theirs")
@@ -104,6 +106,7 @@ def test_a_server_that_does_not_answer_is_not_waited_for_longer_than_asked(graph
         call(graph, "/silent", {}, 0.2)
 
 
+@pytest.mark.slow
 def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
     graph: Ros2, router: Router, start_peer: Callable[..., Process]
 ) -> None:
@@ -127,6 +130,7 @@ def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
     assert "no node serves it" in failed[0]
 
 
+@pytest.mark.slow
 def test_of_two_servers_of_one_name_one_is_asked(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     """ROS 2 would ask both: what they do would be done twice."""
     asked: list[str] = []
@@ -163,6 +167,7 @@ def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer
     assert peer.hear("types")["types"] == [0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept_s", [1000.0, 0.0], ids=["asked_unseen", "asked_seen"])
 def test_S05_a_queued_request_keeps_the_name_of_a_node_that_died_meanwhile(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch, kept_s: float
@@ -199,6 +204,7 @@ def test_S05_a_queued_request_keeps_the_name_of_a_node_that_died_meanwhile(
     assert asked == ["/first", "/doomed"]
 
 
+@pytest.mark.slow
 def test_S01_a_service_receives_the_arrival_time_of_a_queued_request(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
@@ -223,6 +229,7 @@ def test_S01_a_service_receives_the_arrival_time_of_a_queued_request(
     assert began_at <= first_at <= second_at <= second_waits_at
 
 
+@pytest.mark.slow
 def test_S07_a_stop_waits_neither_for_a_hanging_stop_nor_for_the_name_of_its_caller(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
 ) -> None:
