@@ -37,20 +37,19 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 	@$(RUN) --no-dev --group demo python examples/demo.py $(ARGS)
 
 # Three tiers of tests, by what a test may use: tests/support/tiers.py. In the last two, what failed runs again at the end, alone.
-WITH_PROCESSORS_TO_ITSELF := tests/system/peers/test_rust.py tests/system/test_demo.py
-REALTIME := $(RUN) pytest --rerun --durations=10 -m "realtime and not system"
+ALONE := tests/system/peers/test_conformance.py tests/system/test_demo.py
 SYSTEM := $(RUN) pytest --rerun --durations=10 -m system
 
 test: $(UV) ## what decides whether a change lands: code, containers and zenoh within a process; 3 minutes on two cores
 	@$(RUN) pytest --durations=10 -n 4 --dist worksteal --hypothesis-profile ci -m "not realtime and not system" $(ARGS)
 
-test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 25 minutes at most
-	@$(REALTIME) -n 2 --dist loadfile $(ARGS)
+test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 13 minutes
+	@$(RUN) pytest --rerun --durations=10 -n 4 --dist worksteal -m "realtime and not system" $(ARGS)
 
-test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 30 minutes at most (root)
+test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 16 minutes (root)
 	@failed=; part() { code=0; "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; *) failed=1 ;; esac; }; \
-	part $(SYSTEM) -n 2 --dist loadfile tests $(WITH_PROCESSORS_TO_ITSELF:%=--ignore %); \
-	part $(SYSTEM) -n 0 $(WITH_PROCESSORS_TO_ITSELF); test -z "$$failed"
+	part $(SYSTEM) -n 4 --dist worksteal tests $(ALONE:%=--ignore %); \
+	part $(SYSTEM) -n 2 --dist loadfile $(ALONE); test -z "$$failed"
 
 test-all: ## the three tiers in a row
 	@failed=; for tier in test test-realtime test-system; do $(MAKE) --no-print-directory $$tier || failed="$$failed $$tier"; done; \

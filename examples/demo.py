@@ -25,7 +25,8 @@ from demo_busy import busy_here
 from demo_judge import PAN, Judge
 from demo_kept import kill_and_see
 from demo_page import dashboard
-from demo_stage import Stage, stage
+from demo_robot import patient
+from demo_stage import ROBOT, Stage, stage
 
 import trade
 from trade import Settings, errors, where
@@ -79,8 +80,8 @@ def arbitrate(scene: Stage, judge: Judge) -> None:
         with scene.behaviour("who_has_the_head.py", "navigate") as navigating:
             navigating.hear("has the head, for 'finding a target'")
             finding.hear("I have let go")
-            free_s = navigating.hear("I have the head")
-            judge.wait_for(lambda: judge.moves(PAN, free_s))  # not the sweep before
+            navigating.hear("I have the head")
+            judge.wait_for(lambda: judge.moving(PAN))  # the sweep before has ended, else it would not have the head
             killed_s = time.monotonic()
             navigating.process.kill()
             rests = judge.wait_for(lambda: judge.rests(PAN, killed_s))
@@ -166,13 +167,15 @@ def expect(kind: type[Exception] | tuple[type[Exception], ...], act: Callable[[]
 
 
 def tell(scene: Stage, recording: contextlib.ExitStack, options: Options) -> None:
-    log = scene.folder / "bytes.jsonl"
-    with scene.robot(log) as ready, SimControl(ready["control"]) as control:
+    log, rosie = scene.folder / "bytes.jsonl", scene.folder / ROBOT.name
+    rosie.write_text(patient(ROBOT.read_text(encoding="utf-8")), encoding="utf-8")
+    with scene.robot(log, rosie) as ready, SimControl(ready["control"]) as control:
         print(f"\nRosie is up on her network: head, arms, hand, legs and tail; {len(ready['services'])} services.")
+        print("This computer simulates her. So her buses have lower rates and longer time-outs than in rosie.toml.")
         for bus, missing in scene.left_out.items():
             print(f"Left out: bus {bus}. Not installed: {missing}, of which there are no wheels for every platform.")
         if options.record:
-            recording.enter_context(scene.recorder(options.record))
+            recording.enter_context(scene.recorder(options.record, rosie))
             print(f"All that she does from now on is recorded to {options.record}.")
         if options.mute:
             control.mute(bus="neck")

@@ -41,6 +41,11 @@ class Judge:
         """Each time it began to move."""
         return [entry for entry in events(self._so_far(), "motion_started", since=since) if entry.joint == joint]
 
+    def moving(self, joint: str) -> bool:
+        """Whether the last that it did was to begin to move."""
+        own = [entry.name for entry in self._so_far() if entry.joint == joint]
+        return next((name for name in reversed(own) if name in {"motion_started", "at_rest"}), "") == "motion_started"
+
     def _so_far(self) -> list[Entry]:
         """All events; only what is new is read, since a bus of drives writes thousands of lines a second."""
         with self._log.open("rb") as log:

@@ -10,6 +10,7 @@ from typing import Any
 
 from demo_actor import PATIENCE_S, DemoFailed
 from demo_judge import AGREE_RAD, PAN, Judge, say
+from demo_robot import patient
 from demo_stage import HERE, Stage
 
 import trade
@@ -102,7 +103,7 @@ def _child(name: str) -> Any:
 
 def _at_ports(scene: Stage, sim: SimProcess) -> Path:
     """A copy of the head's file that names the port of its simulation."""
-    text = re.sub(r'port = "[^"]*"', f'port = "{sim.ports["neck"]}"', (HERE / "head.toml").read_text())
+    text = re.sub(r'port = "[^"]*"', f'port = "{sim.ports["neck"]}"', patient((HERE / "head.toml").read_text()))
     copy = scene.folder / "head.toml"
     copy.write_text(text)
     return copy

@@ -24,7 +24,7 @@ from trade_gateway.pki._authority import Authority
 HERE = Path(__file__).parent
 ROBOT = HERE / "rosie.toml"
 RECORD_HZ = "20"
-"""Samples of joints a second: half of what the slowest bus measures, so that two processors do for all of this."""
+"""Samples of joints a second: less than the slowest bus measures, so that two processors do for all of this."""
 _LAST = 20
 _NEW_NETWORK = 0x40000000
 """CLONE_NEWNET of setns(2)."""
@@ -107,17 +107,17 @@ class Stage:
         }
 
     @contextlib.contextmanager
-    def robot(self, log: Path) -> Generator[dict[str, Any]]:
+    def robot(self, log: Path, file: Path = ROBOT) -> Generator[dict[str, Any]]:
         """Rosie with simulated devices, on her own network; yields what she says when she is up."""
-        words = [*_TRADE, "up", ROBOT, "--sim", "--sim-log", log, "--json"]
+        words = [*_TRADE, "up", file, "--sim", "--sim-log", log, "--json"]
         words += [word for bus in self.left_out for word in ("--without", bus)]
         with self._started("rosie", words, self.environment("robot", "rosie"), "robot") as rosie:
             yield rosie.ready()
 
     @contextlib.contextmanager
-    def recorder(self, file: Path) -> Generator[None]:
+    def recorder(self, file: Path, robot: Path) -> Generator[None]:
         """All that happens on the robot's network goes to a file, from now on until this ends."""
-        words = [*_TRADE, "record", file, "--hz", RECORD_HZ, "--attach", ROBOT, "--json"]
+        words = [*_TRADE, "record", file, "--hz", RECORD_HZ, "--attach", robot, "--json"]
         with self._started("trade record", words, self.environment("robot", "archive"), "robot") as recording:
             recording.ready()
             yield

@@ -45,6 +45,7 @@ def find_target() -> None:
 
 def navigate() -> None:
     """Look ahead; ask the current owner of the head to release it."""
+    look = service("move_to")  # waits for the head, which a lock with wait_s=0 does not
     try:
         with trade.lock(HEAD, wait_s=0):
             print("navigate: the head was free", flush=True)
@@ -55,7 +56,7 @@ def navigate() -> None:
         print("navigate: I have the head", flush=True)
         while True:  # until this process is killed
             for pan_rad in (1.3, -1.3):
-                service("move_to").with_(deadline_s=30)([pan_rad, 0.0], speed_rad_s=SLOWLY_RAD_S)
+                look.with_(deadline_s=30)([pan_rad, 0.0], speed_rad_s=SLOWLY_RAD_S)
 
 
 if __name__ == "__main__":

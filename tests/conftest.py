@@ -3,9 +3,9 @@
 import asyncio
 import gc
 import os
-import resource
 import secrets
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,10 +23,21 @@ from trade import Container, Settings, where
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a run in the background; what tests start would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-_FILES = 8192
+# A thread that wants the interpreter asks its holder for it after this time. The default of 5 ms is too long beside
+# simulated devices, which have to answer within milliseconds.
+sys.setswitchinterval(0.0005)
+
+_DESCRIPTORS = Path("/proc/self/fd")
 _KERNEL_LISTS_CHILDREN = Path(f"/proc/self/task/{os.getpid()}/children").exists()
-_SETTLE_S = 5.0
+_LONGEST = ("peers/test_rust", "test_siege", "test_upgrade", "test_relocation", "soak/test_soak", "test_commissioning")
+"""What takes a minute and more; a run that began with something else would end with waiting for it."""
+_SETTLE_S = 15.0
 """How long what a test has ended may take to be gone; far above what it takes."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest tests."""
+    items.sort(key=lambda item: not any(name in item.nodeid for name in _LONGEST))
 
 
 def pytest_sessionstart() -> None:
@@ -36,13 +47,9 @@ def pytest_sessionstart() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The transport's runtime and the event loop's selector open files once a process; that is no leak.
-
-    Of every session the transport keeps two or three files of shared memory open until the process ends.
-    """
-    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(allowed, min(most, _FILES)), most))
+    """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
+    os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("config"))
     os.environ["TRADE_STATE_DIR"] = str(tmp_path_factory.mktemp("state"))
     for _ in range(2):
         with (
@@ -62,13 +69,13 @@ def _short_collections(_warm_up: None) -> None:
 
 @pytest.fixture(autouse=True)
 def _nothing_leaks(_warm_up: None) -> Iterator[None]:
-    threads, files, children, tasks = set(threading.enumerate()), _files(), _children(), _tasks()
+    threads, files, children, tasks = set(threading.enumerate()), _descriptors(), _children(), _tasks()
     yield
     trade.close()
     leaked = _wait_until_gone(
         lambda: [
             *(f"thread {thread.name}" for thread in set(threading.enumerate()) - threads if thread.is_alive()),
-            *(f"file {path}" for path in _files() - files),
+            *(f"file {path}" for path in _files(_descriptors() - files)),
             *(f"process {name}" for name in _children() - children),
             *(f"task {name}" for name in _tasks() - tasks),
         ]
@@ -84,17 +91,25 @@ def _wait_until_gone(leaks: Callable[[], list[str]]) -> list[str]:
     return leaked
 
 
-def _files() -> set[str]:
-    """Open descriptors with what they stand for; the number alone is reused."""
+def _descriptors() -> set[str]:
+    """The numbers of open files; what they stand for is read for new ones only."""
+    if not _DESCRIPTORS.exists():
+        return set()
+    listing = os.open(os.devnull, os.O_RDONLY)  # the lowest free number, which the listing takes for itself
+    os.close(listing)
+    return set(os.listdir(_DESCRIPTORS)) - {str(listing)}  # noqa: PTH208 - Path is five times slower
+
+
+def _files(numbers: set[str]) -> set[str]:
     found: set[str] = set()
-    for entry in Path("/proc/self/fd").iterdir() if Path("/proc/self/fd").exists() else ():
+    for number in numbers:
         try:
-            target = str(entry.readlink())
-        except OSError:  # the descriptor of the listing itself
+            target = str((_DESCRIPTORS / number).readlink())
+        except OSError:  # closed meanwhile
             continue
-        # Shared memory of closed links: zenoh lets go of it in its own time.
+        # Shared memory of a closed session: zenoh closes it when the next one is opened.
         if not target.removesuffix(" (deleted)").endswith(".zenoh"):
-            found.add(f"{entry.name} -> {target}")
+            found.add(target)
     return found
 
 
@@ -108,7 +123,7 @@ def _tasks() -> set[str]:
 def _children() -> set[str]:
     """Processes of this process, and of those, with their command lines."""
     found: set[str] = set()
-    for number in _child_numbers():
+    for number in _children_numbers():
         with suppress(psutil.NoSuchProcess):
             child = psutil.Process(number)
             if child.status() != psutil.STATUS_ZOMBIE:
@@ -116,12 +131,12 @@ def _children() -> set[str]:
     return found
 
 
-def _child_numbers() -> list[int]:
-    """By the kernel's own lists, if it keeps them: reading all processes of the computer takes 3 ms."""
+def _children_numbers() -> list[int]:
+    """By the lists of the kernel, if it keeps them: to read all processes of the computer takes 3 ms."""
     if not _KERNEL_LISTS_CHILDREN:
         return [child.pid for child in psutil.Process().children(recursive=True)]
     found = [os.getpid()]
-    for number in found:  # grows while it is read
+    for number in found:  # which grows
         for task in Path(f"/proc/{number}").glob("task/*/children"):
             with suppress(OSError):
                 found += map(int, task.read_text().split())
@@ -132,8 +147,8 @@ def _child_numbers() -> list[int]:
 def _patient_hooks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """A hook is cut off after 0.1 s, which a busy computer may take for any: tests of that limit are `realtime`."""
     if tier_of(request.node) == "gate":
-        monkeypatch.setattr("trade._hooks.hook.ONE_S", 30.0)
-        monkeypatch.setattr("trade._hooks.hook.ALL_S", 30.0)
+        monkeypatch.setattr("trade._settings._HOOK_LIMIT_S", 30.0)
+        monkeypatch.setitem(Settings.__init__.__kwdefaults__, "hook_limit_s", 30.0)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import griffe
 
-_MAKERS: Final = {"delegated", "adelegated", "of_default", "aof_default"}
+_MAKERS: Final = {"delegated", "adelegated", "of_default", "aof_default", "in_thread"}
 
 
 class Delegated(griffe.Extension):
@@ -23,10 +23,17 @@ class Delegated(griffe.Extension):
 
 def _replace(pkg: griffe.Module, scope: Any) -> None:
     for member in list(scope.members.values()):
-        value = None if member.is_alias else getattr(member, "value", None)
+        value = None if member.is_alias else _without_cast(getattr(member, "value", None))
         if isinstance(value, griffe.ExprCall) and value.function.canonical_name in _MAKERS:
-            meant = pkg.modules_collection[value.arguments[-1].canonical_path]
+            meant = pkg.modules_collection[_without_cast(value.arguments[-1]).canonical_path]
             scope.set_member(member.name, _as_function(member, meant, bound=scope.is_module))
+
+
+def _without_cast(value: Any) -> Any:
+    """What a `typing.cast` is about: its types are of type checkers only."""
+    while isinstance(value, griffe.ExprCall) and value.function.canonical_name == "cast":
+        value = value.arguments[-1]
+    return value
 
 
 def _as_function(member: Any, meant: Any, *, bound: bool) -> griffe.Function:

@@ -44,8 +44,8 @@ def started(*words: str | Path) -> Generator[dict[str, Any]]:
             process.terminate()
 
 
-def dashboard(browser: Browser, url: str, token: str, name: str, **look: Any) -> None:
-    """Sign in, wait until all joints are shown, take the picture."""
+def dashboard(browser: Browser, url: str, token: str, name: str, container: str = "", **look: Any) -> None:
+    """Sign in, wait until all joints are shown, take the picture; of the section System if a container is named."""
     with contextlib.closing(browser.new_context(**look)) as context:
         page = context.new_page()
         page.goto(url)
@@ -56,6 +56,12 @@ def dashboard(browser: Browser, url: str, token: str, name: str, **look: Any) ->
         pose()  # a browser that starts holds drivers up, and their servos stop: enabled again, they have no fault
         expect(page.locator("#ailing")).to_have_text("✓ Nothing reports a fault.")  # of everything there is a sample
         expect(page.locator(".device.stale")).to_have_count(0)
+        if container:
+            page.goto(f"{url}/#system")
+            page.locator(f'.container[data-container="{container}"]').click()
+            page.get_by_role("button", name="End …").click()
+            expect(page.locator(".consequence")).to_be_visible()
+            page.locator("#system").evaluate("section => section.scrollIntoView({ behavior: 'instant' })")
         page.screenshot(path=HERE / name)
         print(f"wrote {HERE / name}")
 
@@ -99,6 +105,7 @@ def main() -> None:
             browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
             dashboard(browser, http["url"], token, "dashboard.png", **DESKTOP)
             dashboard(browser, http["url"], token, "dashboard-phone.png", **PHONE)
+            dashboard(browser, http["url"], token, "dashboard-system.png", "rosie", **DESKTOP)
             browser.close()
             terminal("top.svg", ["top", "--count", "1"])
         trade.close()

@@ -18,9 +18,12 @@ parts:
   jitter     by how much the cycles of each kind of bus are off their period: quiet and under load, with and without
              SCHED_FIFO where the system allows it
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
-  supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
+  supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start;
+             what the start of a driver with one bus takes, and its memory
 scale      what joining, leaving, announcing and finding cost, by how many containers there are: in memory 100, with
              --full 1,000; and 50 processes (root, iproute2)
+  hub        200 processes (without --full 100) with one link each, to a hub: at rest, and when one more joins (root,
+             iproute2)
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout, all targets once more at the end. Peers that are
@@ -56,6 +59,7 @@ from tests.bench import (
     _supervisor,
     _watching,
 )
+from tests.bench._crowd import run_behind_a_hub
 from tests.bench._record import Clock, Run
 from tests.bench._report import begin_part, forget_since, mark, print_all_targets, print_skipped, this_run
 
@@ -89,9 +93,11 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
     "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "scale": lambda options: _scale.run(options.containers, options.idle),
+    "hub": lambda options: run_behind_a_hub(min(options.containers, _MOST_BEHIND_A_HUB), options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _ATTEMPTS = 2
+_MOST_BEHIND_A_HUB = 200
 _QUICK = {"n": 250, "rounds": 8, "seconds": 1.5, "idle": 20.0, "containers": 100}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0, "containers": 1000}
 
@@ -113,7 +119,7 @@ def main() -> None:
     parser.add_argument(
         "--containers",
         type=int,
-        help=f"at most, of the scale part ({_QUICK['containers']}, full {_FULL['containers']})",
+        help=f"at most, of the parts scale and hub ({_QUICK['containers']}, full {_FULL['containers']})",
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")

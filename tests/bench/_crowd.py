@@ -4,7 +4,7 @@ import os
 import secrets
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -17,7 +17,7 @@ import psutil
 from tests.bench._children import child, hear
 from tests.bench._offering import fill
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_skipped, print_target
 from tests.system.networks import ip, why_not
 
 _SYSTEM: Final = "bench-scale"
@@ -26,7 +26,7 @@ _AT_ONCE: Final = 4
 _SETTLE_S: Final = 20.0
 """Until those that have just begun have nothing new to tell."""
 _PATIENCE_S: Final = 120.0
-_LOOK_AGAIN_S: Final = 0.2
+_HUB: Final = "hub"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +39,15 @@ class Crowd:
     rest_packets_s: float
     rest_cpu: float
     """Share of a core, of each."""
+    hub_cpu: float
+    """Share of a core, of the hub, which is none of them; 0 without."""
     join_bytes: float
     """Of one more, what passes at rest left out."""
     join_s: float
     rss_mib: float
     threads: int
+    open_files: tuple[int, int]
+    """Of the hub, 0 without; of one of the others."""
 
 
 def run_crowd(containers: int, simulated_join_bytes: int, seconds: float) -> None:
@@ -57,19 +61,50 @@ def run_crowd(containers: int, simulated_join_bytes: int, seconds: float) -> Non
     if reason := why_not():
         print(f"containers in processes: skipped, {reason}")
         return
-    seen = _measure(containers, seconds)
+    seen = _measure(containers, seconds, hub=False)
     links = seen.containers * (seen.containers - 1) / 2
-    print(f"\n{seen.containers} containers in processes of their own, {links:.0f} links")
-    print(f"at rest, each      {seen.rest_bytes_s / seen.containers / 1024:8.2f} KiB/s")
-    print(f"  of a link        {seen.rest_bytes_s / links:8.0f} B/s in {seen.rest_packets_s / links:.1f} packets/s")
-    print(f"  processor        {100 * seen.rest_cpu:8.2f} % of a core")
-    print(f"  memory           {seen.rss_mib:8.1f} MiB, {seen.threads} threads")
-    print(f"one more joins     {seen.join_bytes / 1024:8.0f} KiB, all know it after {seen.join_s:.2f} s")
+    _print(seen, links)
     ratio = seen.join_bytes / simulated_join_bytes
     print_target("join, bytes: real / simulated", [ratio], "at most 1.5", lambda share: share <= 1.5)
 
 
-def _measure(containers: int, seconds: float) -> Crowd:
+def run_behind_a_hub(containers: int, seconds: float) -> None:
+    """The same containers with one link each, to a hub. Measure and print.
+
+    Args:
+        containers: how many processes, without the hub.
+        seconds: how long they are looked at.
+    """
+    if reason := why_not():
+        print_skipped("containers behind a hub", reason)
+        return
+    seen = _measure(containers, seconds, hub=True)
+    _print(seen, seen.containers)
+    print(f"the hub takes      {100 * seen.hub_cpu:8.2f} % of a core")
+    values = {
+        "% of a core": [100 * seen.rest_cpu],
+        "% of a core, hub": [100 * seen.hub_cpu],
+        "open files": [float(seen.open_files[1])],
+        "open files, hub": [float(seen.open_files[0])],
+    }
+    keep_point("containers behind a hub", f"{containers} containers", 1, values)
+    core = 100 * seen.rest_cpu
+    print_target("behind a hub: % of a core, each", [core], "at most 0.3", lambda share: share <= 0.3)
+    print_target("behind a hub: a join, s", [seen.join_s], "at most 1", lambda took_s: took_s <= 1)
+
+
+def _print(seen: Crowd, links: float) -> None:
+    print(f"\n{seen.containers} containers in processes of their own, {links:.0f} links")
+    print(f"at rest, each      {seen.rest_bytes_s / seen.containers / 1024:8.2f} KiB/s")
+    print(f"  of a link        {seen.rest_bytes_s / links:8.0f} B/s in {seen.rest_packets_s / links:.1f} packets/s")
+    print(f"  processor        {100 * seen.rest_cpu:8.2f} % of a core")
+    print(f"  memory           {seen.rss_mib:8.1f} MiB, {seen.threads} threads, {seen.open_files[1]} open files")
+    if seen.open_files[0]:
+        print(f"  the hub          {seen.open_files[0]:8} open files")
+    print(f"one more joins     {seen.join_bytes / 1024:8.0f} KiB, all know it {seen.join_s:.2f} s after it began")
+
+
+def _measure(containers: int, seconds: float, *, hub: bool) -> Crowd:
     with own_folder(), _network() as inside, ExitStack() as stack:
 
         def begin(name: str) -> Connection:
@@ -77,23 +112,28 @@ def _measure(containers: int, seconds: float) -> Crowd:
 
         members: list[Connection] = []
         pids: list[int] = []
+        hubs = [psutil.Process(hear(begin(_HUB), _PATIENCE_S)[0])] if hub else []
         for number in range(containers - 1):
             members.append(begin(f"c{number}"))
             if len(members) % _AT_ONCE == 0 or number == containers - 2:
-                pids += [hear(member, _PATIENCE_S) for member in members[len(pids) :]]
+                pids += [hear(member, _PATIENCE_S)[0] for member in members[len(pids) :]]
                 print(f"scale: {len(members)} of {containers} containers", file=sys.stderr, flush=True)
-        _until_known(members, containers - 1)
+        _until_known(members, containers - 1 + len(hubs))
         time.sleep(min(_SETTLE_S, 2 * seconds))
         processes = [psutil.Process(pid) for pid in pids]
+        hub_spent_s, from_s = _cpu_s(hubs), time.monotonic()
         rest_bytes_s, rest_packets_s, cpu = _at_rest(processes, seconds)
+        hub_cpu = (_cpu_s(hubs) - hub_spent_s) / (time.monotonic() - from_s)
         rss = median(process.memory_info().rss for process in processes)
         before, began = _passed(pids[0]), time.monotonic()
         members.append(begin("late"))
-        hear(members[-1], _PATIENCE_S)
-        join_s = _until_known(members, containers)
+        _, began_to_join_s = hear(members[-1], _PATIENCE_S)
+        _until_known(members, containers + len(hubs))
+        join_s = time.monotonic() - began_to_join_s
         passed = _passed(pids[0])[0] - before[0] - rest_bytes_s * (time.monotonic() - began)
         threads = processes[0].num_threads()
-    return Crowd(containers, rest_bytes_s, rest_packets_s, cpu, passed, join_s, rss / 1024**2, threads)
+        files = (sum(one.num_fds() for one in hubs), processes[0].num_fds())
+    return Crowd(containers, rest_bytes_s, rest_packets_s, cpu, hub_cpu, passed, join_s, rss / 1024**2, threads, files)
 
 
 def _at_rest(processes: Sequence[psutil.Process], seconds: float) -> tuple[float, float, float]:
@@ -116,14 +156,12 @@ def _passed(pid: int) -> tuple[int, int]:
     return int(counts[0]), int(counts[1])
 
 
-def _until_known(members: Sequence[Connection], count: int) -> float:
-    """Wait until all know so many containers and what they offer; how long that was."""
-    began = time.monotonic()
+def _until_known(members: Sequence[Connection], count: int) -> None:
+    """Wait until all know so many containers and what they offer."""
     for member in members:
         member.send(count)
     for member in members:
         hear(member, _PATIENCE_S)
-    return time.monotonic() - began
 
 
 @contextmanager
@@ -141,17 +179,20 @@ def _network() -> Iterator[str]:
 def _take_part(pipe: Connection, name: str) -> None:
     from trade import Container, Settings
 
-    with Container(Settings.read(container=name, system=_SYSTEM)) as container:
-        if name != "late":
+    began_s = time.monotonic()
+    with Container(Settings.read(container=name, system=_SYSTEM, hub="serve" if name == _HUB else "auto")) as container:
+        if name not in ("late", _HUB):
             fill(container, name)
-        pipe.send(os.getpid())
+        pipe.send((os.getpid(), began_s))
+        registry = container._parts.registry
+
+        def knows(count: int) -> bool:
+            states = registry.containers()
+            return len(states) == count and all(state.providers for state in states)
+
         while (count := _reported(pipe)) is not None:
-            _wait(lambda count=count: len(container.addresses()) == count and _complete(container.containers()))
+            registry.wait_for(lambda count=count: knows(count), _PATIENCE_S)
             pipe.send("known")
-
-
-def _complete(infos: Sequence[object]) -> bool:
-    return all(info.services > 0 for info in infos)  # type: ignore[attr-defined]
 
 
 def _reported(pipe: Connection) -> int | None:
@@ -159,9 +200,3 @@ def _reported(pipe: Connection) -> int | None:
         return pipe.recv()
     except EOFError:  # the run is over
         return None
-
-
-def _wait(holds: Callable[[], bool]) -> None:
-    until = time.monotonic() + _PATIENCE_S
-    while not holds() and time.monotonic() < until:
-        time.sleep(_LOOK_AGAIN_S)

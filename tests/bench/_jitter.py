@@ -6,6 +6,7 @@ late is not taken for lateness of the driver. A loop with nothing in it shows wh
 
 In real time is the whole process of a driver, with those it has started, as `chrt --all-tasks` and systemd have it. The
 thread of its bus alone would wait for the interpreter, held by an ordinary thread that waits for a processor.
+Each bus is measured in `trade up`, too: in real time by itself, with a priority of its own, and with --no-real-time.
 """
 
 import os
@@ -15,6 +16,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -54,8 +56,8 @@ driver = "{driver}"
 rate_hz = {rate_hz}
 stale_after_s = 1.0
 """
-_SERVOS: Final = 'port = "/dev/ttyNOWHERE"\nbaud = 1_000_000\nwatchdog_s = 0.5\n'
-_CAN: Final = 'interface = "socketcan"\nchannel = "can0"\nbitrate = 1_000_000\nwatchdog_s = 0.5\nleave = "relax"\n'
+_SERVOS: Final = f'port = "{driver.ANYWHERE}"\nbaud = 1_000_000\nwatchdog_s = 0.5\n'
+_CAN: Final = f'{driver.CAN0}\nbitrate = 1_000_000\nwatchdog_s = 0.5\nleave = "relax"\n'
 _JOINT: Final = """
 [joint."j{id}"]
 bus = "it"
@@ -66,7 +68,7 @@ max_rad = 1.4
 max_speed_rad_s = 2.5
 max_accel_rad_s2 = 20.0
 """
-_GRIPPER: Final = """port = "/dev/ttyNOWHERE"
+_GRIPPER: Final = f"""port = "{driver.ANYWHERE}"
 baud = 115_200
 
 [gripper.hand]
@@ -77,7 +79,7 @@ max_width_m = 0.085
 max_speed_m_s = 0.10
 max_force_n = 100.0
 """
-_ARM: Final = """host = "192.168.0.10"
+_ARM: Final = f"""host = "{driver.ADDRESS}"
 
 [arm.arm]
 bus = "it"
@@ -163,6 +165,10 @@ def run(cycles: int, buses: Sequence[Bus] = BUSES, *, loaded: bool = True) -> No
             print_skipped(bus.name, f"{missing[0]} is not installed")
             continue
         _measure(bus.name, bus.rate_hz, _driven(bus, real=not refused), cases, cycles)
+        for real in reals:
+            turns = [case for case in cases if case.real is real]
+            up = _brought_up(bus, real=real, sim_real=not refused)
+            _measure(f"{bus.name}, trade up", bus.rate_hz, up, turns, cycles)
 
 
 class Case(NamedTuple):
@@ -212,6 +218,13 @@ class DrivenLoop(Loop):
         return [one.t for one in log if began <= one.t <= ended and self._bus.begins_cycle(one)], stopped
 
 
+class UpLoop(DrivenLoop):
+    """That of a bus in `trade up`, which decides itself about real time."""
+
+    def threads(self) -> list[int]:
+        return []
+
+
 @contextmanager
 def _nothing() -> Iterator[Loop]:
     with child(driver.idle, IDLE_HZ) as pipe:
@@ -220,14 +233,29 @@ def _nothing() -> Iterator[Loop]:
 
 @contextmanager
 def _driven(bus: Bus, *, real: bool) -> Iterator[Loop]:
+    with _simulated(bus, real=real) as sim, child(driver.drive, bus.text, sim.ports) as pipe:
+        yield DrivenLoop(pipe, bus, sim.log_path)
+
+
+@contextmanager
+def _brought_up(bus: Bus, *, real: bool, sim_real: bool) -> Iterator[Loop]:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        _simulated(bus, real=sim_real) as sim,
+        child(partial(driver.bring_up, real=real), bus.text, sim.ports["it"], Path(folder)) as pipe,
+    ):
+        yield UpLoop(pipe, bus, sim.log_path)
+
+
+@contextmanager
+def _simulated(bus: Bus, *, real: bool) -> Iterator[SimProcess]:
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         file = Path(folder) / "robot.toml"
         file.write_text(bus.text)
         sim = stack.enter_context(SimProcess(file))
         if real:
             stack.enter_context(fifo(lambda: threads_of(sim.pid), _SIM_PRIORITY))
-        pipe = stack.enter_context(child(driver.drive, bus.text, sim.ports))
-        yield DrivenLoop(pipe, bus, sim.log_path)
+        yield sim
 
 
 def _measure(

@@ -1,18 +1,30 @@
-"""The processes of the jitter part: one with a driver and its bus thread, one with a loop that does nothing."""
+"""The processes of the jitter part: a driver and its bus thread, alone or in `trade up`, and an empty loop."""
 
+import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from tests.bench._children import _requests
 from tests.bench._rosie import _WIDE, _through
+from trade import Container, Settings, handle_of
 from trade.errors import TradeError
-from trade_drivers import Arm, AttachedRobot, JointGroup, attach
+from trade_drivers import Arm, AttachedRobot, Gripper, JointGroup, Motor, attach
 from trade_drivers.robotfile import Robot, parse
 
 GROUP = "others"
+ANYWHERE = "/dev/ttyNOWHERE"
+"""The port in a robot file of a serial bus, before there is a simulation."""
+CAN0 = 'interface = "socketcan"\nchannel = "can0"'
+"""The same of a CAN bus."""
+ADDRESS = "192.168.0.10"
+"""The same of a controller."""
+_FOUND_S, _LONG_S = 30.0, 600.0
 _WAY_RAD, _ACCEL_RAD_S2 = 0.2, 2.2
 
 
@@ -29,6 +41,49 @@ def drive(pipe: Connection, text: str, ports: Mapping[str, str]) -> None:
         pipe.send(os.getpid())
         for seconds in _requests(pipe):
             pipe.send(_timed(busy, seconds))
+
+
+def bring_up(pipe: Connection, text: str, port: str, folder: Path, *, real: bool) -> None:
+    """The same of a robot that `trade up` brings up, in real time or not; this process is its client.
+
+    Its system and its files are in a folder.
+    """
+    os.environ.update(TRADE_SYSTEM="bench-jitter", TRADE_RUNTIME_DIR=str(folder), TRADE_STATE_DIR=str(folder))
+    file = folder / "up.toml"
+    adapter = f'interface = "socketcand"\nchannel = "{port.removeprefix("socketcand:")}"'
+    file.write_text(text.replace(ANYWHERE, port).replace(CAN0, adapter).replace(ADDRESS, port))
+    words = ["--with-stdin", "up", str(file), "--json", *(() if real else ("--no-real-time",))]
+    command = [sys.executable, "-m", "trade_gateway", *words]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as up:
+        try:
+            assert up.stdout is not None
+            json.loads(up.stdout.readline())
+            with Container(Settings.read(container="client")) as container:
+                busy = busy_with(parse(text, "jitter.toml"), _Served(container))
+                pipe.send(up.pid)
+                for seconds in _requests(pipe):
+                    pipe.send(_timed(busy, seconds))
+        finally:
+            up.terminate()
+
+
+class _Served:
+    """The services of a robot, with the methods of an attached one that keep it busy."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+
+    def motor(self, joint: str) -> Motor:
+        return self._container.find(Motor, group=f"bench.{joint}", wait_s=_FOUND_S)
+
+    def group(self, name: str) -> JointGroup:
+        return self._container.find(JointGroup, group=f"bench.{name}", wait_s=_FOUND_S)
+
+    def gripper(self, name: str) -> Gripper:
+        return self._container.find(Gripper, group=f"bench.{name}", wait_s=_FOUND_S)
+
+    def arm(self, name: str) -> Arm:
+        return self._container.find(Arm, group=f"bench.{name}", wait_s=_FOUND_S)
 
 
 def idle(pipe: Connection, rate_hz: float) -> None:
@@ -52,7 +107,7 @@ def _timed(busy: Callable[[float], object], seconds: float) -> tuple[tuple[float
     return (began, time.monotonic()), problem
 
 
-def busy_with(robot: Robot, attached: AttachedRobot) -> Callable[[float], object]:
+def busy_with(robot: Robot, attached: AttachedRobot | _Served) -> Callable[[float], object]:
     """What keeps it busy for so many seconds."""
     if robot.grippers:
         attached.gripper(robot.grippers[0].name).activate()
@@ -63,6 +118,10 @@ def busy_with(robot: Robot, attached: AttachedRobot) -> Callable[[float], object
         arm.release_brakes()
         names = [joint.name for joint in arm.limits().joints]
         return lambda seconds: _follow(arm, names, arm.state().positions_rad, seconds)
+    return _following(robot, attached)
+
+
+def _following(robot: Robot, attached: AttachedRobot | _Served) -> Callable[[float], object]:
     group = attached.group(GROUP)
     motors = [attached.motor(joint) for one in robot.groups for joint in one.joints]
 
@@ -84,4 +143,6 @@ def _follow(mover: Arm | JointGroup, joints: list[str], start_rad: list[float], 
     """There and back, no faster than any of them may."""
     way_rad = min(_WAY_RAD, _ACCEL_RAD_S2 * seconds**2 / 24)
     there = [angle + way_rad for angle in start_rad]
-    mover.follow(_through(joints, (0.0, start_rad), (seconds / 2, there), (seconds, start_rad)), _WIDE)
+    here = isinstance(mover, (Arm, JointGroup))  # else it is a proxy, whose call has a deadline
+    follow = mover.follow if here else handle_of(mover.follow).with_(deadline_s=_LONG_S)
+    follow(_through(joints, (0.0, start_rad), (seconds / 2, there), (seconds, start_rad)), _WIDE)

@@ -4,15 +4,19 @@ import sys
 import time
 from collections.abc import Callable
 from statistics import median
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from tests.bench._alone import alone
 from tests.bench._places import own_folder
 from tests.bench._report import keep_point, print_target
 
+if TYPE_CHECKING:
+    from trade import GroupView
+
 _MOST_US: Final = 5.0
 _MOST_LENIENT_US: Final = 1.5
-_PLAIN, _STRICT, _LENIENT = "plain method", "strict", "strict=False"
+_MOST_RATIO: Final = 1.05
+_PLAIN, _STRICT, _LENIENT, _ATTRIBUTE = "plain method", "strict", "strict=False", "strict, attribute"
 
 Results = dict[str, list[float]]
 
@@ -35,6 +39,8 @@ def run(n: int, rounds: int) -> None:
     print_target(
         "local, not strict: us a call", lenient, f"at most {_MOST_LENIENT_US}", lambda us: us <= _MOST_LENIENT_US
     )
+    ratios = [attribute / handle for attribute, handle in zip(results[_ATTRIBUTE], strict, strict=True)]
+    print_target("local: attribute / handle", ratios, f"at most {_MOST_RATIO}", lambda ratio: ratio <= _MOST_RATIO)
 
 
 def _measure(n: int, rounds: int) -> Results:
@@ -44,11 +50,13 @@ def _measure(n: int, rounds: int) -> Results:
         plain = _arm(strict=True)
         calls = {
             _PLAIN: plain.move,
-            _STRICT: container.register(plain, "bench")[0],
-            _LENIENT: container.register(_arm(strict=False), "bench")[0],
+            _STRICT: container.register(plain, "bench.arm")[0],
+            _LENIENT: container.register(_arm(strict=False), "bench.lenient")[0],
         }
-        results: Results = {name: [] for name in calls}
+        arm = container.robot("bench").arm
+        results: Results = {name: [] for name in (*calls, _ATTRIBUTE)}
         for i in range(rounds):
+            results[_ATTRIBUTE].append(_us_per_attribute(arm, n))
             for name, call in calls.items():
                 results[name].append(_us_per_call(call, n))
             print(f"local: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
@@ -64,6 +72,14 @@ def _arm(*, strict: bool):
             return shoulder_rad
 
     return Arm()
+
+
+def _us_per_attribute(arm: "GroupView", n: int) -> float:
+    arm.move(0.1, 0.2, 0.3)
+    began = time.perf_counter_ns()
+    for _ in range(n):
+        arm.move(0.1, 0.2, 0.3)
+    return (time.perf_counter_ns() - began) / 1e3 / n
 
 
 def _us_per_call(call: Callable[[float, float, float], float], n: int) -> float:

@@ -44,7 +44,7 @@ class _TcpLink(Pipeline):
         self._link.sendall(len(payload).to_bytes(_SIZE_BYTES, "little") + payload)
 
     def end(self, begun: None) -> bytes:
-        return _framed(self._link)[_SIZE_BYTES:]
+        return framed(self._link)[_SIZE_BYTES:]
 
     def burst(self, payload: bytes, n: int, in_flight: int) -> None:
         super().burst(payload, n, min(in_flight, max(1, _MOST_UNREAD // len(payload))))
@@ -54,11 +54,11 @@ def _echo_all(listener: socket.socket) -> None:
     link, _ = listener.accept()
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     with link:
-        while message := _framed(link):
+        while message := framed(link):
             link.sendall(message)
 
 
-def _framed(link: socket.socket) -> bytes:
+def framed(link: socket.socket) -> bytes:
     """A message with its length before it; nothing at the end."""
     size = link.recv(_SIZE_BYTES, socket.MSG_WAITALL)
     return size + link.recv(int.from_bytes(size, "little"), socket.MSG_WAITALL) if size else b""

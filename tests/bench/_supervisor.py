@@ -1,7 +1,8 @@
-"""What it costs a gateway to look after ten children, and how soon one that crashed serves again."""
+"""What ten children cost a gateway, how soon one that crashed serves again, and what a start costs."""
 
 import json
 import os
+import re
 import secrets
 import signal
 import subprocess
@@ -17,10 +18,12 @@ import psutil
 
 from tests.bench._report import keep_point, print_target
 from trade import Container, Settings, where
+from trade_hil_sim import SimProcess
 
 _HEAD: Final = Path(__file__).parents[2] / "examples" / "head.toml"
 _CHILDREN: Final = 10
 _MOST_CORE, _MOST_S, _MOST_RATIO = 1.0, 1.5, 1.2
+_MOST_START_S, _MOST_MIB = 0.6, 60.0
 _PATIENCE_S: Final = 60.0
 
 
@@ -41,14 +44,19 @@ def run(rounds: int, seconds: float) -> None:
         with Container(Settings.read(system=system, container="bench")) as member:
             shares = _overhead(file, system, environment, member, seconds)
             again, plain = _restarts(file, system, environment, member, rounds)
+        started, empty, mib = _starts(Path(folder) / "head.toml", environment, rounds)
     print(f"\nsupervisor, {_CHILDREN} children over {seconds:.0f} s; {rounds} crashes of a simulated head:")
     keep_point("a crash", "until it serves again", rounds, {"s": again})
     keep_point("a crash", "a plain start", rounds, {"s": plain})
+    keep_point("one bus", "from start to service", rounds, {"s": started, "MiB": mib})
+    keep_point("one bus", "python -c pass", rounds, {"s": empty})
     keep_point("idle", f"{_CHILDREN} children", 1, {"% of a core": shares})
     print_target("supervisor: % of a core", shares, f"at most {_MOST_CORE:g}", lambda share: share <= _MOST_CORE)
     print_target("crash to serving, s", again, f"at most {_MOST_S:g}", lambda took_s: took_s <= _MOST_S)
     ratios = [one / other for one, other in zip(again, plain, strict=True)]
     print_target("crash to serving / plain start", ratios, f"at most {_MOST_RATIO:g}", lambda one: one <= _MOST_RATIO)
+    print_target("one bus: to service, s", started, f"at most {_MOST_START_S:g}", lambda one: one <= _MOST_START_S)
+    print_target("one bus: RSS, MiB", mib, f"at most {_MOST_MIB:g}", lambda one: one <= _MOST_MIB)
 
 
 def _overhead(file: Path, system: str, environment: dict[str, str], member: Container, seconds: float) -> list[float]:
@@ -90,6 +98,25 @@ def _restarts(
             _served(member, epoch)
             plain.append(time.monotonic() - began)
     return again, plain
+
+
+def _starts(file: Path, environment: dict[str, str], rounds: int) -> tuple[list[float], list[float], list[float]]:
+    """Of a driver with one bus: seconds until it says that it serves, those of an empty program, and its MiB."""
+    started: list[float] = []
+    empty: list[float] = []
+    mib: list[float] = []
+    with SimProcess(_HEAD) as sim:
+        file.write_text(re.sub(r"(?m)^port = .*", f'port = "{sim.ports["neck"]}"', _HEAD.read_text()))
+        for number in range(rounds + 1):
+            began = time.monotonic()
+            subprocess.run([sys.executable, "-c", "pass"], env=environment, check=True)
+            empty.append(time.monotonic() - began)
+            began = time.monotonic()
+            with _trade(environment, "up", str(file)) as driver:
+                started.append(time.monotonic() - began)
+                mib.append(psutil.Process(driver.pid).memory_info().rss / 1024**2)
+            print(f"supervisor: start {number} of {rounds}", file=sys.stderr, flush=True)
+    return started[1:], empty[1:], mib[1:]  # the first one may compile
 
 
 def _served(member: Container, not_by: str) -> str:

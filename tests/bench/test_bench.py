@@ -14,7 +14,8 @@ import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
 from tests.bench._children import Job
 from tests.bench._flood import FLOODS
-from tests.bench._others import Rpyc
+from tests.bench._others import Grpc, Pyro5, Rpyc
+from tests.bench._peers import Tcp
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
@@ -91,8 +92,8 @@ def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
     each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    others = ["Pyro5", "gRPC"] if Viam().missing else ["Pyro5", "gRPC", Viam.name]
-    small = (*each, *(f"p50 / {other}" for other in others), "p99 / p50")
+    others = [peer.name for peer in (Tcp(), Rpyc(), Pyro5(), Grpc(), Rospy(), Viam()) if not peer.missing]
+    small = (*each[:2], *(f"p50 / {other}" for other in others), "p99 / p50")
     of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
     assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
@@ -114,7 +115,13 @@ def test_the_bench_of_checks_prints_each_thing_that_may_be_added_to_a_call() -> 
 
 def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
     printed = bench("supervisor", "--rounds", "1", "--idle", "1")
-    assert targets(printed) == ["supervisor: % of a core", "crash to serving, s", "crash to serving / plain start"]
+    assert targets(printed) == [
+        "supervisor: % of a core",
+        "crash to serving, s",
+        "crash to serving / plain start",
+        "one bus: to service, s",
+        "one bus: RSS, MiB",
+    ]
 
 
 def test_a_peer_that_is_not_installed_is_named_and_skipped(
@@ -158,11 +165,11 @@ def test_the_Viam_SDK_answers_in_an_environment_of_its_own() -> None:
 
 def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
     printed = bench("local", "-n", "3", "--rounds", "2", "--json", str(tmp_path / "run.json"))
-    assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call"]
+    assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call", "local: attribute / handle"]
     run = Run.read(tmp_path / "run.json")
     assert [target.name for target in run.targets] == targets(printed)
     assert [(point.part, point.name) for point in run.points] == [
-        ("local", name) for name in ("plain method", "strict", "strict=False")
+        ("local", name) for name in ("plain method", "strict", "strict=False", "strict, attribute")
     ]
     assert all(point.n == 2 * 50 * 3 and point.values["us"].rounds == 2 for point in run.points)
     assert run.took_s is not None
@@ -176,7 +183,10 @@ def test_the_bench_of_the_registry_prints_its_targets() -> None:
 
 
 def test_the_bench_of_locks_prints_its_targets() -> None:
-    assert targets(bench("locks", "-n", "3", "--rounds", "1")) == ["lock and unlock / call", "checked / unchecked call"]
+    assert targets(bench("locks", "-n", "3", "--rounds", "1")) == [
+        "lock and unlock / call on the transport",
+        "checked / unchecked call",
+    ]
 
 
 def test_the_bench_of_the_can_bus_prints_its_targets() -> None:
@@ -260,6 +270,13 @@ def test_the_bench_of_many_containers_prints_its_targets() -> None:
     ]
     processes = [] if "processes: skipped" in printed else ["join, bytes: real / simulated"]
     assert targets(printed) == [*ours, *processes]
+
+
+def test_the_bench_of_containers_behind_a_hub_prints_its_targets() -> None:
+    printed = bench("hub", "--containers", "4", "--idle", "0.2")
+    if "behind a hub: skipped" not in printed:
+        assert targets(printed) == ["behind a hub: % of a core, each", "behind a hub: a join, s"]
+        assert re.search(r"^  the hub +\d+ open files$", printed, re.MULTILINE)
 
 
 def test_a_stand_in_costs_what_a_container_costs() -> None:

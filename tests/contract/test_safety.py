@@ -114,7 +114,7 @@ def test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why(rig: JointRig) ->
     assert "DeviceFault" in said or "DeviceSilent" in said
     assert all(part in said for part in rig.says_on_waking), said
     assert rig.truth().position_rad == pytest.approx(rested, abs=0.002)
-    assert not rig.sent_away(stopped)
+    assert not rig.sent_on_waking(stopped)
     for event in ("motion_started", "torque_on", "watchdog_cleared"):
         assert not rig.events(event, stopped)
 
@@ -317,7 +317,7 @@ def test_S19_shutdown_while_moving_stops_first(rig: SafetyRig) -> None:
     rig.robot.close()
     rig.robot.close()
     assert isinstance(moving.wait().error, TradeError)
-    assert not rig.moving
+    assert rig.at_rest()
     rig.rests()
     with pytest.raises(DeviceFault, match="ended"):
         rig.move()

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
@@ -15,6 +15,9 @@ import trade
 from tests.docs.blocks import DOCS, Block, Section, blocks
 from tests.support.waiting import wait_until
 from trade import Container
+
+_WRITTEN: Final = ("rosie_types",)
+"""Modules that a command of the page writes."""
 
 
 class Play:
@@ -82,7 +85,8 @@ def _imported_before(section: Section) -> str:
         if block.heading == section.heading:
             break
         tree = compile(block.text, section.page, "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
-        above += [ast.unparse(node) for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+        imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+        above += [ast.unparse(node) for node in imports if getattr(node, "module", "") not in _WRITTEN]
     return "\n".join(above)
 
 

@@ -22,13 +22,17 @@ PAGES: Final = ("guide.md", "drivers.md", "deployment.md")
 TYPED_ELSEWHERE: Final = {
     Section("guide.md", "Let a system configure itself"): ["system/test_transcript.py", "system/test_witness.py"],
     Section("guide.md", "Have one robot look at another"): ["system/test_witness.py"],
+    Section("guide.md", "Types of a running robot"): ["unit/gateway/test_stubs.py", "docs/test_guide.py"],
     Section("guide.md", "Devices"): ["system/test_demo.py"],
     Section("guide.md", "Have one arm follow another"): ["system/test_teleop.py"],
     Section("guide.md", "Locks, stops, e-stop"): ["system/test_lock_commands.py"],
-    Section("guide.md", "Ask in sentences"): ["unit/gateway/test_ask.py"],
+    Section("guide.md", "Ask in sentences"): ["unit/gateway/test_ask.py", "unit/gateway/test_ask_orders.py"],
     Section("guide.md", "Observe a system"): ["system/test_traces.py", "system/test_watch.py"],
+    Section("guide.md", "States of containers"): ["unit/gateway/test_states_shown.py", "unit/gateway/test_lists.py"],
     Section("guide.md", "The record of who did what"): ["system/test_audit.py"],
     Section("guide.md", "Create objects in other containers"): ["docs/test_guide.py"],
+    Section("guide.md", "Other hosts"): ["system/test_starts.py"],
+    Section("guide.md", "Many containers on one host"): ["system/test_hub.py"],
     Section("guide.md", "A whole system from one file"): ["system/test_transcript.py"],
     Section("guide.md", "A robot's computer that looks after itself"): ["system/test_supervisor.py"],
     Section("drivers.md", "What was wrong"): ["unit/gateway/test_faults.py"],
@@ -42,7 +46,6 @@ NOT_TYPED: Final = {
     Section(
         "deployment.md", "A gateway between networks"
     ): "changes the kernel: unit/gateway/test_gateway_file.py has the warning",
-    Section("deployment.md", "Real time"): "takes a right, and the processor from all other tests",
     Section("deployment.md", "In a container"): "takes podman or docker: release/test_container.py tries it",
 }
 

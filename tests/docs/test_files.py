@@ -1,5 +1,6 @@
 """The files that pages show, read by what reads them."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,7 @@ def test_a_lexicon(tmp_path: Path, text: str) -> None:
     lexicon = read_lexicon(save(tmp_path, "mine.toml", text))
     for sentence in ("look 0.3 rad", "look 0.3 radians to the left"):
         assert lexicon.hear(sentence).gaps == {"number": "0.3"}
+    assert lexicon.hear("start a vision provider on rover").gaps["kind"] == "mypkg.vision:Camera"
 
 
 @of("guide.md", "Who may do what")
@@ -103,6 +105,16 @@ def test_a_gateway(tmp_path: Path, text: str) -> None:
 @of("guide.md", "A robot's computer that looks after itself")
 def test_a_gateway_that_looks_after_containers(tmp_path: Path, text: str) -> None:
     assert [child.name for child in gateway(tmp_path, text).children] == ["rosie", "mind"]
+
+
+@of("guide.md", "A whole system from one file")
+def test_a_system_with_a_supervisor(tmp_path: Path, text: str) -> None:
+    (tmp_path / "planner").touch(mode=0o755)
+    (tmp_path / "ros.toml").write_text('[ros]\nversion = 1\n[[to_ros.lock]]\ngroup = "rosie"\n')
+    shutil.copy(ROOT / "examples" / "rosie.toml", tmp_path)
+    plan = read_system_file(save(tmp_path, "system.toml", text))
+    assert [part.entry.kind for part in plan.parts] == ["gateway", "robot", "ros", "record", "program"]
+    assert plan.supervised == {"rosie", "bridge", "recorder", "planner"}
 
 
 @of("guide.md", "When a host is lost")

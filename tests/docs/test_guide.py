@@ -14,9 +14,11 @@ from tests.docs.blocks import DOCS, of, said, sections
 from tests.docs.conftest import Play, Said
 from tests.support.waiting import wait_until
 from tests.system.conftest import Program
-from trade import Handle, Settings, service, where
+from trade import Handle, Settings, StateEvent, service, where
 from trade._transport.endpoints import free_endpoint
 from trade.errors import Cancelled, CannotStart, DeviceFault, InvalidArgument
+from trade_drivers.testing import FakeJointGroup
+from trade_gateway.stubs import write_stubs
 
 PAGE = "guide.md"
 
@@ -87,6 +89,59 @@ def test_find_and_call(play: Play, printed: Said) -> None:
     assert oven.heated == [(180, 10), (180, 5), (180, 10), (180, 10)]
     assert "kitchen.oven.heat heat(celsius: float, minutes: float = 10) -> float" in printed.text
 
+
+@of(PAGE, "Plan with conditions")
+def test_plan_with_conditions(play: Play, printed: Said) -> None:
+    play.run()
+    assert "rosie.hand.pick_up ('see(?thing)', 'at(?place)')\n" in printed.text
+    assert "(define (domain rosie)" in printed.text
+    assert ":effect (and (holding ?thing) (not (empty hand)))" in printed.text
+
+
+class Hand:
+    def __init__(self) -> None:
+        self.closed = threading.Event()
+
+    @service
+    def close(self) -> None:
+        self.closed.set()
+
+
+class Pan:
+    @service(effect="read")
+    def limits(self) -> list[float]:
+        return [-1.4, 1.4]
+
+
+@of(PAGE, "Robots as objects")
+def test_robots_as_objects(play: Play, printed: Said) -> None:
+    head, hand = FakeJointGroup(["rosie.neck.pan", "rosie.neck.tilt"]), Hand()
+    for provider, group in ((head, "rosie.head"), (hand, "rosie.hand"), (Pan(), "rosie.neck.pan")):
+        play.offer("rosie", provider, group)
+    play.run()
+    assert head.went == [[0.3, -0.2]] * 2
+    assert hand.closed.wait(20)
+    assert "[-1.4, 1.4]" in printed.text
+    assert play.module.positions_rad == [0.3, -0.2]
+
+
+@of(PAGE, "Types of a running robot")
+def test_types_of_a_running_robot(play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    head = FakeJointGroup(["rosie.neck.pan", "rosie.neck.tilt"])
+    play.offer("rosie", head, "rosie.head")
+    (tmp_path / "rosie_types.py").write_text(write_stubs(trade.services("rosie"), "rosie", "guide"))
+    try:
+        play.run()
+    finally:
+        sys.modules.pop("rosie_types", None)
+    assert head.went == [[0.3, -0.2]] * 2
+    assert play.module.positions_rad == [0.3, -0.2]
+
+
+@pytest.mark.realtime
+@of(PAGE, "Handles")
+def test_handles(play: Play, printed: Said) -> None:
     for loop in ("find", "lock"):
         head = Head()
 
@@ -197,6 +252,14 @@ def test_watch_calls(play: Play, printed: Said) -> None:
     again.detach()
 
 
+@of(PAGE, "Guards")
+def test_refuse_calls(play: Play, printed: Said) -> None:
+    play.run()
+    assert "press.press was refused by its guard door_closed: the door is open" in printed.text
+    assert "20.0 1" in printed.text
+    assert trade.guards() == []
+
+
 class JointNow(Struct, frozen=True):
     position_rad: float
     moving: bool
@@ -256,6 +319,20 @@ def test_see_what_happens(play: Play) -> None:
     play.run()
     assert play.module.span.service == "rosie.eye.look"
     assert play.module.tree.service == "rosie.eye.look"
+
+
+class Searching:
+    @service
+    def search(self, event: StateEvent) -> None: ...
+
+
+@of(PAGE, "States of containers")
+def test_states_of_containers(play: Play) -> None:
+    play.offer("base", Searching(), "planner")
+    play.run()
+    listed = {info.occasion.partition(" ")[0]: info.container for info in trade.notifications()}
+    here = trade.container().name
+    assert listed == {"hook_suspended": here, "call_deviated": here, "unlinked": "base"}
 
 
 @of(PAGE, "While it runs")

@@ -2,6 +2,7 @@
 
 import operator
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,15 +19,6 @@ SHOWN = {
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")] for line in PAGE.splitlines() if re.match(r"\| *P\d", line)
 ]
-NOT_YET = re.compile(r"(?:^|\. )not yet: (?P<reason>\S+ .+)$", re.IGNORECASE)
-
-
-def _shows_something(shown_by: str) -> bool:
-    """Whether tests or commands stand before what is not there yet, and all of them exist."""
-    named = re.findall(r"`([^`]+)`", NOT_YET.sub("", shown_by))
-    missing = [name for name in named if not _exists(name)]
-    assert not missing
-    return bool(named)
 
 
 def _exists(named: str) -> bool:
@@ -35,8 +27,13 @@ def _exists(named: str) -> bool:
         return f"\n{words.split()[0]}:" in (ROOT / "Makefile").read_text(encoding="utf-8")
     if command == "trade":
         return words.split()[0] in {known.name for known in app.registered_commands}
-    tests = (path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
-    return any(re.search(rf"\bdef {re.escape(named)}\(", text) for text in tests)
+    return named in _functions()
+
+
+@cache
+def _functions() -> set[str]:
+    texts = (path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
+    return {name for text in texts for name in re.findall(r"\bdef (\w+)\(", text)}
 
 
 def test_every_promise_has_exactly_one_row_in_order() -> None:
@@ -44,18 +41,16 @@ def test_every_promise_has_exactly_one_row_in_order() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_a_promise_is_shown_or_said_to_be_not_yet(row: list[str]) -> None:
+def test_a_promise_is_shown_by_tests_or_commands_that_exist(row: list[str]) -> None:
     number, promise, _ = row
-    shown_by = SHOWN[number]
+    named = re.findall(r"`([^`]+)`", SHOWN[number])
     assert promise
-    said_not_yet = NOT_YET.search(shown_by)
-    assert _shows_something(shown_by) or said_not_yet
-    assert bool(said_not_yet) == ("not yet" in shown_by.lower()), "say 'not yet: ' and the reason"
+    assert named
+    assert [name for name in named if not _exists(name)] == []
 
 
-def test_nothing_is_not_yet_but_what_is_left_for_later_on_purpose() -> None:
-    """Bounds under load."""
-    assert [number for number, names in SHOWN.items() if NOT_YET.search(names)] == ["P12"]
+def test_no_promise_is_left_open() -> None:
+    assert "not yet" not in PAGE.lower()
 
 
 @pytest.mark.parametrize("named", sorted(set(re.findall(r"`trade\.(\w[\w.]*)", PAGE))))

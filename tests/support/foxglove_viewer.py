@@ -13,6 +13,8 @@ from tests.support.waiting import PATIENCE_S
 
 PROTOCOL: Final = Subprotocol("foxglove.sdk.v1")
 MESSAGE_DATA: Final = 1
+UNKNOWN: Final = "nknown channel"
+"""What the server answers, and logs, if a viewer subscribes sooner than the server has noted its own offer."""
 
 
 class Viewer:
@@ -23,6 +25,8 @@ class Viewer:
         self.channels: dict[str, dict[str, Any]] = {}
         self.withdrawn: list[int] = []
         self._topics: dict[int, str] = {}
+        self._numbers: dict[int, int] = {}
+        """The number of the subscription of each channel."""
         self.info = self._read()
 
     def _read(self) -> Any:
@@ -39,14 +43,19 @@ class Viewer:
             self.channels |= {channel["topic"]: channel for channel in said["channels"]}
         elif said["op"] == "unadvertise":
             self.withdrawn += said["channelIds"]
+        elif said["op"] == "status" and UNKNOWN in said["message"]:  # foxglove-sdk 0.30 offers before it notes
+            refused = int(said["message"].rpartition(":")[2])
+            self._subscribe(self._numbers[refused], refused)
 
     def subscribe(self, topic: str) -> None:
         while topic not in self.channels:
             self.hear()
-        number = 100 + len(self._topics)
-        self._topics[number] = topic
-        asked = {"id": number, "channelId": self.channels[topic]["id"]}
-        self.send({"op": "subscribe", "subscriptions": [asked]})
+        number, channel = 100 + len(self._topics), self.channels[topic]["id"]
+        self._topics[number], self._numbers[channel] = topic, number
+        self._subscribe(number, channel)
+
+    def _subscribe(self, number: int, channel: int) -> None:
+        self.send({"op": "subscribe", "subscriptions": [{"id": number, "channelId": channel}]})
 
     def send(self, said: dict[str, Any]) -> None:
         self._socket.send(json.dumps(said))

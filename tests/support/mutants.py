@@ -1,6 +1,7 @@
 """The product broken on purpose, each in one way; as a plugin (``-p tests.support.mutants``) tests are run on one.
 
-``MUTANT`` in the environment says which. Broken locks have a place of their own: `tests.endurance.chaos._mutants`.
+``MUTANT`` in the environment says which. `tests.support.everywhere` breaks the processes that a test starts. Broken
+locks have a place of their own: `tests.endurance.chaos._mutants`.
 """
 
 import os
@@ -107,11 +108,26 @@ def _busiest(patch: Patch) -> None:
     patch(_departing, "busyness", lambda load: tuple(-each for each in busyness(load)))
 
 
+def _busiest_picked(patch: Patch) -> None:
+    """The service that is picked is the one with the most to do."""
+    from trade._calls import picking
+
+    busyness = picking.busyness
+    patch(picking, "busyness", lambda load, under_way: tuple(-each for each in busyness(load, under_way)))
+
+
 def _twin_unplaced(patch: Patch) -> None:
     """The twin stays where it came up, and says that it is where the robot is."""
     from trade_gateway.mcp import Twin
 
     patch(Twin, "_place", lambda self, *_: True)
+
+
+def _deviations_unseen(patch: Patch) -> None:
+    """Calls are not compared with what is usual."""
+    from trade._telemetry.call_model import CallWatch
+
+    patch(CallWatch, "see", lambda self, span: None)
 
 
 def _no_stop_line(patch: Patch) -> None:
@@ -120,6 +136,59 @@ def _no_stop_line(patch: Patch) -> None:
 
     patch(service, "host_socket", lambda _: None)
     patch(service, "_network_sockets", lambda *_: [])
+
+
+def _ordinary(patch: Patch) -> None:
+    """The processes of devices run as any other."""
+    from trade_gateway.process._real_time import RealTime
+
+    patch(RealTime, "take", lambda self: [])
+
+
+def _first_of_several(patch: Patch) -> None:
+    """A constraint that several services meet means one of them."""
+    from trade._container.lookup import Lookup
+
+    matches = Lookup._await_matches
+    patch(Lookup, "_await_matches", lambda self, *which: matches(self, *which)[:1])
+
+
+def _discovery_never(patch: Patch) -> None:
+    """No container is searched for."""
+    from trade._discovery.dialer import Dialer
+
+    patch(Dialer, "set_discovery", lambda self, on: None)
+
+
+def _no_question(patch: Patch) -> None:
+    """Orders in sentences are carried out without a confirmation."""
+    from trade_gateway.language._dialogue import Talk
+
+    say = Talk.say
+    patch(Talk, "say", lambda self, sentence, **terms: say(self, sentence, **{**terms, "confirmed": True}))
+
+
+def _rules_without_if(patch: Patch) -> None:
+    """Rules fire whether their condition holds or not."""
+    from trade.rules._file import Condition
+
+    patch(Condition, "holds", lambda self, answer: True)
+
+
+def _all_may_read(patch: Patch) -> None:
+    """The dashboard shows everything to all its users."""
+    from trade_gateway.clients._authorizer import ClientAuthorizer
+
+    patch(ClientAuthorizer, "require_some", lambda self, *_: None)
+    patch(ClientAuthorizer, "require_system", lambda self, *_: None)
+    patch(ClientAuthorizer, "may_system", lambda self, *_: True)
+
+
+def _any_order(patch: Patch) -> None:
+    """The containers of a system file start in the order of the file."""
+    from trade_gateway.config._tables import Tables
+
+    patch(Tables, "_order", lambda self: list(self._entries))
 
 
 HOW: Final[dict[str, Callable[[Patch], None]]] = {
@@ -133,8 +202,17 @@ HOW: Final[dict[str, Callable[[Patch], None]]] = {
     "uses-uncounted": _uses_uncounted,
     "no-priority": _no_priority,
     "busiest": _busiest,
+    "busiest-picked": _busiest_picked,
     "twin-unplaced": _twin_unplaced,
+    "deviations-unseen": _deviations_unseen,
     "no-stop-line": _no_stop_line,
+    "ordinary": _ordinary,
+    "first-of-several": _first_of_several,
+    "discovery-never": _discovery_never,
+    "no-question": _no_question,
+    "rules-without-if": _rules_without_if,
+    "all-may-read": _all_may_read,
+    "any-order": _any_order,
 }
 
 

@@ -1,5 +1,14 @@
 """Robot files that tests of drivers and of simulators share."""
 
+import msgspec
+
+from trade_drivers import Robot
+from trade_hil_sim import DeviceState
+
+_DEFAULT_S, _PATIENT_S = 0.25, 1.0
+_REST_RAD_S = 0.04
+"""A Dynamixel shows speeds up to 0.036 rad/s as one unit or none, which its driver takes for rest."""
+
 HEAD = """
 [robot]
 name = "rosie"
@@ -98,3 +107,20 @@ max_accel_rad_s2 = 20.0
 [group.tail]
 joints = ["tail.root", "tail.tip"]
 """
+
+
+def patient(robot: Robot) -> Robot:
+    """The robot with drivers that wait longer for simulated devices: those share a processor with them and with others.
+
+    Buses that say `stale_after_s` themselves keep it.
+    """
+    buses = [
+        msgspec.structs.replace(bus, stale_after_s=_PATIENT_S) if bus.stale_after_s == _DEFAULT_S else bus
+        for bus in robot.buses
+    ]
+    return msgspec.structs.replace(robot, buses=type(robot.buses)(buses))
+
+
+def at_rest(device: DeviceState) -> bool:
+    """Whether a driver measures it at rest; its planned course may end a moment later."""
+    return abs(device.velocity_rad_s) < _REST_RAD_S

@@ -4,6 +4,7 @@ import json
 import os
 import queue
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,14 +16,18 @@ from typing import Any
 
 import pytest
 
+from tests.support.c_compiler import library
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.networks import Networks, why_not
 from tests.system.sshd import Sshd, why_no_sshd
+from tests.system.supervised import Keeping
+from trade import Container
 from trade_hil_sim import SimProcess, events, writes
 
 ROOT = Path(__file__).parents[2]
 ROSIES_HEAD = ROOT / "examples" / "head.toml"
 DORA = ROOT / "examples" / "dora.toml"
+C_GRIPPER = ROOT / "examples" / "c_gripper"
 
 
 class Program:
@@ -104,6 +109,15 @@ class Program:
 
 
 @pytest.fixture
+def c_gripper(tmp_path: Path) -> Path:
+    """The program of examples/c_gripper, beside its compiled library."""
+    folder = tmp_path / "c_gripper"
+    folder.mkdir()
+    library(C_GRIPPER / "gripper.c", folder / "libgripper.so")
+    return shutil.copy(C_GRIPPER / "gripper.py", folder)
+
+
+@pytest.fixture
 def run(system: str) -> Iterator[Callable[..., Program]]:
     """Starts Python programs in the test's system, also inside of a network namespace; ends them."""
     programs: list[Program] = []
@@ -149,7 +163,8 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
 
     def up() -> Rosie:
         log = tmp_path / f"bytes-{next(counter)}.jsonl"
-        return Rosie(run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim", "--sim-log", log, "--json"), log)
+        robot = patient_copy(ROSIES_HEAD, tmp_path)
+        return Rosie(run("-m", "trade_gateway", "up", robot, "--sim", "--sim-log", log, "--json"), log)
 
     return up
 
@@ -205,12 +220,20 @@ class Bench:
         return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
 
 
+def patient_copy(robot_file: Path, folder: Path) -> Path:
+    """A copy of a robot file whose drivers and devices wait longer for each other: they share a processor."""
+    copy = folder / robot_file.name
+    text = re.sub(r"(?m)^driver = .*", r"\g<0>\nstale_after_s = 1", robot_file.read_text(encoding="utf-8"))
+    copy.write_text(re.sub(r"(?m)^watchdog_s = [\d.]+", "watchdog_s = 1", text), encoding="utf-8")
+    return copy
+
+
 def at_ports(robot_file: Path, sim: SimProcess, folder: Path) -> Path:
-    """A copy of a robot file that names the ports of its simulation."""
-    text = robot_file.read_text(encoding="utf-8")
+    """A patient copy of a robot file that names the ports of its simulation."""
+    copy = patient_copy(robot_file, folder)
+    text = copy.read_text(encoding="utf-8")
     for bus, port in sim.ports.items():
         text = re.sub(rf'(\[bus\.{bus}\][^\[]*?port = )"[^"]*"', rf'\g<1>"{port}"', text)
-    copy = folder / robot_file.name
     copy.write_text(text, encoding="utf-8")
     return copy
 
@@ -233,6 +256,20 @@ def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterato
 @pytest.fixture
 def bench(benches: Callable[..., Bench]) -> Bench:
     return benches(ROSIES_HEAD)
+
+
+@pytest.fixture
+def keeping(system: str, tmp_path: Path, start_container: Callable[..., Container]) -> Iterator[Callable[..., Keeping]]:
+    made: list[Keeping] = []
+
+    def keep(text: str, grace_s: float = 20.0) -> Keeping:
+        made.append(Keeping(tmp_path, start_container(f"door{len(made)}"), grace_s))
+        made[-1].go_by(text)
+        return made[-1]
+
+    yield keep
+    for one in made:
+        one.supervisor.close()
 
 
 @pytest.fixture

@@ -1,5 +1,10 @@
-"""A client that sets the pan joint moving and stays: ``mover.py call|start|jog|relay|plan``; says when it has begun."""
+"""A client that sets the pan joint moving and stays; says when it has begun.
 
+``mover.py call|start|leave|forked|jog|relay|plan``. ``leave`` exits at SIGTERM, with its started move under way.
+"""
+
+import os
+import signal
 import sys
 import time
 
@@ -31,6 +36,17 @@ def main(how: str) -> None:
             run = handle("move_to").start(FAR_RAD, SPEED_RAD_S)
             say()
             run.result()
+        case "leave":
+            handle("move_to").start(FAR_RAD, SPEED_RAD_S)
+            signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+            say()
+            time.sleep(120)
+        case "forked":
+            move = handle("move_to")
+            if os.fork() == 0:
+                time.sleep(120)  # it keeps the sockets of the transport open
+            say()
+            move(FAR_RAD, SPEED_RAD_S)
         case "jog":
             turn = handle("set_velocity")
             say()

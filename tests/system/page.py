@@ -1,4 +1,4 @@
-"""An HTTP client that sets the pan joint moving and stays: ``page.py URL TOKEN socket|request|session``."""
+"""An HTTP client that sets the pan joint moving and stays: ``page.py URL TOKEN socket|request|session|agent``."""
 
 import json
 import sys
@@ -7,6 +7,10 @@ import time
 import urllib.request
 from typing import Any
 
+import anyio
+import httpx
+from mcp import ClientSession
+from mcp.client.streamable_http import streamable_http_client
 from websockets.sync.client import connect
 
 CALL = {"args": [1.3, 0.1], "deadline_s": 120}
@@ -40,6 +44,21 @@ def main(url: str, token: str, how: str) -> None:
             while moving.is_alive():
                 ask("/session")
                 time.sleep(0.1)
+        case "agent":
+            anyio.run(act, url, token)
+
+
+async def act(url: str, token: str) -> None:
+    """Move as an agent does."""
+    connections = httpx.AsyncClient(headers={"Authorization": f"Bearer {token}"}, timeout=120)
+    async with (
+        streamable_http_client(f"{url}/mcp", http_client=connections) as (hears, says, _),
+        ClientSession(hears, says) as session,
+    ):
+        await session.initialize()
+        await session.call_tool("lock", {"group": "rosie.neck.pan"})
+        say()
+        await session.call_tool("call", {"group": "rosie.neck.pan", "name": "move_to", **CALL})
 
 
 def say() -> None:

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -107,12 +108,33 @@ def test_the_twin_is_brought_to_where_a_part_of_each_kind_is(system: str, part: 
     with memory_system() as memory, closing(Twin(ROOT / "examples" / f"{part}.toml")) as twin:
         robot = memory.container("robot")
         robot.register(Part(), group)
-        tried = twin.call(robot.find(where(name="state", group=group)), [], 10.0, there)
+        tried = twin.call(robot.find(where(name="state", group=group)), [], 10.0, {group: there})
     assert tried.began_where_the_robot_is, tried
     for real, dry in zip(_several(there), _several(tried.before), strict=True):
         assert {name: dry[name] for name in real} == {
             name: pytest.approx(value, abs=0.02 if "rad" in name else 0.001) for name, value in real.items()
         }
+
+
+def test_a_dry_run_begins_with_the_whole_robot_where_it_is_and_says_what_is_elsewhere(
+    system: str, tmp_path: Path
+) -> None:
+    head, hand = ((ROOT / "examples" / f"{part}.toml").read_text() for part in ("head", "hand"))
+    both = tmp_path / "both.toml"
+    both.write_text(head + hand[hand.index("[bus.") :])
+    states = {"rosie.neck.tilt": {"position_rad": -0.3}, "rosie.neck.pan": {"position_rad": 0.6}}
+    with memory_system() as memory, closing(Twin(both)) as twin:
+        robot = memory.container("robot")
+        robot.register(Part(), "rosie.head")
+        robot.register(Part(), "rosie.left.hand")
+        state_of = {group: robot.find(where(name="state", group=group)) for group in ("rosie.head", "rosie.left.hand")}
+        tried = twin.call(state_of["rosie.left.hand"], [], 10.0, states)
+        assert (tried.began_where_the_robot_is, tried.elsewhere) == (True, ())
+        unknown = twin.call(
+            state_of["rosie.head"], [], 10.0, {"rosie.left.hand": None, "rosie.tail": [{"position_rad": 1}]}
+        )
+    assert [round(one["position_rad"], 1) for one in unknown.before] == [0.6, -0.3]
+    assert (unknown.began_where_the_robot_is, unknown.elsewhere) == (False, ("rosie.tail", "rosie.left.hand"))
 
 
 def _several(state: Any) -> list[dict[str, Any]]:

@@ -34,7 +34,7 @@ from trade._protocol.messages import (
 )
 from trade._security.authorizer import FUNCTIONS
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")

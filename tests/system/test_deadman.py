@@ -16,15 +16,27 @@ from trade_hil_sim import events, writes
 MOVER = Path(__file__).with_name("mover.py")
 HALFWAY_RAD = 0.65
 """Where a joint that is not stopped gets to long after everything that stops it should have."""
+SHORT_OF_GOAL_RAD = 1.2
 
 Run = Callable[..., Program]
 
 
 def moving_client(bench: Bench, run: Run, how: str) -> Program:
+    since = time.monotonic()
     client = run(MOVER, how)
     client.json()
-    wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1)))
+    wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1, since=since)))
     return client
+
+
+def stop_delay_s(bench: Bench, run: Run, how: str, number: int) -> float:
+    """The time from the end of a client in its move to the first bytes that stop the joint, by the simulator's log."""
+    client = moving_client(bench, run, how)
+    ended_at = time.monotonic()
+    client.signal(number)
+    bench.stopped_short(ended_at, SHORT_OF_GOAL_RAD)
+    client.process.kill()
+    return writes(bench.sim.entries(), device_id=1, register="goal_position", since=ended_at)[0].t - ended_at
 
 
 @pytest.mark.parametrize(
@@ -64,3 +76,25 @@ def test_S03_a_motion_ends_with_any_session_on_whose_behalf_it_is(bench: Bench, 
     ended_at = time.monotonic()
     (planner if killed == "plan" else relay).signal(signal.SIGKILL)
     bench.stopped_short(ended_at, HALFWAY_RAD)
+
+
+def test_S05_a_joint_stops_no_later_where_calls_take_the_local_path(
+    bench: Bench, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def delays_s() -> tuple[float, float, float]:
+        return (
+            min(stop_delay_s(bench, run, "call", signal.SIGKILL) for _ in range(3)),
+            stop_delay_s(bench, run, "leave", signal.SIGTERM),
+            stop_delay_s(bench, run, "call", signal.SIGSTOP),
+        )
+
+    killed_s, left_s, frozen_s = delays_s()
+    forked_s = stop_delay_s(bench, run, "forked", signal.SIGKILL)
+    bench.driver.close()
+    monkeypatch.setenv("TRADE_LOCAL_PATH", "0")
+    bench.restart()
+    killed_without_s, left_without_s, lease_s = delays_s()
+    assert killed_s < killed_without_s + lease_s / 4
+    assert left_s < left_without_s + lease_s / 4
+    assert frozen_s < lease_s * 1.5
+    assert forked_s < lease_s / 2  # its child keeps the sockets of the transport open

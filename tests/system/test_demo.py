@@ -2,16 +2,20 @@
 
 import json
 import math
+import os
 import re
 import runpy
 import signal
 import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
+import msgspec
 import pytest
 from mcap.reader import make_reader
 
@@ -19,7 +23,7 @@ from tests.support.http_clients import Client
 from tests.support.waiting import wait_until
 from tests.system.conftest import ROOT, Program
 from tests.system.networks import ip, why_not
-from trade_drivers import load
+from trade_drivers import load, parse
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_hil_sim import frames, motion_writes, read_log
 
@@ -54,6 +58,41 @@ def test_a_demo_that_fails_on_a_busy_computer_says_so() -> None:
     busy = runpy.run_path(str(DEMO.with_name("demo_busy.py")))["busy"]
     assert busy(40.0, 2).startswith("this computer is busy (load 40 on 2 cores); try again when it is not")
     assert not busy(1.0, 2)
+
+
+@pytest.mark.parametrize("name", ["rosie.toml", "head.toml"])
+def test_the_robot_of_the_demo_differs_from_the_example_in_rates_and_times_only(name: str) -> None:
+    patient = runpy.run_path(str(DEMO.with_name("demo_robot.py")))["patient"]
+    text = DEMO.with_name(name).read_text(encoding="utf-8")
+    example, made = parse(text, name), parse(patient(text), name)
+    assert msgspec.structs.replace(made, buses=example.buses, given=example.given) == example
+    for before, after in zip(example.buses, made.buses, strict=True):
+        assert after.rate_hz <= before.rate_hz
+        assert after.watchdog_s >= before.watchdog_s
+        assert after.stale_after_s > before.stale_after_s
+        times = {"rate_hz": before.rate_hz, "watchdog_s": before.watchdog_s, "stale_after_s": before.stale_after_s}
+        assert msgspec.structs.replace(after, **times) == before
+
+
+BUSY = "import os\nwhile os.getppid() == {parent}:\n    for _ in range(10**6):\n        pass"
+"""It keeps one core busy until it is killed, or the process that started it has ended."""
+FAULTY = re.compile(
+    r"did not answer|does not answer|held up|watchdog|silent|fault|too busy|is busy|lost|warning|Traceback|\wError"
+    r"|DeadlineExceeded|OutcomeUnknown|ToleranceExceeded|NotStopped|demo failed",
+    re.IGNORECASE,
+)
+"""What a demo without faults of devices does not say."""
+
+
+@contextmanager
+def busy_cores() -> Generator[None]:
+    with ExitStack() as undo:
+        for _ in range(os.cpu_count() or 1):
+            words = [sys.executable, "-S", "-c", BUSY.format(parent=os.getpid())]
+            program = subprocess.Popen(words, start_new_session=True)
+            undo.callback(program.wait)
+            undo.callback(program.kill)
+        yield
 
 
 def left_of(story: str) -> list[str]:
@@ -180,3 +219,13 @@ def test_a_demo_that_is_ended_in_the_middle_leaves_nothing(run: Run) -> None:
     demo.signal(signal.SIGTERM)
     assert demo.wait() == 130, demo.errors
     assert why_not() or left_of(story) == []
+
+
+# Last, as it keeps all cores busy.
+def test_rosie_walks_beside_a_busy_process_for_each_core_and_nothing_looks_like_a_fault(run: Run) -> None:
+    with busy_cores():
+        demo = run(DEMO)
+        story = reported(demo, "confirms every line above")
+        assert demo.wait() == 0, demo.errors
+    assert not FAULTY.findall(story)
+    assert demo.errors == []

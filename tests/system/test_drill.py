@@ -13,7 +13,7 @@ from tests.system.conftest import ROSIES_HEAD
 _SECONDS = 500
 """A drill starts a dozen processes, one after the other."""
 
-pytestmark = pytest.mark.timeout(_SECONDS + 60)
+pytestmark = [pytest.mark.timeout(_SECONDS + 60)]
 
 
 def _drill(*words: str | Path) -> subprocess.CompletedProcess[str]:

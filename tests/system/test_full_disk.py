@@ -10,11 +10,11 @@ import pytest
 from tests.support.full_disks import SmallDisk, small_disk
 from tests.support.waiting import wait_until
 from tests.system.conftest import Rosie
-from trade import Container, where
+from trade import CallModel, Container, where
 from trade.errors import ConfigurationError, MotionStopped, Stopped
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import _write
-from trade_gateway.cli.watching._profile import Model, read, write
+from trade_gateway.cli.watching._profile import read, write
 from trade_gateway.http import add_token
 from trade_gateway.pki._authority import Authority
 from trade_hil_sim import events, read_log
@@ -113,11 +113,11 @@ def test_a_robot_file_is_as_it_was(disk: SmallDisk) -> None:
 
 def test_an_earlier_learned_model_stays(disk: SmallDisk) -> None:
     file = disk.folder / "usual.json"
-    learned = Model(v=1, after={"look": {"grip": 2}})
+    learned = CallModel(v=1, after={"look": {"grip": 2}})
     write(file, learned)
     disk.fill()
     with pytest.raises(ConfigurationError):
-        write(file, Model(v=1, after={}))
+        write(file, CallModel(v=1, after={}))
     assert read(file) == learned
 
 

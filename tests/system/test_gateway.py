@@ -91,6 +91,10 @@ def test_a_service_is_visible_and_callable_only_once_it_is_exported(site: Site, 
     site.change(site.file, "export = []", 'export = ["lobby"]')
     assert [label for _, label in arm.ask("group", "lobby", "planner")] == ["lobby.echo"]
     assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
+    site.change(site.file, 'export = ["lobby"]', "export = []")
+    assert arm.ask("sees", "2") == ["cellar.echo", "rosie.arm.echo"]
+    site.change(site.file, "export = []", 'export = ["lobby"]')
+    assert arm.ask("sees", "3") == ["cellar.echo", "lobby.echo", "rosie.arm.echo"]
 
 
 def test_an_unauthorized_call_is_refused_by_the_caller_the_callee_and_the_gateway(

@@ -16,7 +16,7 @@ from tests.system.networks import Member, Networks, ip
 from tests.system.sites import GATEWAY, SYSTEM, Site
 from trade_hil_sim import events
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300)]
 
 POLICY = """
 gateways = ["door"]

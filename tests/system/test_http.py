@@ -28,7 +28,8 @@ class HttpProcess:
     def __init__(self, run: Run, trade_command: Command, folder: Path) -> None:
         self._tokens, self._command, self._run = folder / "tokens.toml", trade_command, run
         self.token = self.new("anna")
-        self.program = run("-m", "trade_gateway", "http", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--json")
+        words = ["http", "--listen", "127.0.0.1:0", "--tokens", self._tokens, "--mcp", "--json"]
+        self.program = run("-m", "trade_gateway", *words)
         self.url: str = self.program.json()["url"]
 
     def new(self, identity: str) -> str:
@@ -59,6 +60,8 @@ def http(bench: Bench, run: Run, trade_command: Command, tmp_path: Path) -> Http
         ("request", signal.SIGKILL),
         ("session", signal.SIGKILL),
         ("session", signal.SIGSTOP),
+        ("agent", signal.SIGKILL),
+        ("agent", signal.SIGSTOP),
     ],
 )
 def test_S03_motion_of_a_page_stops_with_it_while_the_http_gateway_runs(
@@ -93,3 +96,6 @@ def test_an_http_gateway_without_tokens_is_refused(trade_command: Command, tmp_p
     refused = trade_command("http", "--listen", "127.0.0.1:0", "--tokens", tmp_path / "none.toml")
     assert refused.returncode == 1
     assert "trade http token" in refused.stderr
+    refused = trade_command("http", "--listen", "127.0.0.1:0", "--ask-first", "rosie")
+    assert refused.returncode == 1
+    assert "Add --mcp" in refused.stderr

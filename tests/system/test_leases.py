@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from tests.support.waiting import wait_until
-from tests.system.test_supervisor import COUNTER, Keeping, call
+from tests.system.supervised import COUNTER, Keeping, call
 from trade import Container
 from trade.errors import AccessDenied, ConfigurationError
+from trade_gateway.process._kill_timer import uptime_s
 from trade_gateway.supervisor import ChildServices
 
 STANDBY = '[container.a]\nstands_in_for = "rover"\nlease_s = 2.0\nsave_every_s = 1\n'
@@ -119,3 +120,32 @@ def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
             there.keep_for(caller, gateway, turn, 9, one)
     with pytest.raises(ConfigurationError, match="no standby for a container 'b'"):
         pair.base.supervisor.stand_in("b")
+
+
+def test_a_container_moves_with_its_state_from_a_busy_host_to_the_least_loaded_one(
+    pair: Pair, tmp_path: Path, start_container: Callable[..., Container]
+) -> None:
+    standby = STANDBY.replace('"rover"', '["rover", "cart"]')
+    cart = Keeping(tmp_path, start_container("cart"), 20.0)
+    try:
+        pair.base.go_by(f"{standby}move_above = 1.0\n{COUNTER}")
+        pair.rover.go_by(LEASED + COUNTER)
+        first = pair.rover.become("a", "up")
+        cart.go_by(LEASED + COUNTER)
+        call("count")
+        there = pair.base.supervisor.stand_in("a")
+        wait_until(lambda: there._loads._loads.keys() == {"", "rover", "cart"}, "base knows the loads of all hosts")
+        pair.base.go_by(standby + COUNTER)  # from now on, the test says what the loads are
+        wait_until(lambda: "cart" in there._arbiter.asked_at, "cart asks for it")
+        for s in (6.0, 4.0, 2.0, 0.0):
+            now = uptime_s() - s
+            for host, load in (("", 0.5), ("rover", 0.9), ("cart", 0.1)):
+                there._loads.note(host, load, now)
+            there._balance(now, above=0.8)
+        cart.become("a", "up")
+        assert call("shown") == 1  # saved on its way, not by the interval
+        left = pair.rover.become("a", "elsewhere")
+        assert left.pid == 0
+        assert first.pid != (cart.child("a") or first).pid
+    finally:
+        cart.supervisor.close()

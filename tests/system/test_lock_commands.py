@@ -187,7 +187,7 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
     [
         (["lock", "rosie.head"], 2, "UsageError: trade lock: say what to run"),
         (["lock", "--", "true"], 2, "UsageError: trade lock: say what to lock"),
-        (["lock", "nowhere", "--wait", "0", "--", "true"], 1, "NoSuchService: no service matches group='nowhere'"),
+        (["lock", "nowhere", "--wait", "0", "--", "true"], 3, "NoSuchService: no service matches group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
         (["estop", "--clear", "--limit", "0.2"], 1, "NoContainerFound: no other container was found in system "),
@@ -218,7 +218,7 @@ def test_a_listing_without_containers_is_empty_and_names_the_silent_endpoint(
 
 def test_a_call_without_containers_names_the_silent_endpoint(trade_command: Command, no_container_there: str) -> None:
     said = trade_command("--connect", no_container_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
-    assert said.returncode == 1
+    assert said.returncode == 3
     assert said.stderr.startswith("NoSuchService: no service matches")
     assert f"no container answers at {no_container_there} (TRADE_CONNECT)" in said.stderr
     assert "TRADE_SYSTEM" not in said.stderr
@@ -228,7 +228,7 @@ def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], tra
     rosie_up()
     for words in (["resume", "rosie.nekc"], ["unlock", "rosie.nekc", "--break", "it hangs"]):
         said = trade_command(*words)
-        assert said.returncode == 1
+        assert said.returncode == 3
         assert "Did you mean rosie.neck" in said.stderr
 
 
@@ -243,7 +243,7 @@ def test_a_link_without_containers_is_reported_as_a_possible_other_system(
 
 def test_resume_of_nothing_is_of_no_such_service(trade_command: Command) -> None:
     said = trade_command("resume", "rosie")
-    assert said.returncode == 1
+    assert said.returncode == 3
     assert said.stderr.startswith("NoSuchService: no service matches group='rosie'")
 
 
@@ -274,7 +274,7 @@ def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_comman
     assert move() == pytest.approx(0.05, abs=0.02)
     assert "no e-stop is open" in trade_command("estop", "--clear").stdout
     unknown = trade_command("estop", "--clear", "abc")
-    assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (1, True)
+    assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (3, True)
 
 
 def test_S09_a_robot_that_comes_up_with_one_open_says_so_and_how_it_is_cleared(

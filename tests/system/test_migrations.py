@@ -191,4 +191,4 @@ def test_it_is_moved_on_the_command_line(
         wait_until(lambda: caller.answers > answers)
     assert_alive_once(folder, [pids["old"], pids["new"]])
     refused = trade_command("migrate", "hall", "--to", "nowhere")
-    assert (refused.returncode, "no service matches" in refused.stderr) == (1, True)
+    assert (refused.returncode, "no service matches" in refused.stderr) == (3, True)

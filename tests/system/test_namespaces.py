@@ -17,7 +17,7 @@ from trade_hil_sim import events
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "20"))
 MOVER = Path(__file__).with_name("mover.py")
 HALFWAY_RAD = 0.65
-pytestmark = pytest.mark.timeout(120 + 15 * ROUNDS)
+pytestmark = [pytest.mark.timeout(120 + 15 * ROUNDS)]
 
 
 class Cable:

@@ -16,7 +16,7 @@ from tests.system.two_hosts import LEASE_S, Life, TwoHosts, now, overlaps, two_h
 
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "4"))
 SEED = int(os.environ.get("SEED", "1"))
-pytestmark = pytest.mark.timeout(180 + 90 * ROUNDS)
+pytestmark = [pytest.mark.timeout(180 + 90 * ROUNDS)]
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ The nodes are rospy of the distribution; a package of other hands that speaks rm
 a node of our own that says so as rmw_zenoh does. The judge of motion is the simulator's log.
 """
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -14,7 +13,6 @@ from typing import Any, Protocol
 import pytest
 
 import trade
-from tests.support.c_compiler import library
 from tests.support.ros1_system import Peer, need_ros1
 from tests.support.ros1_system import Stand as Ros1Stand
 from tests.support.ros2_processes import Process, Router, free_port
@@ -24,7 +22,6 @@ from trade import Handle, errors, where
 from trade_hil_sim import events, writes
 
 FAR_RAD = 1.2
-EXAMPLE = Path(__file__).parents[2] / "examples" / "c_gripper"
 HALFWAY_RAD = 0.6
 """Where a joint that is not stopped gets to long after everything that stops it should have."""
 FILE = """
@@ -199,15 +196,6 @@ class Bridged:
 
     def got_no_goal(self, since: float) -> bool:
         return not writes(self.bench.sim.entries(), device_id=1, register="goal_position", since=since)
-
-
-@pytest.fixture
-def c_gripper(tmp_path: Path) -> Path:
-    """The program of examples/c_gripper, beside its compiled library."""
-    folder = tmp_path / "c_gripper"
-    folder.mkdir()
-    library(EXAMPLE / "gripper.c", folder / "libgripper.so")
-    return shutil.copy(EXAMPLE / "gripper.py", folder)
 
 
 @pytest.fixture

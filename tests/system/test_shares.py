@@ -14,7 +14,7 @@ from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300)]
 
 LAB = """
 [roles.driver]

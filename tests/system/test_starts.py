@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import shlex
+import shutil
 import socket
 import subprocess
 import sys
@@ -45,6 +47,42 @@ def test_a_container_is_started_used_and_ended_on_another_host(sshd: Sshd) -> No
         instantiate = trade.find(where(name="instantiate", container="eyes"))
         [see] = instantiate("sight:Eye", (), ["rosie.eyes"])
         assert see() == "a cat"
+
+
+def test_another_container_starts_one_with_all_that_it_needs_and_code_is_brought_to_it(
+    sshd: Sshd,
+    start_container: Callable[[str], trade.Container],
+    trade_command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A service has no file of ssh's settings: it takes those of its user."""
+    (tmp_path / "bin").mkdir()
+    ours = tmp_path / "bin" / "ssh"
+    ours.write_text(f'#!/bin/sh\nexec {shutil.which("ssh")} -F {sshd.config} "$@"\n')
+    ours.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{ours.parent}:{os.environ['PATH']}")
+    (tmp_path / "brought_eye.py").write_text(
+        "from trade import service\nclass Eye:\n    @service\n    def see(self) -> str:\n        return 'a dog'\n"
+    )
+    code = tmp_path / "code"
+    code.mkdir()
+    (tmp_path / "brought_eye.py").rename(code / "brought_eye.py")
+    shown = trade_command("code", code)
+    start_container("starter")
+    start = trade.find(where(name="start_container", container="starter"), wait_s=30).with_(deadline_s=60)
+    started = start(
+        "robot",
+        "eyes",
+        allow=["brought_eye:Eye"],
+        command=HERE,
+        environment={"TRADE_CODE": shown.stdout.strip(), "TRADE_STATE_DIR": str(tmp_path / "state")},
+    )
+    with ended("eyes", started.pid):
+        sent = trade_command("code", code, "--to", "eyes")
+        assert sent.returncode == 0, sent.stderr
+        [see] = trade.find(where(name="instantiate", container="eyes"))("brought_eye:Eye", (), ["rosie.eyes"])
+        assert see() == "a dog"
 
 
 def test_it_is_started_on_the_command_line_and_outlives_that(sshd: Sshd, trade_command: Command) -> None:

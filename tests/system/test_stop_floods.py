@@ -22,7 +22,7 @@ PER_S, IDLE = "1000", "1000"
 MANY = [f"10.231.7.{last}" for last in range(10, 210)]
 MOST_DESCRIPTORS = 1200
 """Above what a container has anyway: the strangers of both ports, 128 and 256, and what comes until that is noticed."""
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300)]
 
 
 class Flood:

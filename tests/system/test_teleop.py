@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 
 import trade
+from tests.support.simulated_robots import at_rest
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import ROOT, Bench, Program
 from trade import where
@@ -86,7 +87,7 @@ class Pair:
         return abs(self.position_rad(joint) - position_rad) < TOLERANCE_RAD and self.at_rest()
 
     def at_rest(self) -> bool:
-        return not any(device.moving for bus in self.sim.control.state() for device in bus.devices)
+        return all(at_rest(device) for bus in self.sim.control.state() for device in bus.devices)
 
 
 @pytest.fixture
@@ -187,7 +188,7 @@ def test_a_follower_whose_lock_is_broken_halts_and_obeys_other_clients(pair: Pai
     assert code == 1
     assert "LockLost" in errors or "MotionStopped" in errors  # whichever comes first
     move: Any = trade.find(where(name="move_to", group="pair.follower", kind="JointGroup"))
-    with trade.lock(where(group="pair.follower"), wait_s=PATIENCE_S):  # granted once the driver has reported the stop
+    with trade.lock(where(group="pair.follower"), wait_s=PATIENCE_S):  # granted once it is at rest
         assert pair.at_rest()
         assert move([0.1] * 6)[0] == pytest.approx(0.1, abs=TOLERANCE_RAD)
 

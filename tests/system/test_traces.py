@@ -122,6 +122,12 @@ def test_a_call_that_deviates_from_the_learned_profile_is_reported(looked: Conta
     odd = json.loads(_says("profile", "--against", learned, "--json", code=1))
     assert [(one["kind"], one["before"], one["after"]) for one in odd] == [("new", "mind.look", "rosie.neck.pan.state")]
     assert looked.trace(odd[0]["call_id"]).service == "rosie.neck.pan.state"
+    assert looked.name in json.loads(_says("profile", "--watch", learned, "--json"))["watched"]
+    for _ in range(2):
+        looked.call(where(name="state", group="rosie.neck.pan"))
+    events = json.loads(_says("containers", "--show", "events", "--json"))
+    deviated = [(one["container"], one["about"]) for one in events if one["kind"] == "call_deviated"]
+    assert deviated == [(looked.name, "rosie.neck.pan.state")]
 
 
 def test_logs_are_followed(run: Callable[..., Program], start_container: Callable[..., Container]) -> None:

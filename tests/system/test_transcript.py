@@ -41,6 +41,14 @@ STEPS: Final = (
     Step("", "trade services --group home"),
     Step("What has been asked to happen by itself?", "trade notifications", numbers=False),
     Step("Which hooks are attached to which services?", "trade hooks"),
+    Step("The same in English. What has changed since the last question?", 'trade ask "what is new?"'),
+    Step("", 'trade ask "which containers are there?"'),
+    Step("", 'trade ask "who can see a mug?"'),
+    Step("", 'trade ask "who has the head?"'),
+    Step("", 'trade ask "what would stop if lamps died?"'),
+    Step("", 'trade ask "is discovery on?"'),
+    Step("An order says what it would do, and waits for a yes.", 'trade ask "turn on discovery on care"'),
+    Step("", 'trade ask --yes "turn on discovery on care"'),
     Step("From now on calls are noted.", "trade tracing on"),
     Step("She looks to the left, and down.", "trade call rosie.head.move_to '[0.3, -0.2]'"),
     Step("Which calls were there, and what happened in this one?", "trade trace"),
@@ -52,6 +60,7 @@ STEPS: Final = (
     Step("", "trade policy check ann call rosie.head --policy examples/policy.toml"),
     Step("The lamp of the hall moves to the attic, with its brightness.", "trade migrate home.hall --to attic"),
     Step("", "trade call home.hall.level"),
+    Step("", 'trade ask "what is new?"'),
     Step("The end; what was started last is ended first.", "trade system down examples/system.toml"),
 )
 

@@ -17,7 +17,7 @@ from trade_hil_sim import events, writes
 
 ROUNDS = int(os.environ.get("CHAOS_ROUNDS", "5"))
 BOTH = where(group="rosie") | where(group="dora")
-pytestmark = pytest.mark.timeout(120 + 20 * ROUNDS)
+pytestmark = [pytest.mark.timeout(120 + 20 * ROUNDS)]
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from unittest import mock
 import pytest
 
 from tests.support.lock_log import Done, Log, read
+from tests.support.simulated_robots import at_rest
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
 from tests.system.siege import Driver
@@ -52,7 +53,7 @@ _PATIENCE: Final = "stale_after_s = 1\nwatchdog_s = 1"
 """On a busy host a driver or a simulation gets no time for half a second, whatever the version."""
 _FEW: Final = 4
 """Moves that show that a client continues."""
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.timeout(600)]
 
 
 class Stand:
@@ -166,7 +167,7 @@ class Stand:
 
     def moving(self, robot: str) -> bool:
         state = self.drivers[robot].sim.control.state()
-        return any(abs(device.velocity_rad_s) > 0 for bus in state for device in bus.devices)
+        return not all(at_rest(device) for bus in state for device in bus.devices)
 
     def close(self) -> None:
         for driver in self.drivers.values():

@@ -14,7 +14,7 @@ from trade_hil_sim import Entry, SimControl, events, read_log
 
 EXAMPLES = ROOT / "examples"
 SHOULDER = "dora.right.shoulder"
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.timeout(240)]
 
 
 def pictures_asked(log: Path, since: float) -> list[Entry]:

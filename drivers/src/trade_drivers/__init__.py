@@ -2,8 +2,8 @@
 
 from trade._protocol.schema_types import publish as _publish
 from trade_drivers._attach import AttachedRobot, attach
+from trade_drivers.bus._can_monitor import CanBusState, CanMonitor
 from trade_drivers.bus._jobs import WireError
-from trade_drivers.bus.can._monitor import CanBusState, CanMonitor
 from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found, scan
 from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Trouble
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState

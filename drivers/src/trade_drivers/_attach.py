@@ -13,7 +13,7 @@ from trade import Measure
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
-from trade_drivers.bus.can._monitor import CanMonitor
+from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.faults import FaultLog, FaultPoller, FaultStore
 from trade_drivers.faults._health import HEALTHY, HealthTeller
 from trade_drivers.interfaces._arm import Arm
@@ -184,7 +184,11 @@ def _default_state_dir() -> Path | None:
 
 def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLog:
     path = None if state_dir is None else state_dir / "faults" / f"{robot.name}.sqlite"
-    log = FaultLog(robot.name, None if path is None else FaultStore(path, _log.warning))
+    parts = (*robot.joints, *robot.grippers, *robot.arms, *robot.cameras, *robot.sensors, *robot.groups)
+    names = [
+        f"{robot.name}.{name}" for name in (*(part.name for part in parts), *(f"bus.{b.name}" for b in robot.buses))
+    ]
+    log = FaultLog(robot.name, None if path is None else FaultStore(path, _log.warning), devices=names)
     undo.callback(log.close)
     return log
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 from trade import Measure
 from trade.errors import DeviceError
-from trade_drivers.bus.can._monitor import CanMonitor
+from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.interfaces._motion import Motor, MotorState
 from trade_drivers.plugins._driver import AttachedBus
 from trade_drivers.robotfile import Robot

@@ -1,37 +1,52 @@
 """Checks command-line words: the usage error, and the services that the words name."""
 
+from typing import cast
+
 from trade import Constraint, Container, Handle, where
-from trade.errors import ConfigurationError, TooManyServices
+from trade._calls.picking import Pick
+from trade.errors import ConfigurationError
 
 
 class UsageError(ConfigurationError):
     """A usage error: wrong words on the command line; exit code 2."""
 
 
-def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
+def asked_for(
+    what: str,
+    *,
+    name: str | None,
+    group: str | None,
+    container: str | None = None,
+    needs: str | None = None,
+    achieves: str | None = None,
+) -> Constraint:
     """Builds a constraint from words of the command line.
 
     Raises:
         UsageError: the words are no valid constraint.
     """
     try:
-        return where(name=name, group=group, container=container)
+        return where(name=name, group=group, container=container, needs=needs, achieves=achieves)
     except ConfigurationError as bad:
         raise UsageError(where=what, problem=bad.problem) from None
 
 
-def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
+def find(visiting: Container, service: str, container: str | None, wait_s: float, pick: str | None = None) -> Handle:
     """Finds a service by group and name; an exact group match wins over groups beneath it.
+
+    Args:
+        visiting: the container of the command.
+        service: the words.
+        container: the name of the service's container, if given.
+        wait_s: how long to wait for it, in seconds.
+        pick: which one to take if several match, as for `trade.find`.
 
     Raises:
         UsageError: the text does not name a service.
     """
-    group, _, name = service.rpartition(".")
-    constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)
     try:
-        return visiting.find(constraint, wait_s=wait_s)
-    except TooManyServices:
-        exact = [handle for handle in visiting.services(constraint) if group in handle.groups]
-        if len(exact) == 1:
-            return exact[0]
-        raise
+        return visiting.find(service, container=container, wait_s=wait_s, pick=cast("Pick | None", pick))
+    except ConfigurationError as bad:
+        if pick is not None and "pick" in bad.problem:
+            raise UsageError(where=f"--pick {pick}", problem=bad.problem) from None
+        raise UsageError(where=f"service {service!r}", problem=bad.problem) from None

@@ -59,6 +59,7 @@ def test_a_synchronous_call_inside_a_callback_deadlocks(_: object) -> None:
         assert answers == [5]
 
 
+@pytest.mark.system
 @complaint(
     ("wifi", mutants.containers_are_searched_by_multicast, "in vain until the planner reaches the robot"),
     also=("loopback",),

@@ -208,6 +208,10 @@ class SafetyRig(ABC):
     def sent_away(self, since: float, within_rad: float = 0.002) -> Sequence[object]:
         """Everything sent that leads the device away from where it is, farther than joints brake."""
 
+    def sent_on_waking(self, since: float) -> Sequence[object]:
+        """What a driver sends, after its device has stopped without it, that must not be."""
+        return self.sent_away(since)
+
     @abstractmethod
     def events(self, name: str, since: float) -> Sequence[Entry]:
         """What the simulator noted of the device."""

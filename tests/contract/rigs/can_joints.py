@@ -12,7 +12,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
 from trade.errors import DeviceFault
-from trade_hil_sim import Entry, Mute, WrongModel
+from trade_hil_sim import Entry, Late, Mute, WrongModel
 
 _NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
 _QUICK_STOP = 0x02
@@ -198,6 +198,16 @@ class DamiaoRig(OdriveRig):
     def swap(self) -> None:
         self.plug()
         self.configure(('model = "DM4310"', 'model = "DM4340"'))
+
+    def stopped_by_itself(self, since: float) -> float:
+        """From then on it answers late, as to a busy computer: no hold may precede its answer."""
+        stopped = super().stopped_by_itself(since)
+        self.bench.sim.do(Late(ids=(FIRST, SECOND), s=0.03))
+        return stopped
+
+    def sent_on_waking(self, since: float) -> Sequence[object]:
+        """No set-point, not even one that leads nowhere: the motor gets one in each cycle of a motion."""
+        return self.targets_rad(since)
 
     def ordered(self, since: float) -> Sequence[object]:
         """Every cycle sends an enabled motor to where it is."""

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 from tests.contract.rigs.base import DriverProcess, Request, SafetyRig
+from tests.support.simulated_robots import at_rest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome
 from trade import Container
@@ -137,7 +138,7 @@ class JointRig(SafetyRig):
         return bool(self.truth().moving)
 
     def at_rest(self) -> bool:
-        return abs(self.truth().velocity_rad_s) < 0.03
+        return at_rest(self.truth())
 
     def travelled(self) -> float:
         return float(self.truth().position_rad) / (0.93 * self.max_rad)

@@ -27,6 +27,9 @@ from tests.support.lock_log import Log, Verdict, now, read
 
 _FORKS = multiprocessing.get_context("forkserver")
 _FAULTS: Final = ("kill", "freeze", "delay", "cut")
+_HUB_FAULTS_PER_S: Final = 0.25
+_HUB_FROZEN_S: Final = 4.0
+"""At most: longer than the lease of its links and the second that it has to return."""
 _JOINTS: Final = 3
 _READY_S: Final = 60.0
 _END_S: Final = 40.0
@@ -46,6 +49,8 @@ class Plan:
     drivers: int
     faults_per_s: float
     """Of each kind."""
+    hub: bool
+    """Whether all begin attached to a hub, which is killed and frozen, too."""
 
 
 class Slot:
@@ -97,6 +102,9 @@ class Run:
         self._plan = plan
         self._log = Log(folder, "faults")
         self._random = random.Random(plan.seed)
+        self._hubs = [Slot("hub", self._starter(_driver.be_hub, folder, 0))] if plan.hub else []
+        for hub in self._hubs:
+            hub.ready()
         self._drivers = [
             Slot(f"d{index}", self._starter(_driver.main, folder, _JOINTS)) for index in range(plan.drivers)
         ]
@@ -119,7 +127,10 @@ class Run:
         """Do every fault of the plan at its time."""
         plan = self._plan
         count = int(plan.seconds * plan.faults_per_s)
-        times = sorted((self._random.random() * plan.seconds, what) for what in _FAULTS for _ in range(count))
+        counts = dict.fromkeys(_FAULTS, count)
+        if plan.hub:
+            counts["hub"] = int(plan.seconds * _HUB_FAULTS_PER_S)
+        times = sorted((self._random.random() * plan.seconds, what) for what in counts for _ in range(counts[what]))
         for slot in (*self._drivers, *self._clients):
             slot.ready()
         due, began = deque(times), now()
@@ -131,7 +142,7 @@ class Run:
 
     def _wait_until(self, at: float) -> None:
         while True:
-            frozen = [slot for slot in (*self._drivers, *self._clients) if slot.thaw_at is not None]
+            frozen = [slot for slot in (*self._hubs, *self._drivers, *self._clients) if slot.thaw_at is not None]
             first = min(frozen, key=lambda slot: slot.thaw_at or 0.0, default=None)
             until = at if first is None or first.thaw_at is None else min(at, first.thaw_at)
             time.sleep(max(0.0, until - now()))
@@ -173,11 +184,21 @@ class Run:
         self._note("cut", slot)
         slot.tell("cut", 0.2 + 2.3 * self._random.random())
 
+    def _hub(self) -> None:
+        [slot] = self._hubs
+        self._note("hub", slot)
+        if slot.thaw_at is not None or self._random.random() < 0.5:
+            slot.kill()
+            slot.begin()
+        else:
+            slot.signal(signal.SIGSTOP)
+            slot.thaw_at = now() + 0.1 + self._random.random() * _HUB_FROZEN_S
+
     def end(self) -> None:
         """Let all processes end by themselves, clients first; one that does not is killed, and will be missed."""
-        for slot in (*self._drivers, *self._clients):
+        for slot in (*self._hubs, *self._drivers, *self._clients):
             slot.thaw()
-        for slots in (self._clients, self._drivers):
+        for slots in (self._clients, self._drivers, self._hubs):
             for slot in slots:
                 slot.tell("stop")
             until = now() + _END_S
@@ -217,9 +238,10 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=10, help="clients in each")
     parser.add_argument("--drivers", type=int, default=2)
     parser.add_argument("--faults", type=float, default=2.6, help="of each kind, each second")
+    parser.add_argument("--hub", action="store_true", help="a hub, which is killed and frozen, too")
     given = parser.parse_args()
     seconds = given.seconds if given.minutes is None else 60 * given.minutes
-    plan = Plan(given.seed, seconds, given.clients, given.threads, given.drivers, given.faults)
+    plan = Plan(given.seed, seconds, given.clients, given.threads, given.drivers, given.faults, given.hub)
     multiprocessing.set_forkserver_preload(["tests.endurance.chaos._client", "tests.endurance.chaos._driver"])
     with tempfile.TemporaryDirectory(prefix="trade-chaos-") as folder:
         verdict = run(plan, Path(folder))

@@ -67,6 +67,14 @@ def main(pipe: Connection, name: str, seed: int, folder: Path, joints: int) -> N
         ended.set()
 
 
+def be_hub(pipe: Connection, name: str, _seed: int, _folder: Path, _joints: int) -> None:
+    """Be the hub of all until the pipe says or its other end is gone."""
+    logging.getLogger("trade").setLevel(logging.ERROR)
+    with Container(Settings.read(container=name, hub="serve")):
+        pipe.send("ready")
+        _until_asked(pipe)
+
+
 def _until_asked(pipe: Connection) -> None:
     try:
         pipe.recv()

@@ -1,7 +1,7 @@
 """``python -m tests.endurance.fuzz --minutes 10``: all targets, one after the other, each for its share of the time.
 
 With Atheris (the dependency group ``fuzz``) what is tried next is guided by coverage; without, by hypothesis. What
-breaks a target is kept in its corpus as ``found-...``, where `make test` tries it; fix it, and commit both.
+breaks a target is kept in its corpus as ``found-...``, where `make test-all` tries it; fix it, and commit both.
 """
 
 import argparse

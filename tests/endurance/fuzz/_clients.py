@@ -5,6 +5,7 @@ from typing import Any, Final
 import msgspec
 
 from tests.endurance.fuzz._target import Target
+from trade_gateway.clients import _changes as changes
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.mcp._tools import TOOLS
 
@@ -15,8 +16,13 @@ _BODIES: Final = [
     messages.RequestBody,
     messages.EstopBody,
     messages.ClearBody,
-    messages.TracingBody,
+    messages.SwitchBody,
     messages.SessionBody,
+    changes.ReasonBody,
+    changes.MigrateBody,
+    changes.ProviderBody,
+    changes.InstantiateBody,
+    changes.FileBody,
 ]
 _REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
 """What the HTTP gateway answers with BadMessage."""

@@ -27,7 +27,7 @@ from trade._protocol.messages import (
 )
 from trade._protocol.remote_errors import pack_error, unpack_error
 from trade._protocol.samples import decode_sample
-from trade._registry.predicates import achieves_all, parse_predicates
+from trade._registry.predicates import fits_all, parse_predicates
 from trade._services.decorator import marked_methods
 from trade._services.signature import Signature
 from trade._transport.endpoints import Endpoint
@@ -139,8 +139,8 @@ def _predicates(data: bytes) -> tuple[Any, ...]:
     """Patterns, and behind a line's end facts."""
     wanted, _, facts = data.decode(errors="replace").partition("\n")
     patterns = parse_predicates(wanted)
-    achieves_all(facts.split("\n"), patterns)
-    achieves_all([wanted], patterns)
+    fits_all(facts.split("\n"), patterns)
+    fits_all([wanted], patterns)
     return patterns
 
 

@@ -1,4 +1,4 @@
-"""Everything that is fuzzed, in `make test` a little and in `make fuzz` for as long as one likes."""
+"""Everything that is fuzzed, in `make test-all` a little and in `make fuzz` for as long as one likes."""
 
 from typing import Final
 

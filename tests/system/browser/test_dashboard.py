@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 from playwright.sync_api import expect
 
+from tests.conftest import StartContainer
 from tests.support.waiting import wait_until
 from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
 from tests.system.conftest import Bench
+from trade import service
 from trade._transport.endpoints import free_endpoint
 from trade_hil_sim import events
 
@@ -207,8 +209,18 @@ def test_a_read_only_client_can_act_only_by_the_e_stop(bench: Bench, browsers: B
     assert not events(bench.sim.entries(), "motion_started")
 
 
-def test_a_service_is_called_by_a_form_made_from_its_schema(bench: Bench, browsers: Browsers) -> None:
+class Hand:
+    @service(needs=["see(?thing)", "at(?place)"], achieves=["holding(?thing)"])
+    def pick_up(self) -> None: ...
+
+
+def test_a_service_is_called_by_a_form_made_from_its_schema_and_shows_its_conditions(
+    bench: Bench, browsers: Browsers, start_container: StartContainer
+) -> None:
+    start_container("hand").register(Hand(), "rosie.hand")
     anna = browsers.view("anna")
+    hand = anna.service("rosie.hand", "pick_up")
+    expect(hand.locator(".note")).to_contain_text(["needs see(?thing), at(?place)", "achieves holding(?thing)"])
     card = anna.service(PAN, "move_to")
     card.get_by_label("position_rad").fill("9")
     card.get_by_role("button", name="Call").click()

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.simulated_robots import HEAD
+from tests.support.simulated_robots import HEAD, patient
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.gate import Gate
 from trade._context.call_context import CallContext, running
@@ -68,7 +68,7 @@ class Rig:
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
-        self.robot: Robot = parse(HEAD, "head.toml")
+        self.robot: Robot = patient(parse(HEAD, "head.toml"))
         self.announced: list[object] = []
 
     def configure(self, *changes: tuple[str, str]) -> None:
@@ -77,7 +77,7 @@ class Rig:
         for before, after in changes:
             assert before in text, before
             text = text.replace(before, after)
-        self.robot = parse(text, "head.toml")
+        self.robot = patient(parse(text, "head.toml"))
 
     def plug(
         self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None, paced: bool = False

@@ -28,7 +28,7 @@ __all__ = ["ALONE", "SUBJECTS", "Subject"]
 _BEATS = 15
 """Exchanges with a device in which something would have begun to move."""
 _HERE_COUNTS = 6
-_PATIENT = "stale_after_s = 0.4"
+_PATIENT = "stale_after_s = 0.8"
 """So that a loaded machine does not look like a fault."""
 
 

@@ -253,7 +253,7 @@ _UR: Final = (
     _silent("ur", "late, always", Late(s=1.0, instruction="data"), stop=Stop.HOLD_OR_PROGRAM),
     _forgiven("ur", "late, a little", Late(s=0.02, instruction="data")),
     _arm_relaxed("frozen value", Freeze(), stop=Stop.HOLD)._replace(error=DeviceFault, says="it makes no progress"),
-    _arm_relaxed("noise", Garbage(instruction="data", count=1)),
+    _silent("ur", "noise", Garbage(instruction="data"), stop=Stop.HOLD_OR_PROGRAM),
     _arm_relaxed("RTDE link lost", HangUp(kind="rtde")),
     _arm_gone("network cut", Absent(), Absent(on=False), Stop.WATCHDOG),
     _arm_gone("connections dropped", Unplug(), Replug(), Stop.WATCHDOG),

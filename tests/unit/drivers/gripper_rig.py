@@ -5,7 +5,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.support.simulated_robots import HAND
+from tests.support.simulated_robots import HAND, patient
 from tests.support.waiting import wait_until
 from trade.errors import DeviceError
 from trade_drivers import AttachedRobot, Gripper, Robot, attach, parse
@@ -17,7 +17,7 @@ class HandRig:
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
-        self.robot: Robot = parse(HAND, "hand.toml")
+        self.robot: Robot = patient(parse(HAND, "hand.toml"))
         self.announced: list[object] = []
 
     def configure(self, *changes: tuple[str, str]) -> None:
@@ -25,7 +25,7 @@ class HandRig:
         for before, after in changes:
             assert before in text, before
             text = text.replace(before, after)
-        self.robot = parse(text, "hand.toml")
+        self.robot = patient(parse(text, "hand.toml"))
 
     def plug(self, prepare: Callable[[RobotiqBus], None] = lambda _: None) -> RobotiqBus:
         """Simulate the bus of the robot file."""

@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.support.simulated_robots import TAIL
+from tests.support.simulated_robots import TAIL, patient
 from tests.support.waiting import wait_until
 from trade_drivers import AttachedRobot, Motor, Robot, attach, parse
 from trade_hil_sim import DeviceState, Entry, events, motion_writes, writes
@@ -26,7 +26,7 @@ class TailRig:
 
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
-        self.robot: Robot = parse(TAIL, "tail.toml")
+        self.robot: Robot = patient(parse(TAIL, "tail.toml"))
 
     def configure(self, *changes: tuple[str, str]) -> None:
         """Change the robot file's text."""
@@ -34,7 +34,7 @@ class TailRig:
         for before, after in changes:
             assert before in text, before
             text = text.replace(before, after)
-        self.robot = parse(text, "tail.toml")
+        self.robot = patient(parse(text, "tail.toml"))
 
     def plug(
         self, *servos: Servo, prepare: Callable[[FeetechBus], None] = lambda _: None, paced: bool = False

@@ -53,6 +53,15 @@ def test_an_answer_that_comes_twice_is_found_out(head: Rig) -> None:
     assert "two devices may share this id" in refused(head)
 
 
+@pytest.mark.parametrize("instruction", ["ping", "read", None])
+def test_a_device_has_as_long_to_answer_at_first_as_its_measurements_may_be_old(
+    rig: Rig, instruction: str | None
+) -> None:
+    rig.configure(('port = "/dev/ttyNOWHERE"', 'port = "/dev/ttyNOWHERE"\nstale_after_s = 2\nwatchdog_s = 2'))
+    rig.plug().do(sim.Mute(ids=(1,), instruction=instruction, count=5))
+    assert rig.attach().motor("neck.pan").state().name == "rosie.neck.pan"
+
+
 def test_another_baud_rate_looks_like_absence(rig: Rig) -> None:
     rig.plug(Servo(1, baud=57600), Servo(2, baud=57600))
     assert "baud rate (register 8)" in refused(rig)

@@ -12,7 +12,7 @@ from trade_drivers import Commissioner, Found, scan
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_drivers.vendors.feetech import FeetechDriver
 from trade_drivers.vendors.robotiq import RobotiqDriver
-from trade_hil_sim import DynamixelBus, Gripper, Mute, RobotiqBus, Servo, WrongModel, motion_writes, writes
+from trade_hil_sim import DynamixelBus, Gripper, Late, Mute, RobotiqBus, Servo, WrongModel, motion_writes, writes
 from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo
 
@@ -96,11 +96,24 @@ def test_a_scan_reports_after_each_rate_what_it_found(line: Line) -> None:
     assert reported == [(rates[0], 1), (rates[1], 1)]
 
 
+def test_an_answer_that_comes_late_is_not_taken_for_another_device(line: Line) -> None:
+    line.plug(1)
+    line.sim.do(Late(ids=(1,), s=0.06, count=1))
+    assert {one.id for one in line.scan()} <= {1}
+
+
 def test_two_devices_of_one_id_are_one_finding_with_its_remedy(line: Line) -> None:
     line.plug(1, 1)
     [found] = line.scan()
     assert found.id == 1
     assert "Unplug all devices but one" in found.problem
+
+
+def test_an_id_that_is_named_is_asked_again_if_its_answer_gets_lost(line: Line) -> None:
+    line.plug(1)
+    line.sim.do(Mute(count=2))
+    [found] = line.scan(1)
+    assert (found.id, found.problem) == (1, "")
 
 
 def test_S07_a_scan_ends_at_the_first_device_whose_torque_is_on(line: Line) -> None:

@@ -42,13 +42,17 @@ class Loop:
     asked: dict[tuple[str, int], int]
     """What the driver sends in a turn at most: name (of CAN frames) and bytes, how often."""
     answered: dict[tuple[str, int], int]
-    """What comes back for it."""
+    """What comes back for it; after a missing answer, a servo is asked for answers of another size for a while."""
 
 
 _ASKED_IN_TURN = ("temperature", "bus_voltage_current", "error", "iq")
 LOOPS = {
-    "dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("read", 94): 1}),
-    "feetech": Loop(TailRig, {("", 10): 1, ("", 8): 1}, {("sync_read", 12): 2, ("sync_read", 14): 2, ("read", 33): 1}),
+    "dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("sync_read", 29): 2, ("read", 94): 1}),
+    "feetech": Loop(
+        TailRig,
+        {("", 10): 1, ("", 8): 1},
+        {**{("sync_read", size): 2 for size in (12, 14, 16)}, ("read", 33): 1},
+    ),
     "cia402": Loop(
         lambda _, undo: Leg(undo), {("sync", 0): 1, ("heartbeat", 1): 1}, {("tpdo1", 8): 2, ("tpdo2", 7): 2}
     ),

@@ -357,3 +357,15 @@ def test_on_a_full_disk_what_was_refused_is_written_when_there_is_room(bench: Be
     assert [text.startswith("no fault is saved: ") for text in bench.reported] == [True]
     assert len(log.faults()) == 20
     assert len(bench.open().faults()) == 20
+
+
+def test_a_log_takes_saved_faults_of_its_own_devices_only(bench: Bench) -> None:
+    """Two processes of a robot have a log each, and one file."""
+    log = bench.open()
+    bench.begin(device=PAN)
+    bench.begin(device="rosie.elbow")
+    bench.clocks.s += 1
+    log.save()
+    bench.written()
+    assert [info.device for info in bench.open(devices=["rosie.elbow"]).faults()] == ["rosie.elbow"]
+    assert {info.device for info in bench.open().faults()} == {PAN, "rosie.elbow"}

@@ -118,9 +118,42 @@ def test_stopping_a_silent_joint_once_more_does_not_turn_it_back(head: Rig, robo
     held = [goal_counts(entry) for entry in head.goals(1, mark)]
     with pytest.raises(DeviceSilent):
         robot.motor("neck.pan").stop()
-    again = [goal_counts(entry) for entry in head.goals(1, mark)]
-    assert len(again) > len(held)
-    assert set(again) == set(held)
+    wait_until(lambda: len(head.goals(1, mark)) > len(held), "it gets another command to hold")
+    assert {goal_counts(entry) for entry in head.goals(1, mark)} == set(held)
+
+
+PATIENT = ('port = "/dev/ttyNOWHERE"', 'port = "/dev/ttyNOWHERE"\nstale_after_s = 2\nwatchdog_s = 2')
+
+
+def test_a_joint_that_misses_answers_is_not_silent_before_its_measurements_are_stale(rig: Rig) -> None:
+    rig.configure(PATIENT)
+    rig.plug()
+    pan = rig.attach().motor("neck.pan")
+    moving = Outcome(lambda: pan.move_to(0.5, 0.5))
+    rig.wait_for("motion_started", 1)
+    rig.sim.do(sim.Mute(ids=(1,), count=5))
+    assert moving.wait().result == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_joint_at_its_goal_is_not_blocked_while_another_one_is_not_heard(rig: Rig) -> None:
+    rig.configure(PATIENT)
+    rig.plug()
+    group = rig.attach().group("head")
+    group.enable()
+    mark = written_now()
+    moving = Outcome(lambda: group.move_to([0.05, 0.05]))
+    rig.wait_for("motion_started", 1, mark)
+    rig.sim.do(sim.Mute(ids=(1,), count=10))  # for longer than the move may take while it is measured
+    assert moving.wait().result == pytest.approx([0.05, 0.05], abs=0.01)
+
+
+def test_enabling_gives_a_joint_as_long_to_answer_as_its_measurements_may_be_old(rig: Rig) -> None:
+    rig.configure(PATIENT)
+    rig.plug()
+    pan = rig.attach().motor("neck.pan")
+    rig.sim.do(sim.Mute(ids=(1,), instruction="write", count=5))
+    pan.enable()
+    assert rig.truth(1).torque
 
 
 # --- damaged, late, cut, slow, double
@@ -182,6 +215,29 @@ def test_a_late_position_is_not_taken_for_a_new_one(head: Rig, robot: AttachedRo
         return now is not None and now.measured_at > moved + 0.2
 
     wait_until(measured_again, "later measurements came in")
+
+
+@pytest.mark.parametrize("late_s", [0.06, 0.1, 0.15, 0.3, 0.6])
+def test_answers_that_are_late_for_as_long_as_they_may_be_are_not_taken_for_new_ones(rig: Rig, late_s: float) -> None:
+    rig.configure(PATIENT)
+    rig.plug()
+    robot = rig.attach()
+    rig.sim.do(sim.Late(ids=(1,), s=late_s))
+    asked = written_now()
+    wait_until(lambda: len(sim.instructions(rig.log, "ping", since=asked)) > 3, "its answers are late")
+    rig.sim.do(sim.Place(ids=(1,), counts=2500))
+    moved = written_now()
+
+    def measured_again() -> bool:
+        now = state(robot, "neck.pan")
+        fresh = now is not None and now.measured_at > moved
+        assert now is None or not fresh or now.position_rad == pytest.approx(452 * COUNT_RAD, abs=0.01)
+        return fresh
+
+    until = written_now() + 3
+    wait_until(lambda: measured_again() or written_now() > until, "its measurements are too old")
+    rig.sim.do(sim.Heal())
+    wait_until(measured_again, "it is measured again")
 
 
 def test_an_adapter_that_echoes_is_no_trouble(head: Rig, robot: AttachedRobot) -> None:

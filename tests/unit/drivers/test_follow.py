@@ -284,6 +284,7 @@ def test_S04_held_up_for_longer_than_a_set_point_holds_it_is_over(head: Rig) -> 
             holding_up.clear()
         return True
 
+    head.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nwatchdog_s = 1'))
     group = head.attach(healthy=healthy).group("head")
     following = started(head, group)
     holding_up.set()

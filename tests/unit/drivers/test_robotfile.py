@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from tests.support.simulated_robots import HAND, HEAD
 from trade.errors import ConfigurationError
-from trade_drivers import CanBus, Robot, SerialBus, load, parse
+from trade_drivers import CanBus, Robot, SerialBus, load, parse, without
 from trade_drivers.robotfile import Drill
 
 
@@ -36,6 +36,51 @@ def test_coupled_joints_name_each_other() -> None:
     assert robot.coupled_to("neck.pan") == ["rosie.neck.tilt"]
     assert robot.coupled_to("neck.tilt") == ["rosie.neck.pan"]
     assert parse(HEAD, "head.toml").coupled_to("neck.pan") == []
+
+
+def test_buses_with_processes_of_their_own_leave_the_rest_to_another_one() -> None:
+    assert two_buses().own_processes() == []
+    assert two_buses(left="own").own_processes() == ["left"]
+    assert two_buses(right="own").own_processes() == ["right"]
+    assert two_buses(left="own", right="own").own_processes() == ["right"]
+    assert without(two_buses(left="own", right="own"), ["right"])[0].own_processes() == []
+
+
+def test_a_bus_without_devices_needs_no_process() -> None:
+    unused = HEAD.replace("[joint", '[bus.unused]\ndriver = "dynamixel"\nport = "x"\nprocess = "own"\n\n[joint', 1)
+    assert parse(unused, "head.toml").own_processes() == []
+
+
+@pytest.mark.parametrize("table", ["[group.both]", "[[coupled]]"])
+def test_joints_of_two_processes_are_neither_grouped_nor_coupled(table: str) -> None:
+    joints = f'{table}\njoints = ["left", "right"]'
+    assert two_buses(joints).joints
+    with pytest.raises(ConfigurationError, match="left is on bus 'left' with a process of its own, and right is not"):
+        two_buses(joints, left="own")
+    with pytest.raises(ConfigurationError, match="right is on bus 'right' with a process of its own, and left is not"):
+        two_buses(joints, right="own")
+
+
+def two_buses(more: str = "", **process: str) -> Robot:
+    buses = "".join(
+        f"""
+[bus.{name}]
+driver = "dynamixel"
+port = "{name}"
+process = "{process.get(name, "shared")}"
+
+[joint.{name}]
+bus = "{name}"
+id = 1
+model = "XL430-W250"
+min_rad = -1.0
+max_rad = 1.0
+max_speed_rad_s = 2.0
+max_accel_rad_s2 = 20.0
+"""
+        for name in ("left", "right")
+    )
+    return parse(f'[robot]\nname = "rosie"\n{buses}\n{more}', "two.toml")
 
 
 LEGS = """

@@ -63,6 +63,18 @@ def test_a_single_bad_answer_goes_unnoticed(hand: HandRig, gripper: Gripper, fau
     assert gripper.state().fault == ""
 
 
+def test_a_gripper_has_as_long_to_answer_as_its_measurements_may_be_old(tmp_path: Path) -> None:
+    with made_rig(tmp_path) as hand:
+        hand.configure(("baud = 115200", "baud = 115200\nstale_after_s = 2"))
+        hand.plug()
+        gripper = hand.active()
+        moving = closing(hand, gripper)
+        hand.sim.do(sim.Mute(count=6))
+        assert moving.wait().result.width_m == pytest.approx(0, abs=0.003)
+        hand.sim.do(sim.Mute(count=6))
+        assert gripper.open().width_m == pytest.approx(0.085, abs=0.003)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("late_s", [0.036, 0.05, 0.065, 0.07, 0.08, 0.1])
 def test_a_late_answer_never_becomes_a_wrong_value(hand: HandRig, gripper: Gripper, late_s: float, count: int) -> None:

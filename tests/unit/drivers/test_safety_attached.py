@@ -5,6 +5,7 @@ import time
 import pytest
 
 import trade_hil_sim
+from tests.support.simulated_robots import at_rest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, is_silent, written_now
 from trade.errors import (
@@ -97,7 +98,7 @@ def test_S19_shutdown_while_moving_stops_first(head: Rig) -> None:
     robot.close()
     robot.close()
     assert isinstance(moving.wait().error, MotionStopped)
-    assert not head.truth(1).moving
+    assert at_rest(head.truth(1))
     assert head.truth(1).position_rad < 1.0
     with pytest.raises(DeviceFault, match="ended"):
         robot.motor("neck.pan").move_to(0.0)
@@ -112,6 +113,15 @@ def test_S19_a_joint_that_cannot_be_heard_keeps_its_watchdog(head: Rig) -> None:
     assert robot.unseen() == ["rosie.neck.pan"]
     assert head.truth(2).watchdog == 0
     head.wait_for("watchdog_expired", 1)
+
+
+def test_S19_a_joint_that_falls_silent_during_the_shutdown_is_only_reported(head: Rig) -> None:
+    robot = head.attach()
+    robot.group("head").enable()
+    head.sim.do(trade_hil_sim.Mute(ids=(1,)))
+    robot.close()
+    assert robot.unseen() == ["rosie.neck.pan"]
+    assert head.truth(2).watchdog == 0
 
 
 # --- S20 never twice

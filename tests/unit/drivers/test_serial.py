@@ -2,6 +2,7 @@
 
 import os
 import pty
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
@@ -112,4 +113,30 @@ def test_bytes_are_waited_for_until_they_come_or_the_answer_is_overdue(pair: Pai
     assert not line.more(), "an overdue answer is no answer"
     assert line.more(LONGEST_WAIT_S)
     assert bytes(line.received) == b"late"
+    line.close()
+
+
+def test_an_answer_that_came_in_time_is_read_by_a_driver_that_was_held_up(pair: Pair) -> None:
+    line = SerialLine(pair.path, 1_000_000)
+    line.open()
+    line.write(b"?")
+    line.expect(8)
+    os.write(pair.far, b"answer")
+    time.sleep(2 * LONGEST_WAIT_S)  # another program had the processor
+    assert line.more()
+    assert bytes(line.received) == b"answer"
+    os.write(pair.far, b"chatter without an end")
+    assert not line.more()
+    line.close()
+
+
+@pytest.mark.parametrize("wait", [True, False], ids=["waits", "held up"])
+def test_silence_ends_at_the_timeout(pair: Pair, wait: bool) -> None:
+    line = SerialLine(pair.path, 1_000_000)
+    line.open()
+    line.write(b"?")
+    line.expect(8)
+    if not wait:
+        time.sleep(2 * LONGEST_WAIT_S)
+    assert not line.more()
     line.close()

@@ -1,10 +1,13 @@
 """``trade ask``: sentences become calls, and what comes of them becomes sentences."""
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from trade import Container, service, where
@@ -24,6 +27,9 @@ class Eyes:
 class Head:
     def __init__(self) -> None:
         self.turned = 0.0
+
+    @service(effect="read", needs=["see(?x)", "at(?place)"])
+    def follow(self, what: str) -> None: ...
 
     @service(uses="neck")
     def turn(self, angle_rad: float) -> float:
@@ -55,20 +61,32 @@ def talk(memory: MemorySystem, robot: Container) -> Talk:
     return made
 
 
+_NEEDS = (
+    "rosie.head.follow needs at(?place), which no service achieves; "
+    "rosie.head.follow needs see(?x), which rosie.eyes.check_for can achieve."
+)
+
+
 def test_P58_a_dialogue_about_the_services_that_exist(talk: Talk, robot: Container, memory: MemorySystem) -> None:
     host = robot.containers()[0].host
     dialogue = [
         ("Which computers are there?", f"There is one host: {host}."),
         (f"What runs on {host}?", f"On {host} there is one container: robot."),
-        ("What services are there?", "There are 3 services: rosie.eyes.check_for, rosie.head.stop, rosie.head.turn."),
+        (
+            "What services are there?",
+            "There are 4 services: rosie.eyes.check_for, rosie.head.follow, rosie.head.stop, rosie.head.turn.",
+        ),
         ("What can the eyes do?", "eyes has one service: rosie.eyes.check_for."),
         ("Where is the check_for service?", f"check_for is in container robot on host {host}."),
         ("Who can see?", "rosie.eyes.check_for can."),
-        ("Who can fly(?x)?", "Nobody can fly(?x)."),  # plain: Nobody
+        ("Who can fly(?x)?", "I do not know of a service that can fly(?x)."),
         (
             "How do I ask check_for?",
             "rosie.eyes.check_for is check_for(what: str) -> bool: Look for something in front of the robot.",
         ),
+        ("What does the head need?", _NEEDS),
+        ("What are the preconditions of follow?", _NEEDS),
+        ("What does turn need?", "turn has no pre-conditions."),
         ("Who has the head?", "Nobody has it: head is free."),  # plain: Nobody
         ("Is everything all right?", "All is well."),
         ("What is new?", "I have not looked before; from now on I know."),
@@ -153,7 +171,7 @@ def test_a_lexicon_of_ones_own_goes_first_and_calls_what_it_names(
     asker = memory.container("asker")
     memory.settle()
     talk = Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory())
-    assert talk.say("Look -0.25 rad to the left!").text == "I look at -0.25 rad."
+    assert talk.say("Look -0.25 rad to the left!", confirmed=True).text == "I look at -0.25 rad."
     assert talk.say("do you see a cup?").text == "About the cup: true."
     assert talk.say("Do you see a teddy bear?").text == "About the teddy bear: false."
     assert talk.say("what services are there?").means == "services"
@@ -166,7 +184,7 @@ def test_a_lexicon_can_do_no_more_than_the_service_takes(
     asker = memory.container("asker")
     memory.settle()
     with pytest.raises(InvalidArgument):
-        Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory()).say("turn the head to 0.1")
+        Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory()).say("turn the head to 0.1", confirmed=True)
 
 
 PHRASE = '[[phrase]]\nhear = ["hello {name}"]\n'
@@ -177,7 +195,10 @@ PHRASE = '[[phrase]]\nhear = ["hello {name}"]\n'
     [
         ("[[phrase", "own.toml"),
         (f'{PHRASE}say = "hi"\n', "needs either ask or call"),
-        (f'{PHRASE}say = "hi"\nask = "wether"\n', "there is no question 'wether'; there is services, containers"),
+        (
+            f'{PHRASE}say = "hi"\nask = "wether"\n',
+            "there is no question or order 'wether'; there is services, containers",
+        ),
         (f'{PHRASE}say = "hi"\nask = "hosts"\n', "question 'hosts' has no use for {name}; it takes none"),
         (
             f'{PHRASE}say = "hi {{nmae}}"\ncall = "a.b"\n',
@@ -213,8 +234,48 @@ def test_on_the_command_line_new_means_since_the_last_question(start_container, 
 
     assert ask("what", "is", "new?") == "I have not looked before; from now on I know."
     robot.register(Head(), "rosie.head")
-    assert json.loads(ask("anything new?", "--json"))["data"]["came"] == ["rosie.head.stop", "rosie.head.turn"]
+    assert json.loads(ask("anything new?", "--json"))["data"]["came"] == [
+        f"rosie.head.{name}" for name in ("follow", "stop", "turn")
+    ]
     done = CliRunner().invoke(app, ["ask"], input="what is new\nfoo\nwho is there\n")  # plain: is there
     assert done.stdout.splitlines()[1:] == ["Nothing is new.", "There is one container: robot."]
     assert "I do not understand that" in done.stderr
     assert "what is new" in ask("--phrases")
+
+
+@pytest.mark.realtime
+def test_on_the_command_line_an_order_needs_yes_and_a_lock_needs_a_dialogue(
+    start_container, system: str, tmp_path: Path
+) -> None:
+    robot, head = start_container("robot"), Head()
+    robot.register(head, "rosie.head")
+
+    def ask(*words: str, code: int, **options: Any) -> Result:
+        done = CliRunner().invoke(app, ["ask", *words], **options)
+        assert done.exit_code == code, done.output
+        return done
+
+    told = ask("turn", "on", "discovery", code=1).stdout.strip()
+    assert told == "I would turn on discovery in robot. Nothing was done. Add --yes to confirm it."
+    assert json.loads(ask("turn on discovery", "--json", code=1).stdout)["waits"] == "yes"
+    assert not robot.reach.discovers
+    assert ask("turn on discovery", "--yes", code=0).stdout.strip() == "Discovery is on in robot."
+    assert robot.reach.discovers
+    assert "I know no container or host 'mars'" in str(ask("turn on discovery on mars", "--yes", code=1).exception)
+    assert "would end with this command, so it was not taken" in str(ask("lock the head", "--yes", code=1).exception)
+    assert robot.locks() == []
+    assert "A dialogue asks for each order" in str(ask("--yes", code=1, input="").exception)
+    dialogue = ask(code=0, input="lock the head\nwho has the head\nturn off discovery\nyes\nrelease it\n").stdout
+    assert dialogue.splitlines()[1] == "You have neck, until you release it or this dialogue ends."
+    assert "for 'asked in a dialogue'" in dialogue
+    assert "Shall I turn off discovery in robot? (yes/no)\nDiscovery is off in robot.\nReleased: neck." in dialogue
+    assert not robot.reach.discovers
+    answer = '{"request": "discovery_on", "gaps": {"place": "robot"}}'
+    (tmp_path / "model.py").write_text(f"print({answer!r})")
+    model = f"--model={sys.executable} {tmp_path / 'model.py'}"
+    said = ask("robot soll discovery anmachen", model, code=1).stdout
+    assert said.splitlines()[0] == "the model proposes discovery_on(place='robot')"
+    assert not robot.reach.discovers
+    ask("robot soll discovery anmachen", model, "--yes", code=0)
+    assert robot.reach.discovers
+    assert head.turned == 0.0

@@ -55,7 +55,7 @@ robot = "/robots/far.toml"
 rules = "rules.toml"
 
 [container.page]
-http = { tokens = "pages/tokens.toml" }
+http = { tokens = "pages/tokens.toml", mcp = true, twin = "pages/twin.toml" }
 """
 KEYS = {f"config/pki/issued/door/{name}" for name in ("ca.pem", "cert.pem", "key.pem")}
 
@@ -140,6 +140,7 @@ def test_of_a_system_file_it_has_the_gateway_robots_and_rules_of_this_host(
     (config / "rules.toml").write_text("")
     (config / "pages").mkdir()
     (config / "pages" / "tokens.toml").write_text("[tokens]\n")
+    (config / "pages" / "twin.toml").write_text((ROOT / "examples" / "head.toml").read_text())
     shutil.copytree(config / "pki" / "issued" / "door", config / "pki" / "issued" / "rosie")
     assert run("backup", config / "system.toml", out, "--state", state).exit_code == 0
     manifest = read_archive(out)
@@ -148,6 +149,7 @@ def test_of_a_system_file_it_has_the_gateway_robots_and_rules_of_this_host(
         "config/system.toml",
         "config/gateway.toml",
         "config/pages/tokens.toml",
+        "config/pages/twin.toml",
         "config/robots/head.toml",
         "config/rules.toml",
         *KEYS,

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.simulated_robots import HAND, HEAD, TAIL
+from trade import Container
 from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
@@ -255,6 +256,20 @@ def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
         well = CliRunner().invoke(app, ["doctor", str(robot_file)])
     assert well.exit_code == 0, well.output
     assert "0 errors" in well.output
+
+
+def test_a_hub_that_has_ended_is_reported(system: str, start_container: Callable[..., Container]) -> None:
+    member = start_container("member")
+    assert [found.about for found in host.in_sight(member, system)] == [f"system {system}"]
+    hub = start_container("hub", hub="serve")
+    found = next(iter(host.in_sight(member, system)))
+    assert (found.about, found.level) == ("hub", "ok")
+    attached = start_container("attached")
+    hub.close()
+    found = next(iter(host.in_sight(member, system)))
+    assert (found.about, found.level, found.fix.startswith("trade hub;")) == ("hub", "warning", True)
+    lost = next(iter(host.in_sight(attached, system)))
+    assert (lost.level, "(the hub of this host)" in lost.text) == ("error", True)
 
 
 @pytest.mark.realtime

@@ -2,11 +2,11 @@
 
 import json
 from typing import Any
-from unittest.mock import create_autospec
 
 import pytest
 
-from trade_drivers import FaultLog, Gripper, Motor
+from tests.support.simulated_robots import HAND, HEAD
+from trade_drivers import FaultLog, parse
 from trade_drivers.faults._trouble import Found
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.robots._up import FaultWatch
@@ -20,6 +20,9 @@ BEGIN: dict[str, tuple[Any, str]] = {
     "blocked": (BLOCKED, "rosie.pan: is it blocked? When you have looked: trade call rosie.pan.enable"),
     "silent": (SILENT, "rosie.pan did not answer"),
 }
+
+
+ROBOT = parse(HEAD.replace("neck.pan", "pan"), "head.toml")
 
 
 @pytest.fixture
@@ -36,7 +39,7 @@ def reported(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
 def test_each_change_is_reported_once_in_both_directions(
     found: Found, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    watch, out = FaultWatch(log, {"rosie.pan": create_autospec(Motor, instance=True)}), Output(as_json=True)
+    watch, out = FaultWatch(ROBOT, lambda: log.faults(open_only=True)), Output(as_json=True)
     assert not watch.report(out)
     log.begin("rosie.pan", found, 0.0, 0.0)
     assert [watch.report(out), watch.report(out)] == [True, False]
@@ -47,7 +50,7 @@ def test_each_change_is_reported_once_in_both_directions(
 
 
 def test_the_remedy_of_a_gripper_is_to_activate_it(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
-    watch = FaultWatch(log, {"rosie.pan": create_autospec(Gripper, instance=True)})
+    watch = FaultWatch(parse(HAND.replace("left.hand", "pan"), "hand.toml"), lambda: log.faults(open_only=True))
     log.begin("rosie.pan", OVERLOAD, 0.0, 0.0)
     watch.report(Output(as_json=True))
     assert reported(capsys) == [
@@ -58,7 +61,7 @@ def test_the_remedy_of_a_gripper_is_to_activate_it(log: FaultLog, capsys: pytest
 def test_of_two_faults_the_newest_is_shown_and_health_returns_when_both_are_gone(
     log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    watch, out = FaultWatch(log, {}), Output(as_json=True)
+    watch, out = FaultWatch(parse(HEAD, "head.toml"), lambda: log.faults(open_only=True)), Output(as_json=True)
     log.begin("rosie.pan", PROTECTIVE, 0.0, 0.0)
     log.begin("rosie.pan", SILENT, 0.0, 0.0)
     watch.report(out)

@@ -4,6 +4,7 @@ import os
 import queue
 import shutil
 import signal
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from socket import AF_INET, AF_INET6, AF_PACKET
@@ -14,10 +15,13 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from trade import Container
 from trade._security.certificates import Certificate
 from trade._transport.endpoints import loopback_interface
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
+from trade_gateway.cli._output import Output
 from trade_gateway.cli.robots import _gateway
 from trade_gateway.config import _gateway_file
 from trade_gateway.config._changes import Named, digest, named_by
@@ -63,6 +67,29 @@ def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pyt
     assert settings.bridge == ("eth0", "eth1")
     assert settings.exports == {"eth0": ("rosie",), "eth1": ()}
     assert settings.connect == ()
+
+
+@pytest.mark.realtime
+def test_a_gateway_may_be_the_hub_of_its_host_and_is_not_by_itself(
+    tmp_path: Path, start_container: Callable[..., Container]
+) -> None:
+    lab = 'credentials = "lab:secret"\ninsecure_lan = true\n'
+    file = tmp_path / "hub.toml"
+    file.write_text(f'system = "{os.environ["TRADE_SYSTEM"]}"\n{lab}[network.here]\ninterface = "lo"\n')
+    with pytest.raises(ConfigurationError, match="bridge lo: joins networks, and this is only one"):
+        read_gateway_file(file)
+    change(file, "insecure_lan", "hub = true\ninsecure_lan")
+    plan = read_gateway_file(file)
+    running = _gateway.Gateway(file, plan, named_by(file, plan), lambda: None)
+    try:
+        attached = [start_container(name, credentials=("lab", "secret")) for name in "ab"]
+        assert {one.reach.source for one in attached} == {"the hub of this host"}
+        wait_until(lambda: len(attached[0].addresses()) == 3)
+        before = running.container.address
+        assert running.reload(file, Output(as_json=True))
+        wait_until(lambda: before not in attached[0].addresses() and len(attached[0].addresses()) == 3)
+    finally:
+        running.close()
 
 
 def test_the_commands_in_the_example_make_all_that_it_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,6 +198,10 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ('rules = "care.toml"\n', 4, "there is providers and rules"),
         ('lease_from = "base"\nstands_in_for = "base"\n', 4, "leave one of them out"),
         ("lease_s = 5.0\n", 4, "goes with stands_in_for; leave it out"),
+        ("move_above = 0.8\n", 4, "goes with stands_in_for; leave it out"),
+        ('lease_from = "base"\nmove_above = 0.8\n', 5, "is set in the file of base; leave it out"),
+        ('stands_in_for = ["rover"]\nmove_above = 80\n', 5, "<= 1"),
+        ('stands_in_for = ["rover", "rover"]\n', 4, "names rover twice"),
         ('lease_from = "base"\nlease_s = 5.0\n', 5, "is set in the file of base; leave it out"),
         ('stands_in_for = "rover"\nlease_s = 1.0\n', 5, ">= 2"),
         ('lease_from = "base"\nrestart = "never"\n', 5, "does not go with lease_from"),

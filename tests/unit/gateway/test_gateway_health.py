@@ -15,7 +15,7 @@ pytestmark = pytest.mark.realtime
 def running(system: str, tmp_path: Path) -> Iterator[Gateway]:
     file = tmp_path / "gateway.toml"
     file.write_text(f'system = "{system}"\n[container.mind]\nproviders = []\n')
-    made = Gateway(read_gateway_file(file), "", lambda: None)
+    made = Gateway(file, read_gateway_file(file), "", lambda: None)
     yield made
     made.close()
 

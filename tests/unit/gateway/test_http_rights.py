@@ -108,8 +108,8 @@ def test_refusals_and_the_client_that_cleared_an_e_stop_are_on_record(
 def test_a_client_learns_its_identity_and_rights(served: Opened) -> None:
     anna, bert, chief = (served.client(name) for name in ("anna", "bert", "chief"))
     may_nothing = {"administers": False, "reads": False, "instruments": False}
-    assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing}
-    assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True)}
+    assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing, "over": []}
+    assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True), "over": ["*"]}
     may = {one["name"]: one["allowed"] for one in bert.ask("GET", "/services?group=robot.a").body}
     assert (may["where_is_it"], may["move"], may["stop"]) == (True, False, True)
     assert all(one["allowed"] for one in anna.ask("GET", "/services").body)

@@ -339,6 +339,7 @@ def test_a_closing_http_gateway_leaves_nothing_moving(served: Opened) -> None:
         assert served["a"].stopped.wait(20)
 
 
+@pytest.mark.realtime
 def test_a_connection_that_asks_nothing_is_closed(served: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trade_gateway.http._protocols._REQUEST_WITHIN_S", 0.5)
     place = urlsplit(served.gateway.url)

@@ -214,7 +214,7 @@ def test_a_port_that_stays_where_it_is_is_allowed_by_its_name(tmp_path: Path) ->
     slow = (EXAMPLES / "legs.toml").read_text().replace('"socketcan"', '"slcan"').replace('"can0"', '"/dev/ttyACM3"')
     legs.write_text(slow)
     assert needs_of(map(load, (robot, eye))).devices == ("char-ttyUSB", "char-ttyACM", "/dev/ttyAMA0", "/dev/video0")
-    assert needs_of([load(legs)]) == Needs(serial=True, devices=("char-ttyUSB", "char-ttyACM"))
+    assert needs_of([load(legs)]) == Needs(serial=True, devices=("char-ttyUSB", "char-ttyACM"), real_time=True)
 
 
 def test_the_unit_exposes_needed_paths_in_hidden_folders_read_only() -> None:
@@ -256,6 +256,16 @@ def test_it_may_write_where_its_record_lies_and_its_state() -> None:
     text = a_unit(records=places)
     assert (said_of(text, "ReadWritePaths"), said_of(text, "BindPaths")) == (["/srv/record"], ["/home/anna/record"])
     assert said_of(text, "ProtectHome") == ["tmpfs"]
+
+
+def test_only_a_unit_with_drivers_may_run_in_real_time() -> None:
+    text = a_unit(needs_of([load(EXAMPLES / "rosie.toml")]))
+    assert (said_of(text, "LimitRTPRIO"), said_of(text, "LimitMEMLOCK")) == (["10"], ["infinity"])
+    assert said_of(text, "SystemCallFilter")[-2:] == ["~@privileged @resources", "sched_setscheduler"]
+    assert said_of(text, "RestrictRealtime") == []
+    alone = a_unit()
+    assert (said_of(alone, "LimitRTPRIO"), said_of(alone, "RestrictRealtime")) == ([], ["yes"])
+    assert said_of(alone, "SystemCallFilter")[-1] == "~@privileged @resources"
 
 
 def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:

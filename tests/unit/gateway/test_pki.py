@@ -14,13 +14,13 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner, Result
 
+from trade import _atomic_file
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway.cli import build
 from trade_gateway.cli.rights._pki import app
 from trade_gateway.pki import _authority
 from trade_gateway.pki._authority import Authority, Issued, NameRevoked, NameTaken, NoAuthority
-from trade_gateway.process import _atomic_file
 
 
 @pytest.fixture

@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 
 from trade import Span
+from trade._telemetry.call_model import deviations, learn, sequences
 from trade.errors import ConfigurationError
-from trade_gateway.cli.watching._profile import deviations, learn, read, sequences, statistics, write
+from trade_gateway.cli.watching._profile import read, statistics, write
 
 pytestmark = pytest.mark.realtime
 

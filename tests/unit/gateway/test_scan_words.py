@@ -16,7 +16,7 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.cli.hardware._scan import _numbers
-from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
+from trade_hil_sim import Arm, DynamixelBus, Mute, Servo, UrBus, writes
 from trade_hil_sim.damiao import DamiaoBus, Motor
 from trade_hil_sim.odrive import Axis, OdriveBus
 
@@ -104,6 +104,16 @@ def test_another_model_than_the_one_meant_is_left_alone(line: DynamixelBus) -> N
     error = trade("set-id", "--port", line.port, "--from", 2, "--to", 5, "--model", "XM430-W350").exception
     assert "is XL430-W250, not XM430-W350" in str(error)
     assert [servo.device_id for servo in line.devices] == [1, 2]
+
+
+def test_a_device_whose_model_could_not_be_read_is_left_alone(line: DynamixelBus) -> None:
+    line.do(Mute(ids=(2,), instruction="read", count=3))
+    words = ("--port", line.port, "--baud", 1_000_000, "--from", 2, "--to", 5, "--model", "XM430-W350")
+    error = trade("set-id", *words).exception
+    assert isinstance(error, ConfigurationError), error
+    assert "answers a ping but no read" in str(error)
+    assert [servo.device_id for servo in line.devices] == [1, 2]
+    assert not writes(line.log.entries)
 
 
 def test_a_rate_is_set_where_the_device_is_found(line: DynamixelBus) -> None:

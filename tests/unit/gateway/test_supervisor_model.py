@@ -18,6 +18,7 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
 from trade.starting import Started
 from trade_gateway.config._children import Child, Supervised
+from trade_gateway.config._entry import Entry
 from trade_gateway.supervisor import Supervisor
 from trade_gateway.supervisor._objects import CreatedObjects
 
@@ -88,7 +89,7 @@ class Question:
         self._error: Exception | None = None
         self._tell: Callable[[Any], None]
 
-    def when_done(self, tell: Callable[[Any], None]) -> None:
+    def add_done_callback(self, tell: Callable[[Any], None]) -> None:
         self._tell = tell
 
     def exception(self, _timeout_s: float) -> Exception | None:
@@ -462,7 +463,7 @@ def _child(name: str, version: int) -> Child:
         window_s=WINDOW_S,
         answers_within_s=MISSES * QUESTION_S,
     )
-    entry = SimpleNamespace(providers=[])
+    entry = Entry(providers=[])
     part: Any = SimpleNamespace(name=name, words=("container", name, str(version)), environment={}, entry=entry)
     return Child(part, terms, {})
 

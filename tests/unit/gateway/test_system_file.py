@@ -16,6 +16,9 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 HEAD = '[system]\nname = "home"\n\n'
 LAMPS = '[container.lamps]\nproviders = [{ class = "lamp:Lamp", groups = ["hall"] }]\n'
 PAGE = "[container.page]\n"
+KEPT = '[system]\nname = "home"\nsupervisor = "keeper"\n\n'
+PROGRAM = f"{KEPT}[container.a]\n"
+HEALTH = 'health = { command = ["ls"] }\n'
 
 
 @pytest.fixture
@@ -82,13 +85,15 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}[container.a]\nproviders = [\n  {{ groups = ["x"] }},\n]\n', 5, "class is missing"),
         (f"{HEAD}{LAMPS}after = 3\n", 6, "Expected `array`"),
         (f'{HEAD}{LAMPS}after = ["rosie"]\n', 6, "no container 'rosie'; there is lamps"),
-        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules, http; there is none"),
+        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules, http, ros, record"),
         (f'{HEAD}{LAMPS}rules = "care.toml"\n', 6, "there is providers and rules"),
         (f"{HEAD}{LAMPS}sim = true\n", 6, "goes with robot"),
         (f'{HEAD}{LAMPS}without = ["legs"]\n', 6, "goes with robot"),
         (f'{HEAD}[container.a]\nrobot = "rosie.toml"\nallow = ["x:Y"]\n', 6, "goes with providers"),
         (f"{HEAD}{PAGE}http = {{}}\n", 5, "no client could log in; name tokens"),
         (f'{HEAD}{PAGE}http = {{ tokens = "t.toml" }}\n', 5, "trade http token NAME --tokens "),
+        (f'{HEAD}{PAGE}http = {{ tls = "pki", twin = "rosie.toml" }}\n', 5, "are for agents; add mcp = true"),
+        (f'{HEAD}{PAGE}http = {{ tls = "pki", mcp = true, twin = "missing.toml" }}\n', 4, "missing.toml"),
         (
             f"{HEAD}{PAGE}http = {{ port = 80 }}\n",
             5,
@@ -103,6 +108,28 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}{LAMPS}tls = "nowhere"\n', 4, "nowhere"),
         (f'{HEAD}{LAMPS}policy = "missing.toml"\n', 4, "missing.toml"),
         (f'{HEAD}{LAMPS}connect = ["tcp/robot.example:7450"]\n', 4, "beyond loopback requires certificates"),
+        (f'{HEAD}[container.a]\nprogram = ["ls"]\n', 5, 'write supervisor = "keeper" in [system]'),
+        (f'{HEAD}{LAMPS}announces = "b"\n', 6, "goes with program; leave it out"),
+        (f'{HEAD}[container.a]\nrecord = {{ file = "x" }}\n', 5, "unknown key 'file'; there is folder, groups"),
+        (f'{HEAD}[container.a]\nros = "rosie.toml"\n', 5, "rosie.toml"),
+        (f'{KEPT}{LAMPS}after = ["far"]\n[container.far]\nhost = "far"\nrules = "r"\n', 7, "cannot wait for far"),
+        (f"{KEPT}[container.keeper]\nproviders = []\n", 3, "it has the name of a container"),
+        (f'{KEPT}[container.far]\nhost = "far"\nrules = "r"\n', 3, "no container of this host"),
+        (f'{KEPT}[container.far]\nhost = "far"\nprogram = ["ls"]\n', 6, "a program runs on the host of its"),
+        (f"{PROGRAM}program = []\n", 6, "length >= 1"),
+        (f'{PROGRAM}program = ["./missing"]\n', 6, "missing that this user may run"),
+        (f'{PROGRAM}program = ["no-such-program"]\n', 6, "there is no no-such-program in PATH"),
+        (f'{PROGRAM}program = ["./head.toml"]\n', 6, "head.toml that this user may run"),
+        (f'{PROGRAM}program = ["ls"]\nfolder = "away"\n', 7, "there is no folder"),
+        (f'{PROGRAM}program = ["ls"]\nenv = {{ "A B" = "c" }}\n', 7, "'A B' is no name of a variable"),
+        (f'{PROGRAM}program = ["ls"]\nenv = {{ A = 1 }}\n', 7, "Expected `str`"),
+        (f'{PROGRAM}program = ["ls"]\nannounces = "a/b"\n', 7, "is no name for a container"),
+        (f'{PROGRAM}program = ["ls"]\ngrace_s = 60\n', 7, "<= 15"),
+        (f'{PROGRAM}program = ["ls"]\nlog_mb = 0\n', 7, ">= 0.1"),
+        (f'{PROGRAM}program = ["ls"]\n{HEALTH}announces = "b"\n', 7, "leave one out"),
+        (f'{PROGRAM}program = ["ls"]\n{HEALTH.replace("ls", "no-such")}', 7, "there is no no-such in PATH"),
+        (f'{PROGRAM}program = ["ls"]\n{HEALTH.replace("}", ", within_s = 9 }")}', 7, "within_s is longer"),
+        (f'{PROGRAM}program = ["ls"]\nlease_from = "base"\n', 7, "goes with providers"),
         ('[system]\nname = "ho me"\n[container.a]\nproviders = []\n', 1, "is no name for a system"),
     ],
 )
@@ -180,3 +207,7 @@ def test_an_http_gateway_starts_with_the_options_of_its_table(folder: Path) -> N
     [part] = read_system_file(write(folder, f"{HEAD}{PAGE}{said}")).parts
     named = ["--listen", "127.0.0.1:7081", "--origin", "http://a", "--origin", "http://b"]
     assert list(part.words)[2:] == ["http", "--name", "page", *named, "--tokens", str(folder / "t.toml")]
+    said = 'http = { tokens = "t.toml", mcp = true, ask_first = ["a", "b"], twin = "rosie.toml" }\n'
+    [part] = read_system_file(write(folder, f"{HEAD}{PAGE}{said}")).parts
+    words = " ".join(part.words)
+    assert words.endswith(f"--ask-first a --ask-first b --tokens {folder}/t.toml --twin {folder}/rosie.toml --mcp")

@@ -233,6 +233,7 @@ def test_two_servos_of_one_id_answer_on_top_of_each_other(make_bus: Any, open_sd
     bus = make_bus(Servo(1), Servo(1, position_counts=1000), 2)
     sdk = open_sdk(bus)
     assert sdk.ph.read4ByteTxRx(sdk.port, 1, POSITION)[1] != 0
+    wait_until(lambda: any(e.kind == "sent" for e in bus.log.entries), "they have answered")  # later than it waits
     assert len(next(e for e in bus.log.entries if e.kind == "sent").data) == 30
     assert sdk.ph.ping(sdk.port, 2) == (1060, *OK)
 

@@ -15,6 +15,7 @@ from trade_gateway.ros._graph import (
     Heard,
     NodeListener,
     Outcome,
+    Refuse,
     RosRefused,
     RosUnreachable,
 )
@@ -106,9 +107,9 @@ class MemoryGraph:
             raise RosUnreachable(what=name, problem="no node serves it")
         return found.call(type_name, request, self._ros.who(self.node), timeout_s)
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> "_Action":
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> "_Action":
         assert name not in self._ros.actions, f"{name} is served twice"
-        return self._keep(_Action(self._ros, name, type_name, do))
+        return self._keep(_Action(self._ros, name, type_name, do, refuse))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
@@ -240,8 +241,10 @@ class _Service:
 
 
 class _Action:
-    def __init__(self, ros: MemoryRos, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
-        self.ros, self.name, self.do = ros, name, do
+    def __init__(
+        self, ros: MemoryRos, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None
+    ) -> None:
+        self.ros, self.name, self.do, self._refuse = ros, name, do, refuse
         self.parts = ros.types.parts(type_name)
         self._type = type_name
         self._last: _Pursuit | None = None
@@ -253,6 +256,9 @@ class _Action:
         assert type_name == self._type, f"{self.name} is {self._type}"
         types = self.ros.types
         message = types.from_bytes(self.parts[0], types.to_bytes(self.parts[0], goal))
+        refused = None if self._refuse is None else self._refuse(message)
+        if refused is not None:
+            return _Pursuit(self, message, who, feedback).reject(refused)
         before, self._last = self._last, _Pursuit(self, message, who, feedback)
         if before is not None:
             before.cancel()
@@ -276,6 +282,10 @@ class _Pursuit:
         self._guard = threading.Lock()
         self.canceled = False
         self.came_at = time.monotonic()
+
+    def reject(self, why: Outcome) -> "_Pursuit":
+        self._ended.put(RosRefused(what=self._action.name, problem=why.text))
+        return self
 
     def begin(self) -> "_Pursuit":
         threading.Thread(target=self._run, name="memory-ros-goal", daemon=True).start()

@@ -13,6 +13,7 @@ from trade_gateway.ros._bridge import Bridge
 from trade_gateway.ros._file import RosFile, read_ros_file
 
 PATIENCE_S = 60.0
+DEFINITIONS = Path(__file__).parent / "definitions"
 
 
 class Part:
@@ -100,7 +101,7 @@ class Stand:
 
     def __init__(self, memory: MemorySystem, folder: Path) -> None:
         self.memory = memory
-        self.ros = MemoryRos()
+        self.ros = MemoryRos(folders=[DEFINITIONS])
         self.folder = folder
         self.robot = Robot(memory.container("robot", identity="robot"))
         self.container = memory.container("bridge", identity="bridge")

@@ -239,6 +239,7 @@ class RosArm:
 
     def _do(self, goal: Goal) -> Outcome:
         self.goals.append(goal.message["trajectory"])
+        goal.feedback({"joint_names": ["a", "b"]})
         goal.when_canceled(self.canceled.set)
         self.goes.set()
         if self.holds:
@@ -306,6 +307,16 @@ def test_a_motion_in_ros_after_which_nothing_is_heard_is_an_error_that_says_so(s
     with pytest.raises(RosUnreachable, match=r"has ended, but for .* no state of a, b arrived"):
         found(stand, "lab.arm", "move_to").with_(deadline_s=2.0)([0.4, -0.4])
     assert time.monotonic() - began < PATIENCE_S
+
+
+def test_the_feedback_of_a_motion_in_ros_is_the_progress_of_the_call(stand: Stand, arm: RosArm) -> None:
+    arm.holds = True
+    run = found(stand, "lab.arm", "move_to").start([0.5, 0.5])
+    wait_until(lambda: run.progress() is not None)
+    assert run.progress()["joint_names"] == ["a", "b"]
+    found(stand, "lab.arm", "stop")()
+    with pytest.raises(MotionStopped):
+        run.result(PATIENCE_S)
 
 
 def test_what_ros_aborts_is_a_fault(stand: Stand, arm: RosArm) -> None:

@@ -13,7 +13,7 @@ from tests.unit.ros.robots import PATIENCE_S, Stand
 from trade import where
 from trade.errors import DeviceFault, ToleranceExceeded
 from trade_gateway.ros._conversion import ros_stamp
-from trade_gateway.ros._graph import Ended, Outcome
+from trade_gateway.ros._graph import Ended, Outcome, RosRefused
 
 ACTION = "control_msgs/action/FollowJointTrajectory"
 ARM = '[[to_ros.trajectory]]\ngroup = "rosie.arm"\naction = "/arm/follow"\n'
@@ -78,14 +78,8 @@ def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, ar
 @pytest.mark.parametrize(
     ("asked", "code", "says"),
     [
-        (goal((0, [0.0]), (1, [0.1]), names=("a",)), -2, "must include exactly a, b"),
-        (goal((0, [0, 0]), (1, [0.1, 0]), names=("a", "c")), -2, "it is for a, c"),
-        (goal(), -1, "it has no points"),
-        (goal((0, [0, 0]), (1, [0.1])), -1, "a point has 1 positions for 2 joints"),
         (goal((0, [0, 0]), (1, [9.0, 0])), -1, "LimitExceeded"),
         (goal((0, [0, 0]), (1, [float("nan"), 0])), -1, "InvalidArgument"),
-        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=1000.0), -3, "it should have begun"),
-        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=4_000_000_000.0 // 2), -1, "goals cannot be scheduled"),
     ],
 )
 def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
@@ -96,6 +90,82 @@ def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
     assert (outcome.how, outcome.result["error_code"]) == (Ended.ABORTED, code)
     assert says in outcome.result["error_string"]
     assert arm.plans == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        (goal((0, [0.0]), (1, [0.1]), names=("a",)), "must include exactly a, b"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), names=("a", "c")), "it is for a, c"),
+        (goal(), "it has no points"),
+        (goal((0, [0, 0]), (1, [0.1])), "a point has 1 positions for 2 joints"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=1000.0), "it should have begun"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=4_000_000_000.0 // 2), "goals cannot be scheduled"),
+    ],
+)
+def test_a_goal_that_no_arm_could_reach_is_rejected_and_the_one_before_it_goes_its_way(
+    stand: Stand, arm: Limb, asked: dict[str, Any], says: str
+) -> None:
+    arm.hold = True
+    stand.up(ARM)
+    before = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
+    assert arm.goes.wait(PATIENCE_S)
+    with pytest.raises(RosRefused, match=says):
+        ended(stand.node("/other"), asked)
+    assert not arm.stopped.is_set()
+    arm.stopped.set()
+    before.wait(PATIENCE_S)
+    assert len(arm.plans) == 1
+
+
+TOPIC = ARM + 'topic = "/arm/joint_trajectory"\n'
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+
+
+def test_messages_of_a_topic_are_goals_and_the_newest_counts(stand: Stand, arm: Limb) -> None:
+    arm.hold = True
+    stand.up(TOPIC)
+    topic = stand.node().advertise("/arm/joint_trajectory", TRAJECTORY)
+    topic.send(TO_THERE["trajectory"])
+    assert arm.goes.wait(PATIENCE_S)
+    [lock] = stand.container.locks()
+    assert lock.holder.purpose == "a trajectory of /teleop"
+    arm.hold = False
+    topic.send(goal((0.0, [0.5, -0.5]), (1.0, [0.1, 0.1]))["trajectory"])
+    wait_until(lambda: arm.at == pytest.approx([0.1, 0.1]))
+    assert len(arm.plans) == 2
+    wait_until(lambda: stand.container.locks() == [])
+
+
+@pytest.mark.parametrize("how", ["no points", "death of the node", "end of the bridge"])
+def test_the_motion_of_a_topic_ends(stand: Stand, arm: Limb, how: str) -> None:
+    arm.hold = True
+    bridge = stand.up(TOPIC)
+    topic = stand.node().advertise("/arm/joint_trajectory", TRAJECTORY)
+    topic.send(TO_THERE["trajectory"])
+    assert arm.goes.wait(PATIENCE_S)
+    if how == "no points":
+        topic.send({"joint_names": ["a", "b"]})
+    elif how == "death of the node":
+        stand.ros.kill("/teleop")
+    else:
+        bridge.close()
+    assert arm.stopped.wait(PATIENCE_S)
+
+
+def test_a_trajectory_of_a_topic_that_no_arm_could_follow_ends_nothing_and_moves_nothing(
+    stand: Stand, arm: Limb, caplog: pytest.LogCaptureFixture
+) -> None:
+    arm.hold = True
+    stand.up(TOPIC)
+    topic = stand.node().advertise("/arm/joint_trajectory", TRAJECTORY)
+    topic.send(TO_THERE["trajectory"])
+    assert arm.goes.wait(PATIENCE_S)
+    topic.send(goal((0.0, [0.0]), (1.0, [0.1]), names=("a",))["trajectory"])
+    topic.send(goal((0.0, [0.0, 0.0]), (1.0, [0.1]))["trajectory"])
+    wait_until(lambda: caplog.text.count("is rejected") == 2)
+    assert not arm.stopped.is_set()
+    assert len(arm.plans) == 1
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,12 @@ def start_program(system: str) -> Iterator[StartProgram]:
 
 
 @pytest.fixture
+def no_local_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Containers that start from now on use the transport for all calls."""
+    monkeypatch.setenv("TRADE_LOCAL_PATH", "0")
+
+
+@pytest.fixture
 def here(start_container: Callable[..., Container]) -> Container:
     """The container that calls."""
     return start_container("here")
@@ -159,9 +165,11 @@ class Gate:
     def __init__(self) -> None:
         self.entered = threading.Event()
         self.open = threading.Event()
+        self.runs = 0
 
     @service
     def pass_through(self) -> str:
+        self.runs += 1
         self.entered.set()
         self.open.wait(30)
         return "through"

@@ -8,6 +8,7 @@ from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource, admit
+from trade._transport.wait_clock import WaitClock
 
 EPOCH = "epoch"
 LONG_S = 1e6
@@ -15,12 +16,25 @@ NAMES = ("a", "b", "c", "d")
 COUPLED = {"c": ("d",), "d": ("c",)}
 
 
+class Now(WaitClock):
+    """A clock that reads a test's time; waits on it end with a notification."""
+
+    def __init__(self, read: Callable[[], float]) -> None:
+        self._read = read
+
+    def now(self) -> float:
+        return self._read()
+
+    def now_ns(self) -> int:
+        return int(self._read())
+
+
 class Table:
     """A lock table whose clock and whose stops are the test's."""
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.table = LockTable(EPOCH, "home", lambda: self.now)
+        self.table = LockTable(EPOCH, "home", Now(lambda: self.now))
         self.resources = {name: self.table.adopt(Resource(name, coupled=COUPLED.get(name, ()))) for name in NAMES}
         self.stopping: list[tuple[Resource, Callable[[Resource, str], None]]] = []
         self.table.stop_with(self._stop)

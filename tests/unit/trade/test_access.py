@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.unit.trade.joint_with_policy import Neck, find, memory, policy, rewritten
-from trade import Container, Estop, Handle, Settings, service, where
+from trade import CallModel, Container, Estop, Handle, Settings, service, where
 from trade._container.builtin_services import OwnServices
 from trade._context.call_context import CallContext, running
 from trade._estop.services import EstopServices
@@ -195,6 +195,27 @@ def test_changing_the_system_needs_the_right_to_administer(member: Member, polic
         planner.call(load, str(policy))
     chief.call(load, str(policy))
     assert planner.call(where(name="clock", container=drv.name)) > 0
+
+
+STATES = ("network", "stream_listeners", "state_events", "call_profile")
+
+
+def test_states_are_for_those_who_may_read_the_system_and_watching_calls_for_those_who_may_instrument(
+    member: Member, memory: MemorySystem, policy: Path
+) -> None:
+    rewritten(policy, 'read = ["rosie"]', 'read = ["*"]')
+    dash, drv = member("dash"), member("drv")
+    for name in STATES:
+        dash.call(where(name=name, group="trade", container=drv.name))
+        with pytest.raises(AccessDenied, match=rf"drv may not read trade.{name}"):
+            drv.call(where(name=name, group="trade", container=dash.name))
+    watch = where(name="watch_calls", group="trade", container=drv.name)
+    careless = memory.container("careless", identity="dash")  # it checks no rule before it calls
+    memory.settle()
+    for asking in (dash, careless):
+        with pytest.raises(AccessDenied, match=r"dash may not instrument trade.watch_calls"):
+            asking.call(watch, CallModel(1, {}))
+    assert drv._parts.spans.watch is None
 
 
 def test_every_function_of_the_middleware_is_in_the_table_of_what_they_need() -> None:

@@ -102,7 +102,7 @@ def go(caller: Caller) -> Call:
 
 
 def route(caller: Caller, to: Address = OTHER) -> Route:
-    return Route(caller.peer(to), caller.publishers.get(to, "rosie", "Arm-1", stop=False))
+    return caller.route(caller.peer(to), "rosie", "Arm-1", stop=False)
 
 
 def answered(transport: PaperTransport) -> Callable[[bytes], None]:
@@ -160,7 +160,7 @@ def test_ending_a_wait_does_not_end_the_next_call_on_the_same_channel(
 
     caller._end(lent_on_meanwhile, Status.LOST)
     assert [call_id for _, call_id in transport.wakes] == [1]
-    assert caller._deadlines() == [deadline_ns]  # the next call keeps its deadline
+    assert caller._next_deadline_ns() == deadline_ns  # the next call keeps its deadline
     box.waiting = None
 
 

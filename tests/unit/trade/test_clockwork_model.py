@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from tests.support.waiting import PATIENCE_S, wait_until
+from tests.unit.trade.lock_table_rig import Now
 from trade._threads.scheduler import MOST_THREADS, ScheduledTask, Scheduler
 
 HOUR_NS = 3_600_000_000_000
@@ -58,7 +59,7 @@ class Model(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0
-        self.scheduler = Scheduler("model-clock", lambda: self.now)
+        self.scheduler = Scheduler("model-clock", Now(lambda: self.now))
         self.turns = itertools.count()
         self.acts: list[Act] = []
 

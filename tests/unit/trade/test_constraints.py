@@ -107,6 +107,9 @@ _FACTS = ["see(cup)", "on(cup, table)", "on(cup, cup)", "at(?place)"]
 _PATTERNS = ["see(?x)", "on(?x, ?x)", "on(?x, table)", "at(dock)", "?x", "see(?x), on(?x, ?y)"]
 
 
+_conditions = st.sampled_from(["needs", "achieves"])
+
+
 def _term(**asked: Any) -> Term:
     [[term]] = where(**asked).clauses
     return term
@@ -118,7 +121,7 @@ _terms = st.one_of(
     st.sampled_from([Term("local", ""), Term("healthy", "")]),
     st.builds(lambda types: _term(args=types), st.lists(st.sampled_from(_TYPES), max_size=2)),
     st.builds(lambda kind: _term(returns=kind), st.sampled_from(_TYPES)),
-    st.builds(lambda pattern: _term(achieves=pattern), st.sampled_from(_PATTERNS)),
+    st.builds(lambda field, pattern: _term(**{field: pattern}), _conditions, st.sampled_from(_PATTERNS)),
     st.builds(lambda value: _term(meta={"a": value}), st.sampled_from([1, 2, True, "x", None])),
 )
 _expressions = st.recursive(
@@ -132,7 +135,9 @@ _expressions = st.recursive(
 )
 
 
-def _info(kinds: list[Any], required: int, returns: Any, achieves: list[str], uses: list[str]) -> ServiceInfo:
+def _info(
+    kinds: list[Any], required: int, returns: Any, needs: list[str], achieves: list[str], uses: list[str]
+) -> ServiceInfo:
     def function(*_: Any) -> Any: ...
 
     places = [
@@ -146,7 +151,7 @@ def _info(kinds: list[Any], required: int, returns: Any, achieves: list[str], us
     ]
     function.__signature__ = inspect.Signature(places)  # type: ignore[attr-defined]
     function.__annotations__ = {**{place.name: place.annotation for place in places}, "return": returns}
-    mark = ServiceMark(achieves=tuple(achieves), uses=tuple(uses))
+    mark = ServiceMark(needs=tuple(needs), achieves=tuple(achieves), uses=tuple(uses))
     return Signature("robot.go", "go", mark, function, _CODEC).info
 
 
@@ -155,6 +160,7 @@ _infos = st.builds(
     st.lists(st.sampled_from(_TYPES), max_size=2),
     st.integers(0, 2),
     st.sampled_from(_TYPES),
+    st.lists(st.sampled_from(_FACTS), max_size=2),
     st.lists(st.sampled_from(_FACTS), max_size=2),
     st.lists(st.sampled_from(["a", "a.b", "ab"]), max_size=2),
 )
@@ -262,6 +268,7 @@ def test_a_term_about_an_unknown_field_is_refused_on_arrival() -> None:
         ["args", "[1, 2]", False],
         ["returns", "[[{}, {}], {}]", False],
         ["achieves", "see(", False],
+        ["needs", "see(", False],
         ["meta", "[]", False],
         ["meta", '["a", [1]]', False],
     ],
@@ -305,6 +312,8 @@ def test_a_pattern_must_be_a_text(wrong: dict[str, Any]) -> None:
         ({"args": [object]}, "this type cannot be sent"),
         ({"returns": threading.Lock}, "this type cannot be sent"),
         ({"achieves": "see(?x"}, "a closing parenthesis is missing"),
+        ({"needs": "see(?x"}, "a closing parenthesis is missing"),
+        ({"needs": ["at(?p)", ""]}, "needs must be a non-empty text"),
         ({"achieves": ""}, "must be a non-empty text"),
         ({"meta": {"a": [1]}}, "meta maps names to numbers"),
         ({"meta": {"a": float("nan")}}, "must be finite"),
@@ -338,6 +347,7 @@ TEXTS = [
     (where(returns=int | None, healthy=False), "not healthy and returns=int | None"),
     (where(returns=Handle), "returns=Handle"),
     (where(achieves=["see( ?x )", "on(?x,table)"]), "achieves='see(?x), on(?x, table)'"),
+    (where(needs="see( ?x )", achieves="holding(?x)"), "achieves='holding(?x)' and needs='see(?x)'"),
     (where(meta={"side": "left"}), "meta side='left'"),
 ]
 

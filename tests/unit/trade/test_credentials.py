@@ -95,7 +95,7 @@ def test_another_user_cannot_join_through_the_loopback_port(
     here: Container, system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another user has another runtime folder, and so another secret."""
-    [entry] = (tmp_path / "runtime" / "trade" / system).iterdir()
+    [entry] = (tmp_path / "runtime" / "trade" / system).glob("tcp_*")
     endpoint = entry.read_text().split()[0]
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))
     with Container(Settings.read(container="intruder", connect=[endpoint])) as intruder:

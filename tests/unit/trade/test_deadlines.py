@@ -269,9 +269,9 @@ def test_calls_end_at_their_deadlines_although_others_begin_while_they_are_looke
     gc.callbacks.append(interrupt)
     gc.set_threshold(1)
     try:
-        caller._end_overdue(1)
+        caller._end_overdue()
     finally:
         gc.set_threshold(*before)
         gc.callbacks.remove(interrupt)
-        caller._end_overdue(1)
+        caller._end_overdue()
     assert {*range(5000)} <= {*ended}

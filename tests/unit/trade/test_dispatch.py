@@ -71,6 +71,7 @@ def test_services_run_side_by_side(here: Container, there: Container, crowd: Cro
     assert [run.result(20) for run in runs] == [None] * 10
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_container_at_its_cap_still_drains(
     run.result(20)
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_when_the_process_can_have_no_more_threads_a_call_is_refused(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch, eventually: Any
 ) -> None:
@@ -275,6 +277,7 @@ def test_a_service_may_register_others_and_look_up(here: Container, there: Conta
     assert found(here, "make")()() == 1
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_only_so_many_reply_keys_are_kept_and_evicted_ones_work_again(
     here: Container, there: Container, monkeypatch: pytest.MonkeyPatch, crowd: Crowd
 ) -> None:
@@ -354,6 +357,7 @@ def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: py
             run.result(20)
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_no_reply_key_is_kept_of_a_caller_that_is_gone(here: Container, there: Container, crowd: Crowd) -> None:
     there.register(crowd, "robot")
     crowd.open.set()

@@ -5,16 +5,18 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import pytest
 
 from tests.support.waiting import wait_until
-from trade import Container, Handle, HookEvent, Secret, current_call, errors, service, where
+from trade import Container, Handle, HookEvent, Secret, Settings, current_call, errors, service, where
 from trade._container.hooking import Hook
 from trade._context.call_context import CallContext
 from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
+from trade.testing import memory_system
 
 
 class Planner:
@@ -61,6 +63,18 @@ class Observer:
 
 
 @pytest.fixture
+def usual_limit() -> None:
+    """Hooks have the time that they have by default."""
+
+
+@pytest.fixture(autouse=True)
+def hooks_have_time(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hooks of most tests may take as long as a busy computer does."""
+    if "usual_limit" not in request.fixturenames:
+        monkeypatch.setenv("TRADE_HOOK_LIMIT_S", "30")
+
+
+@pytest.fixture
 def planner() -> Planner:
     return Planner()
 
@@ -78,8 +92,9 @@ def plan(there: Container, here: Container, planner: Planner) -> Handle:
 
 
 @pytest.fixture
-def watch(here: Container, observer: Observer) -> Callable[[str], Handle]:
-    here.register(observer, "eye")
+def watch(here: Container, there: Container, observer: Observer) -> Callable[[str], Handle]:
+    handles = here.register(observer, "eye")
+    wait_until(lambda: all(there.has(handle.key) for handle in handles))  # it calls them
     return lambda name: here.find(where(name=name, group="eye"))
 
 
@@ -228,6 +243,25 @@ def test_what_is_detached_stays_so_while_it_is_being_attached_to_who_comes(
     assert here.hooks() == []
 
 
+def test_a_hook_is_attached_once_its_container_knows_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trade._registry.registry._KNOWN_WITHIN_S", 60)
+    planner, observer = Planner(), Observer()
+    with memory_system() as system, ThreadPoolExecutor(1, "attaching") as other:
+        here, there = system.container("here"), system.container("there")
+        there.register(planner, "mind")
+        system.settle()
+        system.partition(here, there, one_way=True)
+        here.register(observer, "eye")
+        third = system.container("third")
+        system.settle()
+        attaching = other.submit(third.before_service, third.find("mind.plan"), third.find("eye.see"))
+        assert not wait([attaching], 0.3).done
+        system.heal(here, there)
+        attaching.result(20)
+        third.call("mind.plan", "x")
+        assert observer.next().args == {"goal": "x"}
+
+
 def test_a_hook_is_listed_and_detached_from_anywhere(
     here: Container, there: Container, plan: Handle, watch: Callable[[str], Handle]
 ) -> None:
@@ -315,7 +349,32 @@ def test_a_hook_that_fails_changes_nothing_and_is_suspended_in_the_end(
     assert (info.failures, info.suspended, info.last_error) == (3, True, "OSError: no film")
 
 
+def test_a_setting_gives_hooks_more_time(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> None:
+    class Slow:
+        @service(effect="read")
+        def write(self, called: HookEvent) -> None:
+            threading.Event().wait(0.4)  # longer than hooks have by default
+            observer.seen.put(called)
+
+    monkeypatch.setenv("TRADE_HOOK_LIMIT_S", "30")
+    with Container(Settings.read(container="mind")) as home:
+        home.register(Planner(), "mind")
+        [write] = home.register(Slow(), "log")
+        hook = home.after_service("mind.plan", write)
+        home.call("mind.plan", "coffee")
+        assert observer.next().ok
+        [info] = hook.infos()
+        assert (info.fired, info.failures) == (1, 0)
+
+
+@pytest.mark.parametrize("limit", ["0", "-1", "61", "soon", "nan"])
+def test_an_impossible_limit_of_hooks_is_a_configuration_error(limit: str) -> None:
+    with pytest.raises(ConfigurationError, match="TRADE_HOOK_LIMIT_S"):
+        Settings.read(environment={"TRADE_HOOK_LIMIT_S": limit})
+
+
 @pytest.mark.realtime
+@pytest.mark.usefixtures("usual_limit")
 def test_a_slow_hook_is_cut_off(
     here: Container, plan: Handle, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
@@ -330,6 +389,7 @@ def test_a_slow_hook_is_cut_off(
 
 
 @pytest.mark.realtime
+@pytest.mark.usefixtures("usual_limit")
 def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, observer: Observer) -> None:
     [plan, *_] = here.register(Planner(), "mind")
     here.register(observer, "eye")
@@ -340,6 +400,7 @@ def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, obser
 
 
 @pytest.mark.realtime
+@pytest.mark.usefixtures("usual_limit")
 def test_what_is_too_late_after_its_hooks_does_not_run(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
@@ -373,6 +434,7 @@ def test_the_gates_are_checked_after_the_hooks(
 
 
 @pytest.mark.realtime
+@pytest.mark.usefixtures("usual_limit")
 def test_nothing_comes_before_a_stop_and_what_comes_after_does_not_hold_it_up(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
@@ -394,9 +456,9 @@ def test_what_cannot_be_called_there_is_refused(here: Container, plan: Handle, c
         here.before_service(plan, call)
 
 
-def test_only_handles_and_constraints_are_watched(here: Container, watch: Callable[[str], Handle]) -> None:
-    with pytest.raises(ConfigurationError, match="target must be a handle or where"):
-        here.before_service("mind.plan", watch("see"))  # type: ignore[arg-type]
+def test_what_is_neither_a_service_nor_a_text_is_not_watched(here: Container, watch: Callable[[str], Handle]) -> None:
+    with pytest.raises(ConfigurationError, match=r"trade\.before_service: say which services by where"):
+        here.before_service(7, watch("see"))  # type: ignore[arg-type]
 
 
 def test_hooks_do_not_observe_the_built_in_services(

@@ -17,10 +17,10 @@ from trade._registry.registry import Record, Registry
 def record(number: int, **reported: Any) -> Record:
     address = Address("me", reported.get("container", "driver"), "e1")
     name = reported.get("name", f"s{number}")
-    achieves, uses = tuple(reported.get("achieves", ())), tuple(reported.get("uses", ()))
+    needs, achieves, uses = (tuple(reported.get(field, ())) for field in ("needs", "achieves", "uses"))
     return Record(
         key=ServiceKey(address, "_", f"Arm-{number}", name),
-        info=ServiceInfo(name=name, signature=f"{name}()", achieves=achieves, uses=uses),
+        info=ServiceInfo(name=name, signature=f"{name}()", needs=needs, achieves=achieves, uses=uses),
         groups=tuple(reported.get("groups", ())),
         kind="Arm",
         host="edge",
@@ -34,6 +34,7 @@ def record(number: int, **reported: Any) -> Record:
 
 
 _labels = st.lists(st.sampled_from(["a", "b", "a.b", "a.b.c", "ab"]), max_size=2)
+_conditions = st.lists(st.sampled_from(["see(cup)", "see(?x)", "on(cup, table)", "?x", "(("]), max_size=2)
 _reported = st.fixed_dictionaries(
     {
         "name": st.sampled_from(["a", "b", "a*"]),
@@ -41,14 +42,19 @@ _reported = st.fixed_dictionaries(
         "groups": _labels,
         "uses": _labels,
         "kinds": _labels,
-        "achieves": st.lists(st.sampled_from(["see(cup)", "see(?x)", "on(cup, table)", "?x", "(("]), max_size=2),
+        "needs": _conditions,
+        "achieves": _conditions,
         "health": st.sampled_from([HEALTHY, "hot"]),
     }
 )
 _ATOMS = [
     *(where(**{field: text}) for field in ("name", "container", "group", "uses", "kind") for text in ("a", "a.b")),
     *(where(**{field: "a*"}) for field in ("name", "container", "kind")),
-    *(where(achieves=text) for text in ("see(?x)", "?x", "on(?x, ?y), see(?x)", "none(a)")),
+    *(
+        where(**{field: text})
+        for field in ("needs", "achieves")
+        for text in ("see(?x)", "?x", "on(?x, ?y), see(?x)", "none(a)")
+    ),
     *(where(), ~where(), where(healthy=True), where(host="edge")),
 ]
 _constraints = st.recursive(
@@ -90,6 +96,7 @@ def many() -> Index[Record]:
                 number,
                 name=f"s{number % 100}",
                 groups=[f"r{number % 50}.arm.j{number}"],
+                needs=[f"ready{number % 1000}(it)"],
                 achieves=[f"done{number % 1000}(it)"],
                 uses=[f"r{number % 50}.joint"],
             )
@@ -104,6 +111,8 @@ LOOKED_AT = [
     (where(name="s7", group="r7"), 100),
     (where(name="s5", group="r9"), 0),
     (where(name="s5", achieves="done5(?x)"), 10),
+    (where(needs="ready5(?x)"), 10),
+    (where(needs="done5(?x)"), 0),
     (where(uses="r3"), 200),
     (where(name="s1") | where(name="s2"), 200),
     (where(name="s1") & ~where(group="r3"), 100),
@@ -137,7 +146,7 @@ def test_a_service_by_name_and_group_is_found_by_one_lookup(monkeypatch: pytest.
 
 def test_removed_services_leave_nothing_in_the_index() -> None:
     index: Index[Record] = Index()
-    entry = record(1, groups=["a.b"], uses=["c.d"], achieves=["see(x)"])
+    entry = record(1, groups=["a.b"], uses=["c.d"], needs=["at(y)"], achieves=["see(x)"])
     index.put(entry)
     index.put(record(1, groups=["z"]))
     index.remove(entry.key)

@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 
 from tests.support.two_joint_robot import Joint, Robot
+from tests.support.waiting import PATIENCE_S
 from trade import Handle, service, where
+from trade._locks import api
 from trade.errors import IncompleteGroup, LockLost, NotLocked
 
 A, B, C = (where(group=f"robot.{name}") for name in "abc")
@@ -39,7 +41,8 @@ def test_S13_an_alternative_of_which_nothing_moves_is_missing(robot: Robot) -> N
         robot.me.lock(A | C, wait_s=0).acquire()
 
 
-def test_S13_a_lock_waits_for_an_alternative_that_comes(robot: Robot) -> None:
+def test_S13_a_lock_waits_for_an_alternative_that_comes(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api, "_SETTLE_S", PATIENCE_S)  # on a busy computer it comes late
     came = threading.Timer(0.2, comes, (robot, "c"))
     came.start()
     with robot.me.lock(A | C) as lock:

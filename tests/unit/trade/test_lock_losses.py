@@ -178,9 +178,12 @@ def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot
         robot.find("a", "stop", robot.other)()
         with pytest.raises(Stopped):
             robot.find("a")(0.2)
+        [stop] = robot.other.call(where(name="stops", container=robot.find("a").container))
+        assert (stop.resource, stop.by, stop.estop) == ("a", "tester", False)
         with pytest.raises(LockedByOther):
             robot.other.resume(WHOLE)
         assert robot.me.resume(WHOLE) == ["a"]
+        assert robot.other.call(where(name="stops", container=robot.find("a").container)) == []
         assert robot.find("a")(0.3) == 0.3
 
 

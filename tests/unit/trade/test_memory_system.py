@@ -85,7 +85,7 @@ def test_the_page_on_testing_does_what_it_says() -> None:
     for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         exec(program, known)
     tests = [value for name, value in known.items() if name.startswith("test_")]
-    assert len(tests) == 6
+    assert len(tests) == 9
     for test in tests:
         test()
 
@@ -261,6 +261,7 @@ def losing(*payloads_of: str) -> Callable[[InFlightMessage], bool]:
 def test_a_lost_announcement_is_known_with_the_next_one() -> None:
     with memory_system() as system:
         a, b = system.container("a"), system.container("b")
+        system.settle()
         end = system.lose(losing("Lamp"))
         b.register(Lamp(), "lost")
         end()

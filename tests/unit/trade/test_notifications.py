@@ -153,9 +153,9 @@ def test_a_callback_may_call_services_and_register_more(here: Container, there: 
 def test_what_cannot_be_called_is_refused(here: Container) -> None:
     with pytest.raises(
         ConfigurationError,
-        match=r"trade.joined: call must be a handle, .*, or a function, not 'x'",
+        match=r"trade.joined: call must be a handle, .*, a function, or a text such as 'rosie.head.stop', not 7",
     ):
-        here.joined(where(), "x")  # type: ignore[arg-type]
+        here.joined(where(), 7)  # type: ignore[arg-type]
 
 
 def test_consultants_are_asked_as_they_come_and_go(start_container: Any, listener: Listener) -> None:

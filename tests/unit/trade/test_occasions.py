@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, Handle, service, where
-from trade._notifications import notification as notifications
+from trade._transport import wait_clock
 from trade.errors import ConfigurationError, DeviceSilent, NoSuchNotification
 
 SOON_S = 0.02
@@ -92,7 +92,7 @@ def test_at_uses_the_wall_clock_even_when_it_is_set(
     noted = here.at(datetime.now(timezone.utc) + timedelta(hours=5), handle("go"))
     assert noted.active
     ahead, real = 6 * 3600, time.time
-    monkeypatch.setattr(notifications.time, "time", lambda: real() + ahead)
+    monkeypatch.setattr(wait_clock.time, "time", lambda: real() + ahead)
     assert dock.next() == 0.1
 
 
@@ -244,7 +244,9 @@ def test_after_counts_from_when_its_condition_holds(
         (lambda here: here.at(datetime.now(timezone.utc) - timedelta(seconds=9), print), "has passed, 9"),
         (lambda here: here.at(datetime.now(), print), "has no time zone"),  # noqa: DTZ005
         (lambda here: here.at("noon", print), "the time must be a datetime, not 'noon'"),
-        (lambda here: here.once("go"), "call must be a handle"),
+        (lambda here: here.once(7), "call must be a handle"),
+        (lambda here: here.once("rosie..go"), r"trade\.once 'rosie\.\.go': .* is no group"),
+        (lambda here: here.joined(7, print), r"trade\.joined: say which services"),
         (lambda here: here.once(print, if_=True), "a condition must be a handle"),
         (lambda here: here.every(1, print, if_=lambda _percent: True), "a condition is called without arguments"),
         (lambda here: here.every(1, print, when=lambda _percent: True), "a condition is called without arguments"),

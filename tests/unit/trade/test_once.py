@@ -193,6 +193,7 @@ def test_large_answers_are_dropped_first_but_not_the_record_that_they_were_given
 # --- the caller's side
 
 
+@pytest.mark.usefixtures("no_local_path")
 @pytest.mark.parametrize("how", ["call", "start"])
 def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
     here: Container, there: Container, motor: Motor, how: str

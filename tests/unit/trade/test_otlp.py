@@ -18,6 +18,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from opentelemetry.sdk.trace.sampling import Decision, TraceIdRatioBased
 from opentelemetry.trace import SpanKind, StatusCode
 
+from tests.support.waiting import wait_until
 from trade import Container, Settings, current_call, service, where
 from trade._telemetry.otlp import Export, trace_id
 from trade.errors import ConfigurationError
@@ -49,6 +50,10 @@ class Mind:
         return self.container.call(where(name="step"), far_m)
 
 
+SPANS = 5
+"""Two calls between containers, noted at both ends, and one within a container."""
+
+
 @pytest.fixture
 def walk(start_container: Start) -> Callable[[float], list[ReadableSpan]]:
     """Calls over three containers, all of which note and export; gives the spans."""
@@ -62,12 +67,14 @@ def walk(start_container: Start) -> Callable[[float], list[ReadableSpan]]:
 
     def walked(far_m: float) -> list[ReadableSpan]:
         call = user.find(where(name="walk"), wait_s=30)
-        mind.find(where(name="step"), wait_s=30)
+        for asking in (user, mind):  # tracing begins in the containers that the user knows
+            asking.find(where(name="step"), wait_s=30)
         user.set_tracing(True)
         try:
             call(far_m)
         except ValueError:
             assert far_m > 1
+        wait_until(lambda: len(exporter.get_finished_spans()) >= SPANS)  # an answer may come before its span is over
         return list(exporter.get_finished_spans())
 
     return walked

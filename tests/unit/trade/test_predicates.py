@@ -1,11 +1,13 @@
-"""Post-conditions and patterns with variables."""
+"""Pre-conditions and post-conditions, and patterns with variables."""
+
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import service
-from trade._registry.predicates import Predicate, achieves_all, parse_achieved, parse_predicates, read_achieved
+from trade._registry.predicates import Predicate, fits_all, parse_condition, parse_predicates, read_condition
 from trade.errors import ConfigurationError
 
 FITS = [
@@ -38,7 +40,7 @@ FITS = [
 
 @pytest.mark.parametrize(("pattern", "achieved", "fits"), FITS)
 def test_a_pattern_fits_what_it_says(pattern: str, achieved: list[str], fits: bool) -> None:
-    assert achieves_all(achieved, parse_predicates(pattern)) is fits
+    assert fits_all(achieved, parse_predicates(pattern)) is fits
 
 
 @pytest.mark.parametrize(
@@ -56,12 +58,11 @@ def test_predicates_have_an_end() -> None:
         parse_predicates("a" * 1001)
 
 
-@pytest.mark.parametrize("wrong", ["open(", "?x", "a, b", ""])
-def test_a_malformed_post_condition_is_refused_where_it_is_declared(wrong: str) -> None:
-    with pytest.raises(ConfigurationError):
-
-        @service(achieves=[wrong])
-        def go() -> None: ...
+@pytest.mark.parametrize("wrong", ["open(", "?x", "a, b", "", 5, None])
+@pytest.mark.parametrize(("field", "kind"), [("needs", "pre-condition"), ("achieves", "post-condition")])
+def test_a_malformed_condition_is_refused_where_it_is_declared(field: Any, kind: str, wrong: Any) -> None:
+    with pytest.raises(ConfigurationError, match=f"is no ({kind}|predicate)"):
+        service(**{field: [wrong]})
 
 
 _names = st.sampled_from(["a", "b", "f", "see", "1.5", "x-y"])
@@ -79,13 +80,13 @@ def test_a_predicate_reads_as_it_is_written(predicate: Predicate) -> None:
 
 @given(_predicates.filter(lambda predicate: not predicate.is_variable))
 def test_every_post_condition_is_found_by_itself(predicate: Predicate) -> None:
-    assert parse_achieved(str(predicate)) == predicate
-    assert achieves_all([str(predicate)], [predicate])
+    assert parse_condition(str(predicate)) == predicate
+    assert fits_all([str(predicate)], [predicate])
 
 
 @given(st.text(alphabet="ab?x(), ", max_size=30))
 def test_any_text_is_either_read_or_refused(text: str) -> None:
-    read_achieved(text)
+    read_condition(text)
     try:
         parse_predicates(text)
     except ConfigurationError as refused:
@@ -95,5 +96,5 @@ def test_any_text_is_either_read_or_refused(text: str) -> None:
 def test_an_endless_search_pattern_ends_without_a_match() -> None:
     facts = [f"p({number})" for number in range(10)]
     patterns = parse_predicates(", ".join(f"p(?a{number})" for number in range(60)) + ", q(?z)")
-    assert not achieves_all(facts, patterns)
-    assert achieves_all([*facts, "q(1)"], patterns)
+    assert not fits_all(facts, patterns)
+    assert fits_all([*facts, "q(1)"], patterns)

@@ -140,6 +140,23 @@ def test_a_missed_withdrawal_shows_in_the_answer(registry: Registry, reported: R
     assert registry.removed(ServiceKey(OTHER, "rosie", "leg", "kick"))
 
 
+def test_services_behind_a_bridge_come_and_go_with_what_it_exports(registry: Registry, reported: Reports) -> None:
+    registry.appear(OTHER)
+    answer(registry, 2, arm=info(), leg=info(2, "kick"))
+    for revision in (2, 2, 3):
+        assert registry.reopen(OTHER)
+        assert left_open(registry)
+        assert [record.name for record in registry.select(where())] == ["go", "kick"]  # until it replies
+        answer(registry, revision, arm=info())
+        assert reported.changes[-1] == ([], ["kick"], [])
+        assert not left_open(registry)
+        assert registry.reopen(OTHER)
+        answer(registry, revision, arm=info(), leg=info(2, "kick"))
+        assert reported.changes[-1] == (["kick"], [], [])
+        assert not registry.removed(ServiceKey(OTHER, "rosie", "leg", "kick"))
+    assert not registry.reopen(Address("arm", "unknown", "e1"))
+
+
 def test_the_last_announcement_that_was_missed_shows_with_the_count(registry: Registry) -> None:
     registry.appear(OTHER)
     answer(registry, 1, arm=info())
@@ -193,7 +210,7 @@ def test_whatever_is_lost_the_answer_that_closes_everything_is_true(data: st.Dat
     late = list[tuple[int, dict[str, ProviderInfo]]]()
     names = iter(f"p{number}" for number in range(100))
     for act in data.draw(
-        st.lists(st.sampled_from(["offer", "alter", "withdraw", "ask", "answer", "count"]), max_size=30)
+        st.lists(st.sampled_from(["offer", "alter", "withdraw", "ask", "answer", "count", "reopen"]), max_size=30)
     ):
         if act == "ask":
             late.append((revision, dict(truth)))
@@ -202,6 +219,8 @@ def test_whatever_is_lost_the_answer_that_closes_everything_is_true(data: st.Dat
             answer(registry, revision_then, **then)
         elif act == "count":
             registry.count(OTHER, revision)
+        elif act == "reopen":
+            registry.reopen(OTHER)
         elif act == "offer" or (act in ("alter", "withdraw") and truth):
             revision += 1
             name = next(names) if act == "offer" else data.draw(st.sampled_from(sorted(truth)))

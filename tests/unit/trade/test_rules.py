@@ -70,6 +70,29 @@ def test_what_is_missing_longer_than_its_steps_take_waits_for_the_cooldown(
     assert running.rules()[0].fired == 1
 
 
+def test_a_rule_fires_for_each_service_that_is_present_while_its_condition_holds(
+    here: Container, there: Container, desk: Desk, engine: Engine
+) -> None:
+    desk.wanted = True
+    there.register(Lamp(), "hall")
+    there.register(Lamp(), "attic")
+    wait_until(lambda: len(here.services(where(name="switch"))) == 2)
+    running = engine(
+        '[rule.r]\nwhen = { present = { name = "switch" } }\nif = { service = { name = "is_wanted" } }\n'
+        f"{TELL}\ncooldown_s = 600"
+    )
+    assert {desk.next()[0], desk.next()[0]} == {"hall.switch", "attic.switch"}
+    wait_for_looks(here)
+    assert running.rules()[0].fired == 2  # each once in its cooldown
+    desk.wanted = False
+    there.register(Lamp(), "porch")
+    wait_until(lambda: here.services(where(name="switch", group="porch")))
+    wait_for_looks(here)
+    assert running.rules()[0].fired == 2
+    desk.wanted = True
+    assert desk.next()[0] == "porch.switch"
+
+
 def wait_for_looks(here: Container) -> None:
     """Until it has been looked for what is missing a few times more."""
 

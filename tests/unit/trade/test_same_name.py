@@ -53,6 +53,7 @@ def test_when_one_of_two_of_a_name_ends_the_other_stays(twins: tuple[Container, 
     assert handles[other.address]() > 0
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_answers_to_two_callers_of_one_name_do_not_cross(
     twins: tuple[Container, Container], here: Container, open_raw: Any
 ) -> None:

@@ -83,9 +83,7 @@ def test_waiting_takes_no_threads_and_neither_stops_nor_others_wait(
     work, beside, stop = (here.find(where(name=name), wait_s=20) for name in ("work", "beside", "stop"))
     runs = [work.start(i) for i in range(200)]
     assert eventually(lambda: len(work_serial(work)._queue) == 199)
-    assert (
-        len(there._parts.dispatcher._worker_pools[0]._threads) < 50
-    )  # 199 wait; taking calls in may itself need several
+    assert len(there._parts.dispatcher.pools[0]._threads) < 50  # 199 wait; taking calls in may itself need several
     assert (beside(), stop()) == ("beside", "stopped")
     bench.open.set()
     assert sorted(run.result(30) for run in runs) == list(range(200))

@@ -1,13 +1,14 @@
 """Clients within a container (S03): each moves for itself, and takes no other down with it."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 
 from tests.support.two_joint_robot import Joint, Robot
 from tests.support.waiting import wait_until
 from trade import Container, Handle, where
+from trade._resources.resource import Resource, admit
 from trade.errors import ConfigurationError, LockedByOther, LockLost, SessionEnded, Stopped
 from trade.testing import MemorySystem, memory_system
 
@@ -220,3 +221,30 @@ def test_S14_a_device_that_a_dead_session_could_not_stop_is_locked_only_after_re
 
 def _system_of(me: Container, home: Container, name: str) -> Handle:
     return me.find(where(group="trade", name=name, container=home.name), wait_s=20)
+
+
+def test_S05_a_call_that_is_being_admitted_is_not_of_the_session_that_moved_last() -> None:
+    """The old session ends between two steps of an admission: what rests is not its motion any more."""
+    joints = [Resource("a"), Resource("b")]
+    moved = admit(joints, 1, "tester", (), ("old",), None)
+    moved.close()
+    during: list[frozenset[str]] = []
+
+    def look(_: Iterable[str]) -> None:
+        during.extend(joint.sessions for joint in joints if joint.busy)
+
+    for joint in joints:
+        joint.gone = look
+    admit(joints, 2, "tester", (), ("new",), None)
+    assert during
+    assert set().union(*during) == {"new"}
+
+
+def test_S05_a_motion_without_a_call_is_of_the_session_that_began_it() -> None:
+    joint = Resource("a")
+    moved = admit([joint], 1, "tester", (), ("old",), None)
+    joint.moving = True
+    moved.close()
+    assert joint.sessions == {"old"}
+    joint.moving = False
+    assert joint.sessions == set()

@@ -28,6 +28,7 @@ OFFERS = """
 """
 
 
+@pytest.mark.usefixtures("no_local_path")
 def test_announcing_many_services_takes_no_pool_and_a_large_result_does(here: Container, start_program: Any) -> None:
     program = start_program(OFFERS)
     handle = here.find(where(name="picture", group="house.room39"), wait_s=30)

@@ -82,6 +82,10 @@ class Brain:
         return which(value)
 
     @service(effect="read")
+    def picture(self, size: int) -> bytes:
+        return bytes(size)
+
+    @service(effect="read")
     def itself(self) -> Handle:
         return self.home
 
@@ -164,6 +168,10 @@ def test_calls_give_results_and_errors_of_their_own_types(two: Two) -> None:
         two.find("fail")("odd")
     with pytest.raises(InvalidArgument, match="other"):
         two.find("middle")(Point(0, 0), 3)
+
+
+def test_large_results_cross(two: Two) -> None:
+    assert len(two.anna.find(where(name="picture"))(300_000)) == 300_000
 
 
 def test_deadline_lineage_and_who_it_is_for_go_along(two: Two) -> None:

@@ -1,15 +1,19 @@
 """The rules of ``examples/rules.toml``, each at work in a system as it describes."""
 
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, service, where
+from trade._calls import picking
 from trade._migration import source as _departing
 from trade._transport.endpoints import free_endpoint
-from trade.errors import NoSuchService
+from trade.errors import NoSuchService, ServiceGone
 from trade.rules import Firing, Rules, read_rules, rehearse
 from trade.rules import _engine as rules_module
 
@@ -26,7 +30,12 @@ class Camera:
 
 
 class Planner:
+    made: ClassVar[list["Planner"]] = []
     load = 0.2
+
+    def __init__(self) -> None:
+        self.plans: list[str] = []
+        self.made.append(self)
 
     @service(effect="read")
     def busy(self) -> float:
@@ -34,6 +43,8 @@ class Planner:
 
     @service(achieves=["plan(?goal)"])
     def plan(self, goal: str) -> str:
+        self.plans.append(goal)
+        threading.Event().wait(0.05)  # eight at once outweigh a busy processor
         return goal
 
     def save_state(self) -> float:
@@ -82,7 +93,14 @@ def seers(looking: Container) -> list[str]:
 
 def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) -> None:
     reported = {rehearsal.rule: rehearsal.fires for rehearsal in rehearse(here, read_rules(SHIPPED))}
-    assert reported == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
+    assert reported == {
+        "bootstrap": True,
+        "elsewhere": True,
+        "degraded": False,
+        "balance": False,
+        "ease": False,
+        "relocate": False,
+    }
 
 
 @pytest.mark.realtime
@@ -152,25 +170,67 @@ def test_a_lamp_that_is_missing_is_made(
     shine(0.5)
 
 
-def test_an_overloaded_provider_moves_elsewhere_and_clients_find_one(
-    start_container: StartContainer, only: Only, here: Container
+@pytest.fixture
+def mind(start_container: StartContainer, here: Container, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Planner:
+    """The planner of container "mind"; two workers may make another one, and the second worker is less busy."""
+    text = f"from {__name__} import Planner as Ours\nclass Planner(Ours): ...\n"
+    (tmp_path / "mind.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(Planner, "made", [])
+    planner = Planner()
+    for name in BUSY:
+        start_container(name, instantiable=["mind:Planner"])
+        here.find(where(name="instantiate", container=name), wait_s=30)
+    start_container("mind").register(planner, "mind.planner")
+    here.find("mind.planner.busy", wait_s=30)
+    return planner
+
+
+BUSY = {"worker-1": 0.7, "worker-2": 0.2}
+
+
+def planning(looking: Container) -> list[str]:
+    return sorted(handle.container for handle in looking.services("mind.planner.plan"))
+
+
+def test_two_planners_share_the_jobs_once_the_first_has_too_much_to_do(
+    mind: Planner, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mind, planner = start_container("mind"), Planner()
-    start_container("worker-1", instantiable=[f"{__name__}:Planner"])
-    mind.register(planner, "mind.planner")
-    for constraint in (where(name="migrate", container="mind"), where(name="clock", container="worker-1")):
-        here.find(constraint, wait_s=30)
-    wait_until(lambda: here.services(where(name="plan")))
-    rules = only("balance", every_s="0.02")
-    wait_until(lambda: any(info.fired for info in here.notifications()))
+    with monkeypatch.context() as reports:
+        reports.setattr(picking, "busyness", lambda load, under_way: (BUSY[load.container], 0.0))
+        rules = only("balance", every_s="0.02")
+        wait_until(lambda: any(info.fired for info in here.notifications()))
+        assert rules.rule_firings() == []
+        assert planning(here) == ["mind"]
+        mind.load = 0.9
+        firing = first(rules)
+        assert firing.ok
+        assert [(did.service, did.container) for did in firing.steps] == [("trade.instantiate", "worker-2")]
+    wait_until(lambda: planning(here) == ["mind", "worker-2"])
+    goals = [f"job {number}" for number in range(40)]
+    with ThreadPoolExecutor(8, "client") as clients:
+        made = list(clients.map(lambda goal: here.call("mind.planner.plan", goal, pick="least_busy"), goals))
+    assert made == goals
+    first_one, second = Planner.made
+    assert sorted(first_one.plans + second.plans) == sorted(goals)
+    assert 10 <= len(first_one.plans) <= 30
+
+
+def test_the_second_planner_ends_once_the_first_has_little_to_do(mind: Planner, only: Only, here: Container) -> None:
+    [busy, *_] = here.call(where(name="instantiate", container="worker-2"), "mind:Planner", [], ["mind.planner"])
+    wait_until(lambda: planning(here) == ["mind", "worker-2"])
+    mind.load = 0.45
+    rules = only("ease")
+    wait_until(lambda: any(info.fired > 1 for info in here.notifications()))
     assert rules.rule_firings() == []
-    planner.load = 0.9
+    assert planning(here) == ["mind", "worker-2"]
+    mind.load = 0.2
     firing = first(rules)
-    assert (firing.ok, firing.service) == (True, "mind.planner.busy")
-    wait_until(lambda: [one.container for one in here.services(where(name="plan"))] == ["worker-1"])
-    for looking in (where(name="plan"), where(name="plan", group="mind.planner"), where(achieves="plan(?goal)")):
-        assert here.find(looking)("tea") == "tea"
-    assert here.call(where(name="busy")) == 0.9
+    assert firing.ok
+    assert [(did.service, did.container) for did in firing.steps] == [("trade.terminate", "worker-2")]
+    wait_until(lambda: planning(here) == ["mind"])
+    with pytest.raises(ServiceGone):
+        busy.with_(deadline_s=5)()
 
 
 def test_all_of_them_together_do_not_run_in_circles_when_a_camera_is_replaced(

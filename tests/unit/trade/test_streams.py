@@ -10,7 +10,8 @@ from tests.unit.trade.stream_listeners import FAST_HZ, PATIENCE_S, Battery, Two,
 from trade import Handle, Stream, where
 from trade._protocol.messages import EMPTY, PROTOCOL
 from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
-from trade._streams.source import Pace, RateRequest, Source
+from trade._streams.rate import Pace
+from trade._streams.source import RateRequest, Source
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 
@@ -266,7 +267,7 @@ def test_a_slow_listener_gets_the_newest_sample_and_the_number_of_missed_ones(tw
         assert eventually(lambda: (latest := stream.latest()) is not None and latest.number > 20)
         first, *others = some(stream, 4)
         assert first.number > 4
-        assert first.dropped == first.number - 1
+        assert 0 < first.dropped < first.number  # the first ones may come before the subscription has arrived
         together = others[-1].number - first.number
         assert sum(sample.dropped + 1 for sample in others) == together
 

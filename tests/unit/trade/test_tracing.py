@@ -218,6 +218,7 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
 
     there.register(Queue(), "q")
     here.find(where(name="follow"), wait_s=20)
+    here.find(where(name="set_tracing", group="trade", container="there"), wait_s=20)
     here.set_tracing(True)
     first = here.find(where(name="hold")).start()
     assert entered.wait(20)

@@ -1,11 +1,13 @@
 """The transport on zenoh keeps the guarantees of every transport."""
 
 import contextlib
+import gc
 import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,7 @@ from trade._discovery.host_folder import free_endpoint
 from trade._transport.base import Channel, ChannelClosed, Presence, Questions
 from trade._transport.zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
+from trade.testing._ear import meet
 
 
 class TestZenoh(TransportConformance):
@@ -41,12 +44,30 @@ class TestZenoh(TransportConformance):
         with self.network() as open_transport:
             here, there = open_transport(), open_transport()
             unread, read = there.subscribe("flood", newest=_CHANNEL_CAPACITY), there.subscribe("call")
+            meet(listener=there, speaker=here)
             flood, call = here.publish("flood"), here.publish("call")
             for number in range(2 * _CHANNEL_CAPACITY):
                 flood.put(str(number).encode())
             call.put(b"at last")
             assert read.receive().payload == b"at last"
             assert int(unread.receive().payload or b"0") >= _CHANNEL_CAPACITY
+
+    def test_sessions_with_open_publishers_leave_no_files_when_they_are_closed(self) -> None:
+        def open_files() -> int:
+            gc.collect()
+            return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+        def opened_and_closed() -> None:
+            with self.network() as open_transport:
+                publisher = open_transport().publish("state")
+            with pytest.raises(ChannelClosed):
+                publisher.put(b"late")
+
+        opened_and_closed()  # what zenoh opens once for each process
+        before = open_files()
+        for _ in range(5):
+            opened_and_closed()
+        assert open_files() <= before + 1  # zenoh closes the memory of one session when the next is opened
 
     def test_a_wait_for_queries_ends_when_their_queue_is_closed(self) -> None:
         def read(questions: Questions) -> None:
@@ -66,6 +87,7 @@ class TestZenoh(TransportConformance):
         with self.network() as open_transport, ThreadPoolExecutor(1, "putting") as other:
             here, there = open_transport(), open_transport()
             orders, announced = there.subscribe("estop/**"), there.announcements("registry/**")
+            meet(listener=there, speaker=here)
             order = here.publish("estop/one")
 
             def put_all() -> None:

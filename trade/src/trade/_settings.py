@@ -3,6 +3,7 @@
 import difflib
 import logging
 import os
+import re
 import socket
 import sys
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ from types import MappingProxyType
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
+from trade._chosen_system import chosen_settings
 from trade._protocol.keys import as_chunk, is_chunk
 from trade._protocol.samples import STEPS_HZ
 from trade._security.certificates import Certificate
@@ -26,13 +28,16 @@ _logger = logging.getLogger("trade")
 _VARIABLES: Final = (
     "TRADE_SYSTEM",
     "TRADE_IDENTITY",
+    "TRADE_CODE",
     "TRADE_CONTAINER",
     "TRADE_LISTEN",
     "TRADE_CONNECT",
     "TRADE_CREDENTIALS",
     "TRADE_TLS",
     "TRADE_BRIDGE",
+    "TRADE_HUB",
     "TRADE_INSECURE_LAN",
+    "TRADE_LOCAL_PATH",
     "TRADE_LOCK",
     "TRADE_INSTANTIABLE",
     "TRADE_POLICY",
@@ -45,7 +50,12 @@ _VARIABLES: Final = (
     "TRADE_AUDIT_KEEP_DAYS",
     "TRADE_AUDIT_KEEP_ROWS",
     "TRADE_METRICS",
+    "TRADE_HOOK_LIMIT_S",
 )
+_SHA256: Final = re.compile(r"[0-9a-f]{64}")
+_HUB: Final = ("auto", "off", "serve")
+_HOOK_LIMIT_S: Final = 0.1
+_LONGEST_HOOK_S: Final = 60.0
 _KEEP_DAYS: Final = 90
 _KEEP_ROWS: Final = 10_000_000
 _MOST_KEPT: Final = 1_000_000_000
@@ -89,11 +99,16 @@ class Settings:
     stream_hz: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
     """For each interface of the bridge and exported group: the highest rate at which others receive its streams, one of
     1, 2, 5, 10, 20, 50, 100, 200 and 500 samples a second; without a limit: the rate they request."""
+    hub: str = "auto"
+    """``auto``: attach to the hub of this host, if one runs and ``listen``, ``connect`` and ``bridge`` are empty: one
+    link instead of one to each container. ``off``: do not attach. ``serve``: be the hub of this host."""
     explicit_system: bool = False
     lock: str = ""
     """A lock that the parent process holds for this one; see `Lock.environment`."""
     instantiable: tuple[str, ...] = ()
     """Classes that other containers may create objects of here, such as ``mypkg.vision:Camera`` or ``mypkg.*``."""
+    code: tuple[str, ...] = ()
+    """SHA-256 of the archives of code that the container takes from others, in hexadecimal digits."""
     state_dir: Path | None = None
     """Folder for what must outlive a process, such as open e-stops; none: nothing is kept."""
     trace: bool = False
@@ -113,6 +128,11 @@ class Settings:
     metrics: str = ""
     """Where to serve ``/metrics`` for Prometheus, such as ``127.0.0.1:9464``; none: not served. Requires the extra
     ``trade-core[metrics]``."""
+    local_path: bool = True
+    """Make and take calls within this host on Unix sockets; false: all calls take the transport, which is slower."""
+    hook_limit_s: float = _HOOK_LIMIT_S
+    """How long one hook may delay a call of a service of this container, in seconds, at most 60; all hooks of one side
+    together two and a half times as long."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -122,6 +142,8 @@ class Settings:
         self._check_collector(urlsplit(self.otlp))
         self._check_kept()
         self._check_metrics()
+        self._check_code()
+        self._check_choices()
         certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
@@ -134,10 +156,17 @@ class Settings:
             raise ConfigurationError(where="credentials", problem=problem)
         for endpoint in self.connect:
             self.check_may_dial(endpoint)
-        if len(set(self.bridge)) == 1 and not self.connect:
+        if len(set(self.bridge)) == 1 and not self.connect and self.hub != "serve":
             problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
             raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
         self._check_exports()
+
+    def _check_choices(self) -> None:
+        if not 0 < self.hook_limit_s <= _LONGEST_HOOK_S:
+            problem = f"must be above 0 and at most {_LONGEST_HOOK_S:g} seconds, not {self.hook_limit_s:g}"
+            raise ConfigurationError(where="TRADE_HOOK_LIMIT_S", problem=problem)
+        if self.hub not in _HUB:
+            raise ConfigurationError(where="TRADE_HUB", problem=f"{self.hub!r} is none of {', '.join(_HUB)}")
 
     def _check_metrics(self) -> None:
         if not self.metrics:
@@ -153,6 +182,12 @@ class Settings:
                 f"127.0.0.1:{place.port}, and put a proxy that does both in front"
             )
             raise ConfigurationError(where="TRADE_METRICS", problem=problem)
+
+    def _check_code(self) -> None:
+        for sha256 in self.code:
+            if not _SHA256.fullmatch(sha256):
+                problem = f"{sha256!r} is no SHA-256; write the 64 hexadecimal digits that `trade code PATH` shows"
+                raise ConfigurationError(where="TRADE_CODE", problem=problem)
 
     def _check_kept(self) -> None:
         for name, value in (("DAYS", self.audit_keep_days), ("ROWS", self.audit_keep_rows)):
@@ -247,6 +282,7 @@ class Settings:
         tls: str | Path | None = None,
         insecure_lan: bool | None = None,
         bridge: Sequence[str] | None = None,
+        hub: str | None = None,
         exports: Mapping[str, Sequence[str]] | None = None,
         stream_hz: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
         policy: Path | None = None,
@@ -259,14 +295,20 @@ class Settings:
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
-        ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
-        (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_OTLP`` (a
-        URL), ``TRADE_AUDIT`` (a folder), ``TRADE_AUDIT_READS`` (``1``), ``TRADE_AUDIT_KEEP_DAYS``,
-        ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_METRICS`` (``HOST:PORT``), ``TRADE_RUNTIME_DIR`` and
-        ``TRADE_STATE_DIR`` (else the user's folder for state).
-        A warning is logged for other variables that begin with ``TRADE_``.
+        ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_HUB``
+        (``auto``, ``off`` or ``serve``), ``TRADE_LOCK`` (set by ``trade lock``), ``TRADE_INSTANTIABLE`` and
+        ``TRADE_CODE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_OTLP`` (a URL), ``TRADE_AUDIT`` (a folder),
+        ``TRADE_AUDIT_READS`` (``1``), ``TRADE_AUDIT_KEEP_DAYS``, ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_METRICS``
+        (``HOST:PORT``), ``TRADE_HOOK_LIMIT_S`` (seconds),
+        ``TRADE_LOCAL_PATH`` (``0`` switches the local path off),
+        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        A warning is logged for other variables that begin with ``TRADE_``. If neither the arguments nor the environment
+        name a system, the choice of ``trade use`` comes before the defaults.
         """
-        environment = os.environ if environment is None else environment
+        if environment is None:
+            environment = os.environ
+            if not system and not environment.get("TRADE_SYSTEM"):
+                environment = {**chosen_settings(environment), **environment}
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
         folder = tls or environment.get("TRADE_TLS")
@@ -281,12 +323,14 @@ class Settings:
             tls=certified,
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
+            hub=hub or environment.get("TRADE_HUB") or "auto",
             exports=None if exports is None else {name: tuple(groups) for name, groups in exports.items()},
             stream_hz=stream_hz,
             policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
             instantiable=tuple(_split(environment, "TRADE_INSTANTIABLE") if instantiable is None else instantiable),
+            code=tuple(_split(environment, "TRADE_CODE")),
             state_dir=_state_dir(environment),
             trace=environment.get("TRADE_TRACE") == "1" or bool(environment.get("TRADE_OTLP")),
             otlp=environment.get("TRADE_OTLP", ""),
@@ -295,6 +339,8 @@ class Settings:
             audit_keep_days=_number(environment, "TRADE_AUDIT_KEEP_DAYS", _KEEP_DAYS),
             audit_keep_rows=_number(environment, "TRADE_AUDIT_KEEP_ROWS", _KEEP_ROWS),
             metrics=environment.get("TRADE_METRICS", "") if metrics is None else metrics,
+            local_path=environment.get("TRADE_LOCAL_PATH") != "0",
+            hook_limit_s=_seconds(environment, "TRADE_HOOK_LIMIT_S", _HOOK_LIMIT_S),
         )
 
 
@@ -332,6 +378,14 @@ def _number(environment: Mapping[str, str], name: str, default: int) -> int:
         return int(text) if text else default
     except ValueError:
         raise ConfigurationError(where=name, problem=f"{text!r} is no whole number") from None
+
+
+def _seconds(environment: Mapping[str, str], name: str, default: float) -> float:
+    text = environment.get(name)
+    try:
+        return float(text) if text else default
+    except ValueError:
+        raise ConfigurationError(where=name, problem=f"{text!r} is no number of seconds") from None
 
 
 def _state_dir(environment: Mapping[str, str]) -> Path | None:

@@ -7,7 +7,7 @@
     |   |-- DeadlineExceeded, OutcomeUnknown, Cancelled                 how the call ended
     |   |-- MotionStopped, Stopped, NoSuchEstop                         stops
     |   |-- LockedByOther, LockLost, NotLocked, IncompleteGroup         locks
-    |   |-- AccessDenied, SessionEnded, InUse                           rights, sessions and containers
+    |   |-- AccessDenied, CallRefused, SessionEnded, InUse              rights, guards, sessions and containers
     |   |-- NoSuchNotification, NoSuchHook, NoSuchCall                  ids
     |   `-- NotInstantiable, NoSuchClass                                objects created on request
     |-- CallError              the other side of a call failed
@@ -32,7 +32,7 @@ All errors are in one module, so that a reader sees the whole tree.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
 from trade._timestamps import clock
 
@@ -41,12 +41,14 @@ __all__ = [
     "BusGone",
     "Busy",
     "CallError",
+    "CallRefused",
     "CallerError",
     "Cancelled",
     "CannotConnect",
     "CannotInstantiate",
     "CannotMigrate",
     "CannotStart",
+    "CodeRefused",
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
@@ -94,6 +96,10 @@ _SHORTEST_SILENCE_S: Final = 0.1
 _NO_MORE_TENTHS_S: Final = 10.0
 
 
+_NEVER_RAN: Final = "_never_ran"
+_Error = TypeVar("_Error", bound="TradeError")
+
+
 @dataclass(kw_only=True, eq=False)
 class TradeError(Exception):
     """The root of all errors that this project raises on purpose."""
@@ -107,6 +113,20 @@ class TradeError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), {f.name: getattr(self, f.name) for f in fields(self)})
+
+
+def never_ran(error: TradeError, key: object) -> bool:
+    """Whether it is certain that a call of the service with that key did not begin, so that another one may be called.
+
+    An error of the same type may come from the service itself, which has then run.
+    """
+    return vars(error).get(_NEVER_RAN) == key
+
+
+def as_never_ran(error: _Error, key: object) -> _Error:
+    """The error of a call of that service that did not begin. The mark does not cross the wire."""
+    setattr(error, _NEVER_RAN, key)
+    return error
 
 
 def _rebuild(cls: type[TradeError], data: dict[str, object]) -> TradeError:
@@ -378,6 +398,18 @@ class NotInstantiable(CallerError, PermissionError):
 
 
 @dataclass(kw_only=True, eq=False)
+class CodeRefused(CallerError, PermissionError):
+    """A container does not take code that was brought to it; nothing was imported."""
+
+    sha256: str
+    container: str
+    reason: str
+
+    def describe(self) -> str:
+        return f"container {self.container} does not take the code with SHA-256 {self.sha256}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
 class NoSuchClass(CallerError, LookupError):
     """The container's Python has no class of that path."""
 
@@ -409,6 +441,19 @@ class AccessDenied(CallerError, PermissionError):
             f"{self.who} may not {self.verb} {self.what}: {self.rule}. "
             "`trade policy show` lists all rights. Ask the policy's maintainer for access"
         )
+
+
+@dataclass(kw_only=True, eq=False)
+class CallRefused(CallerError, PermissionError):
+    """A guard of the service did not let the call run; nothing was done."""
+
+    service: str
+    guard: str
+    """The name of the guard's check."""
+    reason: str
+
+    def describe(self) -> str:
+        return f"{self.service} was refused by its guard {self.guard}: {self.reason}"
 
 
 @dataclass(kw_only=True, eq=False)

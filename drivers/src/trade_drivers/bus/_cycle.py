@@ -11,6 +11,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade import Resource
 from trade.errors import DeviceError, DeviceFault, DeviceSilent, TradeError
+from trade_drivers.bus._attempts import ATTEMPTS
 from trade_drivers.bus._jobs import Device, Work
 from trade_drivers.robotfile import Bus
 
@@ -22,7 +23,8 @@ PROBE_NS: Final = 500_000_000
 """The first pause before a device that did not answer is tried again."""
 HALT_NS: Final = 2_000_000_000
 """The time allowed for a device to come to rest after a stop."""
-_RETRIES: Final = 3
+_PATIENT_NS: Final = 100_000_000
+"""The pause before a device whose retries are used up is tried again, while its measurement is not too old yet."""
 
 
 def _lasting_ns() -> int:
@@ -67,7 +69,7 @@ class BusDevice(ABC, Generic[_Sample]):
         self.doubted = False
         """True after a missed exchange until a proper answer: what the device sends may answer an earlier request."""
         self.silent = False
-        """True after its retries are used up: the device is left out, and tried from time to time."""
+        """True after its retries are used up and its measurement is too old: it is left out, and tried now and then."""
         self.silent_since_ns = 0
         self.probe_at_ns = 0
 
@@ -171,7 +173,12 @@ class BusCycle(ABC, Generic[_Device]):
 
     def unseen(self) -> list[str]:
         """Returns the names of devices not seen at rest: offline, or still moving after a stop."""
-        return [device.name for device in self._devices if device.silent or device.halting_since_ns]
+        now_ns = self.clock()
+        return [
+            device.name
+            for device in self._devices
+            if device.silent or device.halting_since_ns or device.age_ns(now_ns) > self.stale_after_ns
+        ]
 
     def absence(self, device: _Device, silent: DeviceSilent) -> DeviceError:
         """Returns the error for a missing measurement: why new work is refused, or that the device does not answer."""
@@ -280,16 +287,22 @@ class BusCycle(ABC, Generic[_Device]):
         self._stopping.clear()
 
     def missed(self, device: _Device) -> None:
-        """Records a missing answer: the device is in doubt, and left out after three in a row."""
+        """Records a missing answer: the device is in doubt.
+
+        It is left out after three in a row, but not before its measurement is too old.
+        """
         now_ns = self.clock()
         self.missed_answers += 1
         device.misses += 1
         device.doubted = True
-        if device.misses >= _RETRIES and not device.silent:
+        if device.silent:
+            device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - ATTEMPTS + 1))
+        elif device.misses >= ATTEMPTS and device.age_ns(now_ns) > self.stale_after_ns:
             silences.warning("%s does not answer on %s", device.name, device.bus)
             device.silent, device.silent_since_ns = True, now_ns
-        if device.silent:
-            device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - _RETRIES + 1))
+            device.misses, device.probe_at_ns = ATTEMPTS, now_ns + PROBE_NS
+        elif device.misses >= ATTEMPTS:
+            device.probe_at_ns = now_ns + _PATIENT_NS
 
     def forget_measurements(self) -> None:
         """Invalidates all measurements after the loss of the port; keeps their age."""

@@ -47,6 +47,8 @@ class SerialLine:
         self._poll = select.poll()
         self._sent = 0
         self._deadline = 0.0
+        self._overdue = False
+        """Whether the timeout of the answer is over and all that arrived until then was read."""
 
     @property
     def is_open(self) -> bool:
@@ -90,11 +92,21 @@ class SerialLine:
         """Starts the timeout for an answer of this size to the last request."""
         on_the_wire = (self._sent + size) * self._byte_s
         self._deadline = time.monotonic() + min(on_the_wire + ANSWER_MARGIN_S, LONGEST_WAIT_S)
+        self._overdue = False
 
     def more(self, for_s: float | None = None) -> bool:
-        """Waits for more bytes; returns False if none arrive in this time or before the answer's timeout."""
-        left_s = self._deadline - time.monotonic() if for_s is None else for_s
-        if left_s <= 0 or not self._poll.poll(left_s * 1e3):
+        """Waits for more bytes; returns False if none arrive in this time or before the answer's timeout.
+
+        Bytes that arrived while this thread was held up past the timeout are read once: the device was not late.
+        """
+        if for_s is None:
+            for_s = self._deadline - time.monotonic()
+            if for_s <= 0:
+                if self._overdue:
+                    return False
+                for_s, self._overdue = 0, True
+        if for_s < 0 or not self._poll.poll(for_s * 1e3):
+            self._overdue = True
             return False
         data = os.read(self._fd, 4096)
         if not data:

@@ -4,7 +4,7 @@ Nothing here moves a device. Only ``set_id`` and ``set_baud`` write, to one devi
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import ClassVar, Final, Literal
 
@@ -231,7 +231,7 @@ def scan(
         commissioner: of the driver whose devices are wanted.
         port: the port, which must not be in use.
         bauds: rates to try; by default all that the devices support.
-        ids: ids to try; by default all, at the rates where a device answers.
+        ids: ids to try, up to three times each; by default all, once each, at the rates where a device answers.
 
     Raises:
         ConfigurationError: the port cannot be opened, or a device has torque on: a scan would delay its stop.
@@ -239,20 +239,23 @@ def scan(
     found: list[Found] = []
     for baud in bauds or commissioner.bauds:
         with commissioner.at(port, baud) as bench:
-            here = list(_looking(bench, ids or commissioner.ids, port)) if ids or bench.anybody() else []
+            if ids:
+                here = list(_safe(map(bench.answering, ids), port))
+            else:
+                here = list(_safe(map(bench.look, commissioner.ids), port)) if bench.anybody() else []
         found += here
         progress(baud, len(here))
     return found
 
 
-def _looking(bench: Bench, ids: Collection[int], port: str) -> Iterator[Found]:
-    for device_id in ids:
-        if (found := bench.look(device_id)) is None:
+def _safe(answers: Iterable[Found | None], port: str) -> Iterator[Found]:
+    for found in answers:
+        if found is None:
             continue
         if found.torque:
             raise ConfigurationError(
                 where=port,
-                problem=f"id {device_id} ({found.model}, {found.baud} baud) has its torque on, so the scan has ended; "
+                problem=f"id {found.id} ({found.model}, {found.baud} baud) has its torque on, so the scan has ended; "
                 "end the program that drives it, or switch off its power",
             )
         yield found

@@ -3,7 +3,7 @@
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, wait
 from typing import Annotated, Final
 
@@ -50,6 +50,7 @@ class FaultLog:
         clock: ``time.monotonic``.
         wall: ``time.time``.
         most: how many kinds are kept.
+        devices: whose saved faults it takes; those of others belong to another process of the robot. None: all.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class FaultLog:
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], float] = time.time,
         most: int = _MOST,
+        devices: Collection[str] | None = None,
     ) -> None:
         self._robot, self._store, self._clock, self._wall, self._most = robot, store, clock, wall, most
         self._lock = threading.Lock()
@@ -74,7 +76,8 @@ class FaultLog:
         self._saved_s = -_SAVE_EVERY_S
         self._started_s = clock()
         for number, fault in store.load() if store is not None else ():
-            self._restore(number, fault)
+            if devices is None or fault.device in devices:
+                self._restore(number, fault)
 
     def _restore(self, number: int, fault: Fault) -> None:
         key = (fault.device, fault.kind)

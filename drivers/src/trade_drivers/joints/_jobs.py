@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from trade.errors import TradeError
+from trade.errors import DeviceSilent, TradeError
 from trade_drivers.bus._gate import Command
 from trade_drivers.bus._jobs import Steps, Work
 from trade_drivers.joints._axis import AxisT
@@ -79,5 +79,7 @@ class Leave(Work[AxisT]):
                 continue
             try:
                 yield from self._exchange.leaving(self, axis, relax=self._relax)
+            except DeviceSilent:
+                continue  # like a joint that was silent before: ``unseen()`` reports it
             except TradeError as problem:
                 self.finish(problem)

@@ -29,6 +29,8 @@ class _Progress(Struct):
     closest: int
     measured_ns: int
     """The time of the last check."""
+    watched_s: float = 0.0
+    """How long the joint has been measured; time without measurements does not count."""
     waiting_s: float = 0.0
     """How long the joint has made no progress."""
 
@@ -99,7 +101,6 @@ class Move(Motion[AxisT]):
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = tuple(speeds)
         self._progress: dict[AxisT, _Progress] = {}
-        self._began_ns = 0
         self._patience_s = 0.0
         self.final_counts: tuple[int, ...] = ()
 
@@ -127,18 +128,17 @@ class Move(Motion[AxisT]):
             axis: _Progress(self._goals[axis], distance, now_ns)
             for axis, distance in zip(self.devices, distances, strict=True)
         }
-        self._began_ns = now_ns
         self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
 
     def watch(self, now_ns: int) -> None:
         ending = self.trouble(now_ns, self.until_ns)
         if ending is None:
-            arrived = [self._arrived(axis) for axis in self.devices]
-            if all(arrived):
+            away = [axis for axis in self.devices if not self._arrived(axis)]
+            if not away:
                 self.final_counts = tuple(axis.sample.position for axis in self.devices if axis.sample is not None)
                 self.exchange.release(self, None)
                 return
-            ending = self._stuck()
+            ending = self._stuck(away)
         if ending is not None:
             self.exchange.release(self, ending)
 
@@ -148,6 +148,7 @@ class Move(Motion[AxisT]):
             return False
         elapsed_s = min(max(0, sample.at_ns - progress.measured_ns) / 1e9, _MOST_PER_CYCLE_S)
         progress.measured_ns = max(sample.at_ns, progress.measured_ns)
+        progress.watched_s += elapsed_s
         distance = abs(progress.goal - sample.position)
         if distance < progress.closest:
             progress.closest, progress.waiting_s = distance, 0.0
@@ -157,10 +158,11 @@ class Move(Motion[AxisT]):
             return False
         return distance <= axis.grain.arrived or (distance <= axis.grain.near and progress.waiting_s > _SETTLING_S)
 
-    def _stuck(self) -> TradeError | None:
-        """Returns the fault of a joint that was measured without progress towards its goal."""
-        for axis, progress in self._progress.items():
-            late = (progress.measured_ns - self._began_ns) / 1e9 > self._patience_s
+    def _stuck(self, away: Sequence[AxisT]) -> TradeError | None:
+        """Returns the fault of a joint that was measured without progress towards its goal, of those not there yet."""
+        for axis in away:
+            progress = self._progress[axis]
+            late = progress.watched_s > self._patience_s
             blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
             if late or blocked:
                 short_rad = progress.closest * axis.grain.rad

@@ -11,9 +11,9 @@ from msgspec import Struct
 from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
+from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.bus.can._monitor import CanMonitor
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.faults import Tell
 from trade_drivers.interfaces._arm import Arm

@@ -1,4 +1,7 @@
-"""The robot file: a robot's devices, their buses and their limits. Pure records, no I/O."""
+"""The robot file: a robot's devices, their buses and their limits. Pure records, no I/O.
+
+It has over 400 lines, since the checks of a file need all of its records.
+"""
 
 import re
 from collections.abc import Mapping
@@ -56,6 +59,8 @@ class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The timeout of the device's own watchdog. A device without one is never commanded farther ahead than this."""
     leave: Literal["hold", "relax"] = "hold"
     """What the driver does with enabled devices at shutdown: hold the position, or switch torque off."""
+    process: Literal["shared", "own"] = "shared"
+    """Whether ``trade up`` runs it in the robot's process, or in one of its own that no other bus or code delays."""
 
 
 class SerialBus(Bus, frozen=True, kw_only=True):
@@ -154,6 +159,17 @@ class Robot(Struct, frozen=True, kw_only=True):
     def arms_on(self, bus: str) -> list[Arm]:
         """Returns the arms on one bus, in file order."""
         return [arm for arm in self.arms if arm.bus == bus]
+
+    def own_processes(self) -> list[str]:
+        """Returns the buses that need a process besides the one for the rest of the robot.
+
+        If each bus with a device has a process of its own, the first one is the rest.
+        """
+        devices = (*self.joints, *self.grippers, *self.arms)
+        used = {device.bus for device in devices}
+        own = [bus.name for bus in self.buses if bus.process == "own" and bus.name in used]
+        shared = used.difference(own) or self.cameras or self.sensors
+        return own if shared else own[1:]
 
     def coupled_to(self, joint: str) -> list[str]:
         """Returns the full names of the joints that are only locked together with this one."""
@@ -379,10 +395,28 @@ def _check_groups(robot: Robot) -> None:
     others = (*robot.grippers, *robot.arms, *robot.cameras, *robot.sensors)
     for group in robot.groups:
         _check_joints(robot, group.joints, f"group.{group.name}.joints", names)
+        _check_process(robot, group.joints, f"group.{group.name}.joints")
         if group.name in names | {device.name for device in others}:
             raise wrong(robot.where, f"group.{group.name}", "a device has this name already")
     for number, coupled in enumerate(robot.coupled, 1):
         _check_joints(robot, coupled.joints, f"coupled {number}.joints", names)
+        _check_process(robot, coupled.joints, f"coupled {number}.joints")
+
+
+def _check_process(robot: Robot, joints: list[str], key: str) -> None:
+    """Checks that joints which move or are locked together are driven by one process."""
+    bus_of = {joint.name: joint.bus for joint in robot.joints}
+    own = {bus.name for bus in robot.buses if bus.process == "own"}
+    inside = next((joint for joint in joints if bus_of[joint] in own), None)
+    if inside is None:
+        return
+    for joint in joints:
+        if bus_of[joint] != bus_of[inside]:
+            problem = (
+                f"{inside} is on bus {bus_of[inside]!r} with a process of its own, and {joint} is not; "
+                f'leave out process = "own", or take joints of one bus'
+            )
+            raise wrong(robot.where, key, problem)
 
 
 def _check_joints(robot: Robot, joints: list[str], key: str, names: set[str]) -> None:

@@ -1,14 +1,19 @@
-"""Contract tests for drivers, one class per kind of device, run by pytest on simulated and real devices.
+"""Tests of devices and without devices: a contract for each kind of device, and fake devices.
 
-The contracts are plain classes with ``test_`` methods. A subclass provides the tested device as a fixture.
-``python -m trade_drivers.testing --hil ROBOT.toml`` runs them on the devices of a robot file.
+The contracts are for drivers: plain classes with ``test_`` methods that pytest runs on simulated and real devices. A
+subclass provides the tested device as a fixture. ``python -m trade_drivers.testing --hil ROBOT.toml`` runs them on the
+devices of a robot file.
 
-``FakeJointGroup`` is a test double for programs that use a robot.
+``FakeMotor``, ``FakeJointGroup``, ``FakeGripper``, ``FakeArm``, ``FakeCamera`` and ``FakeSensor`` are test doubles for
+programs that use a robot.
 """
 
 from trade_drivers.testing._arms import ArmContract
 from trade_drivers.testing._cameras import CameraContract
-from trade_drivers.testing._fakes import FakeJointGroup
+from trade_drivers.testing._fake_arm import FakeArm
+from trade_drivers.testing._fake_gripper import FakeGripper
+from trade_drivers.testing._fake_joints import FakeJointGroup, FakeMotor
+from trade_drivers.testing._fake_senses import FakeCamera, FakeSensor
 from trade_drivers.testing._grippers import GripperContract
 from trade_drivers.testing._groups import JointGroupContract
 from trade_drivers.testing._motors import MotorContract
@@ -17,7 +22,12 @@ from trade_drivers.testing._sensors import SensorContract
 __all__ = [
     "ArmContract",
     "CameraContract",
+    "FakeArm",
+    "FakeCamera",
+    "FakeGripper",
     "FakeJointGroup",
+    "FakeMotor",
+    "FakeSensor",
     "GripperContract",
     "JointGroupContract",
     "MotorContract",

@@ -8,9 +8,10 @@ from typing import Annotated, Final
 
 import typer
 
+from trade import errors
 from trade.errors import TradeError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._output import say_error
+from trade_gateway.cli._output import NOT_FOUND, say_error
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.process._parent_watch import end_with_stdin
 
@@ -28,8 +29,10 @@ _RIGHTS: Final = "Identities and rights"
 _COMMANDS: Final = {
     "up": (_ROBOTS, "cli.robots._up:up"),
     "gateway": (_ROBOTS, "cli.robots._gateway:gateway"),
+    "hub": (_ROBOTS, "cli.robots._hub:hub"),
     "container": (_ROBOTS, "cli.robots._container:container"),
     "start": (_ROBOTS, "cli.robots._start:start"),
+    "code": (_ROBOTS, "cli.robots._code:code"),
     "migrate": (_ROBOTS, "cli.robots._migrate:migrate"),
     "http": (_ROBOTS, "cli.robots._http:app"),
     "system": (_ROBOTS, "cli.robots._system:app"),
@@ -45,8 +48,10 @@ _COMMANDS: Final = {
     "conformance": (_OPERATION, "cli.operation._conformance:conformance"),
     "services": (_SERVICES, "cli.services._services:services"),
     "containers": (_SERVICES, "cli.services._services:containers"),
+    "use": (_SERVICES, "cli.services._use:use"),
     "call": (_SERVICES, "cli.services._call:call"),
     "stream": (_SERVICES, "cli.services._stream:stream"),
+    "stubs": (_SERVICES, "cli.services._stubs:stubs"),
     "ask": (_SERVICES, "cli.services._ask:ask"),
     "mcp": (_SERVICES, "cli.services._mcp:mcp"),
     "ros": (_ROBOTS, "cli.robots._ros:ros"),
@@ -78,6 +83,17 @@ _COMMANDS: Final = {
 """By name: the help panel, and the function or group of commands that implements it."""
 _COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")
 """Environment variables in which a shell passes the line to complete."""
+_FAILED: Final = 1
+_USAGE: Final = 2
+_MISSING: Final = (
+    errors.NoSuchService,
+    errors.NoSuchEstop,
+    errors.NoSuchNotification,
+    errors.NoSuchHook,
+    errors.NoSuchCall,
+    errors.NoSuchClass,
+)
+"""What a command was asked for does not exist."""
 _WITH_VALUE: Final = ("--system", "--connect")
 """Options before the command that take a value."""
 
@@ -164,14 +180,12 @@ def options(
 
 
 def main() -> None:
-    """Runs the command line; a TRADE error is one line on stderr and exit code 1, a usage error exit code 2."""
+    """Runs the command line; a TRADE error is one line on stderr, and its kind decides the exit code."""
+    words = _words()
     try:
-        build(_asked_for(_words()))()
-    except UsageError as error:
-        say_error(error)
-        sys.exit(2)
+        build(_asked_for(words))()
     except TradeError as error:
-        say_error(error)
-        sys.exit(1)
+        say_error(error, as_json="--json" in words)
+        sys.exit(_USAGE if isinstance(error, UsageError) else NOT_FOUND if isinstance(error, _MISSING) else _FAILED)
     except KeyboardInterrupt:
         sys.exit(130)

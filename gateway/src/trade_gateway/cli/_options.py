@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
+from trade_gateway.cli._completion import groups
 
 SELECT: Final = "What to select"
 CONNECTION: Final = "Connection"
@@ -24,7 +25,8 @@ Wait = Annotated[
     ),
 ]
 Groups = Annotated[
-    list[str] | None, typer.Option("--group", help="Select this group and the groups beneath it. Repeatable.")
+    list[str] | None,
+    typer.Option("--group", autocompletion=groups, help="Select this group and the groups beneath it. Repeatable."),
 ]
 Readers = Annotated[
     list[str] | None,

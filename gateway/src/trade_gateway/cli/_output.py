@@ -5,14 +5,17 @@ import re
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any, Final
 
 import msgspec
 from rich.console import Console
 from rich.markup import escape
 
-from trade.errors import DeviceFault
+from trade.errors import DeviceFault, TradeError
 
+NOT_FOUND: Final = 3
+"""The exit code if what a command was asked for does not exist."""
 _GAP: Final = "  "
 _SMALL: Final = re.compile(r'^( *(?:"(?:[^"\\]|\\.)*": )?)(-?[\d.]+e-\d+)(?=,?$)', re.MULTILINE)
 """A number with a negative exponent, on its line of indented JSON."""
@@ -122,13 +125,21 @@ def as_commands(device: str, remedy: str) -> str:
     return _CALLED.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
-def say_error(error: BaseException) -> None:
-    """Prints an error's name and message on standard error, with remedies as commands."""
+def say_error(error: BaseException, *, as_json: bool = False) -> None:
+    """Prints an error's name and message on standard error, with remedies as commands; or all its data as JSON."""
+    if as_json and isinstance(error, TradeError):
+        data = {field.name: getattr(error, field.name) for field in fields(error)}
+        shown = {"error": type(error).__name__, "message": _with_commands(error), "data": data}
+        print(msgspec.json.encode(shown, enc_hook=str).decode(), file=sys.stderr, flush=True)  # noqa: T201
+        return
     console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(f"[bold red]{type(error).__name__}[/]: {escape(_with_commands(error))}")
+    sys.stderr.flush()
+
+
+def _with_commands(error: BaseException) -> str:
+    """The message, with remedies as commands."""
     message = str(error)
     for remedy, command in REMEDIES.items():
         message = message.replace(remedy, command)
-    if isinstance(error, DeviceFault):
-        message = as_commands(error.device, message)
-    console.print(f"[bold red]{type(error).__name__}[/]: {escape(message)}")
-    sys.stderr.flush()
+    return as_commands(error.device, message) if isinstance(error, DeviceFault) else message

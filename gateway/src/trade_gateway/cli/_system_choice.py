@@ -30,9 +30,14 @@ def choice_of(context: typer.Context) -> SystemChoice:
     return found
 
 
-def visitor(context: typer.Context) -> Container:
-    """Opens a short-lived container for this command; the containers that it calls keep the audit records."""
-    return Container(replace(choice_of(context).settings(), audit=None, metrics=""))
+def visitor_of(choice: SystemChoice, name: str | None = None) -> Container:
+    """Opens a short-lived container; the containers that it calls keep the audit records."""
+    return Container(replace(choice.settings(name), audit=None, metrics=""))
+
+
+def visitor(context: typer.Context, name: str | None = None) -> Container:
+    """Opens a short-lived container for this command."""
+    return visitor_of(choice_of(context), name)
 
 
 def visitor_among_others(context: typer.Context) -> Container:

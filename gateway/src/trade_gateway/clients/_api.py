@@ -32,8 +32,10 @@ from trade.errors import (
     TradeError,
 )
 from trade_gateway.clients import _schemas as messages
+from trade_gateway.clients._administration import Administration
 from trade_gateway.clients._authorizer import ClientAuthorizer
 from trade_gateway.clients._clients import MOST_CALLS, Client, Clients, Quota, places
+from trade_gateway.clients._configuration import Configuration
 from trade_gateway.clients._system_info import Overview
 
 _logger = logging.getLogger("trade")
@@ -62,6 +64,8 @@ class ClientApi:
         self._stop_threads = anyio.CapacityLimiter(inf)
         self._quota = Quota()
         self.overview: Final = Overview(container, self.judge, self.counted)
+        self.administration: Final = Administration(container, self.judge, self.counted)
+        self.configuration: Final = Configuration(container, self.judge, self.counted, self.administration)
 
     async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
         """Runs a function that may block in a thread; one that stops something never waits for a free thread."""
@@ -77,11 +81,19 @@ class ClientApi:
 
     # --- queries
 
-    def seen(self, who: str, group: str | None = None, name: str | None = None) -> list[Handle]:
-        """The services that an identity may know of; an invalid group or name matches none."""
+    def seen(
+        self,
+        who: str,
+        group: str | None = None,
+        name: str | None = None,
+        needs: str | None = None,
+        achieves: str | None = None,
+    ) -> list[Handle]:
+        """The services that an identity may know of; an invalid group, name or condition matches none."""
         try:
-            found = self._container.services(_wanted(group, name))
-        except ConfigurationError:  # not the name of a group
+            conditions = where(needs=needs or None, achieves=achieves or None)
+            found = self._container.services(_wanted(group, name) & conditions)
+        except ConfigurationError:  # not the name of a group, or no predicate
             return []
         return [handle for handle in found if self.judge.sees(who, handle)]
 
@@ -126,7 +138,7 @@ class ClientApi:
                 counted()
             raise
         if counted is not None:
-            run.when_done(lambda _: counted())
+            run.add_done_callback(lambda _: counted())
         return run
 
     def _begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
@@ -174,6 +186,7 @@ class ClientApi:
             TradeError: it could not begin.
             Cancelled: the client no longer waits.
         """
+        self.judge.require_unmarked(client.identity, handle)
         run = await self.begin(client, handle, body, client.admit(handle))
 
         async def watch() -> None:

@@ -4,12 +4,15 @@ The system authorises every call as the HTTP gateway's own identity. So the gate
 same policy; and it offers no service of the middleware itself, as those would accept the gateway's identity.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from pathlib import Path
 from typing import Final
 
-from trade import Container, Handle
+from trade import Container, Handle, where
 from trade.errors import AccessDenied
 from trade.policies import Policy
+from trade_gateway.clients._clients import places
+from trade_gateway.clients._errors import NeedsApproval
 
 ANONYMOUS: Final = "anonymous"
 """Identity of clients without a token or certificate; admitted only if the policy names it."""
@@ -42,6 +45,11 @@ class ClientAuthorizer:
         """The current policy."""
         return self._access.policy
 
+    @property
+    def policy_path(self) -> Path | None:
+        """The file of the current policy."""
+        return self._access.path
+
     def admits(self, who: str) -> bool:
         """Whether an identity is admitted at all: it is not revoked."""
         policy = self._access.policy
@@ -69,6 +77,33 @@ class ClientAuthorizer:
             raise AccessDenied(who=who, verb="call", what=handle.label, rule=rule)
         self._container.require_call(who, handle)
 
+    def needs_approval(self, who: str, handle: Handle, ask_first: Collection[str] = ()) -> bool:
+        """Whether a call of an identity needs a person's approval, by the policy or because its group is listed.
+
+        Calls that move a marked group need it whichever service moves it: the head also as two joints of the neck.
+        """
+        if handle.effect in ("read", "stop") or not (ask_first or (self.policy and self.policy.approval)):
+            return False
+
+        def is_marked(one: Handle) -> bool:
+            return any(self._marks(who, group, ask_first) for group in dict.fromkeys((one.key.domain, *one.groups)))
+
+        if is_marked(handle):
+            return True
+        own = places([handle])
+        others = (one for one in self._container.services(where()) if one.effect == "actuate")
+        return any(not own.isdisjoint(places([one])) and is_marked(one) for one in others)
+
+    def _marks(self, who: str, domain: str, ask_first: Collection[str]) -> bool:
+        if any(domain == group or domain.startswith(f"{group}.") for group in ask_first):
+            return True
+        return self.policy is not None and self.policy.asks_first(who, domain)
+
+    def require_unmarked(self, who: str, handle: Handle) -> None:
+        """Raises NeedsApproval: the policy lets the identity call the service only after an approval."""
+        if self.needs_approval(who, handle):
+            raise NeedsApproval(service=handle.label, reason="only its calls over MCP can wait for one")
+
     def require(self, who: str, verb: str, handles: Iterable[Handle]) -> None:
         """Raises AccessDenied: the identity lacks the right over one of these services."""
         for handle in handles:
@@ -76,6 +111,11 @@ class ClientAuthorizer:
                 rule = "the HTTP gateway forwards no calls to the middleware's own services"
                 raise AccessDenied(who=who, verb=verb, what=handle.label, rule=rule)
             self._access.require(who, verb, handle.key.domain, handle.label)
+
+    def require_groups(self, who: str, verb: str, handle: Handle) -> None:
+        """Raises AccessDenied: the identity lacks the right over one of the groups of a service."""
+        for group in handle.groups or (handle.key.domain,):
+            self._access.require(who, verb, group, handle.label)
 
     def require_some(self, who: str, what: str) -> None:
         """Raises AccessDenied: the identity has no role, so it may read nothing of the system."""
@@ -91,3 +131,8 @@ class ClientAuthorizer:
     def may_system(self, who: str, verb: str) -> bool:
         """Whether the identity may."""
         return self._access.denied(who, verb, _OWN, "the system") is None
+
+    def groups_of(self, who: str, verb: str) -> tuple[str, ...]:
+        """The groups over which the identity has a right, as the policy names them; only ``*`` if all."""
+        policy = self._access.policy
+        return ("*",) if policy is None else tuple(policy.groups_of(who, (verb,)))

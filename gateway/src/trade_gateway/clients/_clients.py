@@ -54,6 +54,11 @@ class Client:
     def closed(self) -> bool:
         return self.session.closed
 
+    @property
+    def busy(self) -> bool:
+        """Whether it has a lock, or a call in progress."""
+        return bool(self._locks or self._runs)
+
     @contextmanager
     def speaking(self) -> Generator[None]:
         """Makes calls inside the context as the client, under its locks, also lost ones until they are released.
@@ -98,7 +103,7 @@ class Client:
     def note(self, run: Run) -> None:
         """Ties a call to the client's end."""
         self._runs.add(run)
-        run.when_done(self._runs.discard)
+        run.add_done_callback(self._runs.discard)
         if self.closed:  # closed meanwhile
             run.ask_to_end()
 

@@ -37,7 +37,7 @@ class NoSuchSession(Refusal, LookupError):
     def describe(self) -> str:
         return (
             f"this client has no session {self.session}...: it was closed, or it expired after its lease without a "
-            "request. POST /session opens another one"
+            "request. Open another one: POST /session, or `initialize` over MCP"
         )
 
 
@@ -49,6 +49,16 @@ class NoAuditRecord(Refusal, LookupError):
 
     def describe(self) -> str:
         return "no audit record is kept. TRADE_AUDIT=FOLDER enables it"
+
+
+@dataclass(kw_only=True, eq=False)
+class NoPolicyFile(Refusal, LookupError):
+    """This HTTP gateway has no policy."""
+
+    http_status = HTTPStatus.NOT_FOUND
+
+    def describe(self) -> str:
+        return "this HTTP gateway has no policy. Start it with TRADE_POLICY=FILE"
 
 
 @dataclass(kw_only=True, eq=False)

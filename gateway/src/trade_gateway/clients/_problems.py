@@ -31,6 +31,8 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
     (errors.SessionEnded, HTTPStatus.NOT_FOUND),
     (errors.NoSuchService, HTTPStatus.NOT_FOUND),
     (errors.NoSuchEstop, HTTPStatus.NOT_FOUND),
+    (errors.NoSuchNotification, HTTPStatus.NOT_FOUND),
+    (errors.NoSuchHook, HTTPStatus.NOT_FOUND),
     (errors.ServiceGone, HTTPStatus.NOT_FOUND),
     (errors.DeadlineExceeded, HTTPStatus.GATEWAY_TIMEOUT),
     (errors.OutcomeUnknown, HTTPStatus.GATEWAY_TIMEOUT),

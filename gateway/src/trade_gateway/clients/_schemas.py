@@ -68,7 +68,7 @@ class ClearBody(Struct, forbid_unknown_fields=True, kw_only=True):
     """None: all open e-stops."""
 
 
-class TracingBody(Struct, forbid_unknown_fields=True, kw_only=True):
+class SwitchBody(Struct, forbid_unknown_fields=True, kw_only=True):
     on: bool
 
 
@@ -153,6 +153,8 @@ class Me(Struct, frozen=True):
     """Over the system: it may read its log, calls, notifications, hooks and policy."""
     instruments: bool
     """Over the system: it may turn tracing on and off."""
+    over: tuple[str, ...] = ("*",)
+    """The groups that it may administer, with all beneath them; ``*``: all."""
 
 
 class ServiceView(Struct, frozen=True):
@@ -163,6 +165,8 @@ class ServiceView(Struct, frozen=True):
     signature: str
     doc: str
     effect: str
+    needs: tuple[str, ...]
+    achieves: tuple[str, ...]
     resources: tuple[str, ...]
     health: str
     container: str
@@ -276,6 +280,8 @@ def service_view(handle: Handle, *, allowed: bool) -> ServiceView:
         handle.signature,
         handle.doc,
         handle.effect,
+        handle.needs,
+        handle.achieves,
         handle.resources,
         handle.health,
         handle.container,

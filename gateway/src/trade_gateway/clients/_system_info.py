@@ -126,7 +126,7 @@ class Overview:
         administers, reads, instruments = (
             self._judge.may_system(who, verb) for verb in ("administer", "read", "instrument")
         )
-        return messages.Me(who, administers, reads, instruments)
+        return messages.Me(who, administers, reads, instruments, self._judge.groups_of(who, "administer"))
 
     def policy(self, who: str) -> messages.PolicyView:
         """Returns the access policy. Raises AccessDenied."""

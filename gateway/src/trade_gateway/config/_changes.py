@@ -72,7 +72,7 @@ def _beside(path: Path) -> list[Path]:
     except (OSError, ValueError):  # the reload reports the error
         return []
     shares = raw.get("share")
-    parts = [raw, *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
+    parts = [raw, raw.get("system"), *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
     tables = [cast("Mapping[str, Any]", part) for part in parts if isinstance(part, dict)]
     return [file for table in tables for file in _named_by(table, path)]
 

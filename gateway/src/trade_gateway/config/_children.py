@@ -6,7 +6,8 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, converted
+from trade_gateway.config._entry import Around, ContainerSpec, Entry
+from trade_gateway.config._tables import Tables, converted
 
 __all__ = ["Child", "Supervised", "read_children"]
 
@@ -31,15 +32,30 @@ class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Resident memory above which it is ended; None: no limit."""
     lease_from: str = ""
     """A gateway of another host whose lease it needs to run here, and which runs it if this host is lost."""
-    stands_in_for: str = ""  # plain: stands
-    """The gateway of another host that owns this container; it runs here while that host is lost."""
+    stands_in_for: str | list[str] = ""  # plain: stands
+    """The gateway of another host that has this container, or several; it runs here while their hosts are lost."""
+    move_above: Annotated[float, Meta(gt=0, le=1)] | None = None
+    """With ``stands_in_for``: the load of its host, as a share of all cores, above which it moves to another one."""
     lease_s: Annotated[float, Meta(ge=2, le=600)] = _LEASE_S
     """With ``stands_in_for``: how long that gateway has the container after its last sign of life."""
 
     @property
     def question_s(self) -> float:
-        """The timeout of one health check."""
-        return self.answers_within_s / _MISSES
+        """The interval of health checks and, except for a command, the timeout of one."""
+        return self.answers_within_s / _MISSES if self.health is None else self.health.every_s
+
+    @property
+    def askers(self) -> tuple[str, ...]:
+        """The gateways that it is a standby for."""
+        named = [self.stands_in_for] if isinstance(self.stands_in_for, str) else self.stands_in_for
+        return tuple(name for name in named if name)
+
+    @property
+    def silence(self) -> str:
+        """What it did if too many health checks failed."""
+        if self.health is None:
+            return f"it did not answer within {self.answers_within_s:g} s"
+        return f"its health command failed {_MISSES} times in a row"
 
     @property
     def misses(self) -> int:
@@ -65,13 +81,14 @@ class Child(NamedTuple):
 
     @property
     def _started(self) -> tuple[object, ...]:
-        words, environment, providers = list(self.part.words), self.part.environment, self.part.entry.providers
-        return (words, environment, providers, *self.lease)
+        part, entry = self.part, self.part.entry
+        program = (entry.folder, entry.announces, entry.grace_s, entry.log_mb)
+        return (list(part.words), part.environment, entry.providers, *program, *self.lease)
 
     @property
     def lease(self) -> tuple[str, str]:
-        """The gateway that leases it, and the gateway that it is a standby for; both may be empty."""
-        return self.terms.lease_from, self.terms.stands_in_for
+        """The gateway that leases it, and the gateways that it is a standby for; both may be empty."""
+        return self.terms.lease_from, ",".join(self.terms.askers)
 
 
 def read_children(
@@ -108,9 +125,7 @@ class _OfGateway(Tables):
         if not entry.is_local:
             self.refuse(name, "host", "a gateway supervises containers of its own host; leave it out")
         if entry.gateway:
-            self.refuse(
-                name, "gateway", "is this file; a gateway supervises robots, providers, rules and HTTP gateways"
-            )
+            self.refuse(name, "gateway", "is this file; a gateway supervises robots, providers, programs and the like")
         if isinstance(entry, Supervised):
             self._check_lease(name, entry)
         if self._certified and not entry.tls:
@@ -119,15 +134,19 @@ class _OfGateway(Tables):
     def _check_lease(self, name: str, entry: Supervised) -> None:
         key = "lease_from" if entry.lease_from else "stands_in_for"
         if not getattr(entry, key):
-            if entry.lease_s != _LEASE_S:
-                self.refuse(name, "lease_s", "goes with stands_in_for; leave it out")
+            for other, default in (("lease_s", _LEASE_S), ("move_above", None)):
+                if getattr(entry, other) != default:
+                    self.refuse(name, other, "goes with stands_in_for; leave it out")
             return
+        if twice := [one for one in entry.askers if entry.askers.count(one) > 1]:
+            self.refuse(name, key, f"names {twice[0]} twice")
         if entry.lease_from and entry.stands_in_for:
             self.refuse(
                 name, key, "one of two gateways leases it and the other one is the standby; leave one of them out"
             )
-        if entry.lease_from and entry.lease_s != _LEASE_S:
-            self.refuse(name, "lease_s", f"is set in the file of {entry.lease_from}; leave it out")
+        for other, default in (("lease_s", _LEASE_S), ("move_above", None)):
+            if entry.lease_from and getattr(entry, other) != default:
+                self.refuse(name, other, f"is set in the file of {entry.lease_from}; leave it out")
         if entry.providers is None:
             self.refuse(name, key, f"goes with providers; a {entry.kind} is pinned to its host; leave it out")
         if entry.restart == "never":

@@ -11,12 +11,13 @@ from msgspec import Meta, Struct
 
 from trade import Settings
 from trade._security.certificates import Certificate
-from trade._toml import read_toml_text
 from trade._transport.endpoints import Endpoint, loopback_interface
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
 from trade_gateway.config._children import Child, read_children
-from trade_gateway.config._tables import Around
+from trade_gateway.config._entry import Around
+from trade_gateway.config._supervised_system import as_gateway
+from trade_gateway.config._tables import read_toml
 from trade_gateway.process._addresses import addresses
 
 __all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
@@ -113,6 +114,8 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """The folder of the audit records of the gateway and its guests in other systems."""
     connect: list[_Text] = []
     """Other gateways that it connects to."""
+    hub: bool = False
+    """Whether it is the hub of its host, too."""
     network: dict[str, Network] = {}
     """Networks by a name for people; at least one, unless the gateway only shares or supervises."""
     share: dict[str, Share] = {}
@@ -151,6 +154,7 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             tls=beside / self.tls if self.tls else None,
             insecure_lan=self.insecure_lan,
             bridge=[network.interface for network in networks],
+            hub="serve" if self.hub else "off",
             exports=exports if limited else None,
             stream_hz={network.interface: network.limits for network in networks},
             policy=beside / self.policy if self.policy else None,
@@ -277,15 +281,8 @@ def read_gateway_file(path: Path) -> Plan:
         ConfigurationError: with the file, the key and the remedy.
     """
     where = str(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        raw = read_toml_text(text)
-    except FileNotFoundError:
-        raise ConfigurationError(where=where, problem="there is no such file") from None
-    except OSError as bad:
-        raise ConfigurationError(where=where, problem=f"cannot be read: {bad.strerror}") from None
-    except ValueError as bad:  # no TOML, or no UTF-8
-        raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
+    text, contents = read_toml(path)
+    raw = as_gateway(path, text, contents)
     try:
         file = msgspec.convert(raw, GatewayFile)
     except msgspec.ValidationError as bad:

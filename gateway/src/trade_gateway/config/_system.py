@@ -1,7 +1,7 @@
 """The system file: the containers of a system, their hosts and their order; checked as a whole."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, cast
@@ -11,8 +11,11 @@ from msgspec import Meta, Struct
 from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
+from trade_gateway.config._children import Supervised
+from trade_gateway.config._entry import Around, ContainerSpec, Entry
 from trade_gateway.config._gateway_file import read_gateway_file
-from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, at, converted, line_of, read_toml
+from trade_gateway.config._supervised_system import is_supervised
+from trade_gateway.config._tables import Tables, at, converted, line_of, read_toml
 
 __all__ = ["SystemPlan", "read_system_file"]
 
@@ -31,6 +34,8 @@ class _System(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     audit: str = ""
     """The folder of audit records of containers of this host that name none."""
     connect: list[_Text] = []
+    supervisor: str = ""
+    """The gateway that `trade system up` starts, and that keeps the containers of this host up."""
 
 
 class SystemPlan(NamedTuple):
@@ -42,6 +47,9 @@ class SystemPlan(NamedTuple):
     parts: Sequence[ContainerSpec]
     """The containers in the order in which they are started."""
     text: str
+    supervisor: str = ""
+    """The container that starts and restarts those of ``supervised``."""
+    supervised: frozenset[str] = frozenset()
 
     def at(self, name: str, key: str = "") -> str:
         """Returns the place of a container in the file, for errors."""
@@ -65,16 +73,30 @@ def read_system_file(path: Path) -> SystemPlan:
     tables = raw.get("container")
     if not isinstance(tables, dict) or not tables:
         raise ConfigurationError(where=f"{path}:1: container", problem="missing; write [container.NAME]")
+    named = cast("dict[str, object]", tables)
+    supervised = {name for name, table in named.items() if system.supervisor and is_supervised(table)}
     entries = {
-        name: converted(table, Entry, path, text, ("container", name))
-        for name, table in cast("dict[str, object]", tables).items()
+        name: converted(table, Supervised if name in supervised else Entry, path, text, ("container", name))
+        for name, table in named.items()
     }
     around = Around(
         system=system.name, tls=system.tls, policy=system.policy, audit=system.audit, connect=system.connect
     )
-    reading = _WithGateways(path, text, around, entries)
-    settings = _own_settings(reading, text)
-    return SystemPlan(path, settings, reading.parts(), text)
+    reading = _WithGateways(path, text, around, entries, supervised)
+    settings, parts = _own_settings(reading, text), reading.parts()
+    if system.supervisor:
+        parts = [_keeper(path, text, system, supervised), *parts]
+    return SystemPlan(path, settings, parts, text, system.supervisor, frozenset(supervised))
+
+
+def _keeper(path: Path, text: str, system: _System, supervised: Collection[str]) -> ContainerSpec:
+    """Returns the gateway that supervises the containers of this host: it reads the same file."""
+    if not supervised or system.supervisor in supervised:
+        problem = "it has the name of a container" if supervised else "no container of this host is for it to supervise"
+        raise ConfigurationError(where=at(path, text, ("system",), "supervisor"), problem=problem)
+    entry = Entry(gateway=str(path.absolute()))
+    read_gateway_file(path)  # checks what only a supervisor asks for
+    return ContainerSpec(system.supervisor, entry, ["--system", system.name, "gateway", entry.gateway], {})
 
 
 def _own_settings(reading: Tables, text: str) -> Settings:
@@ -93,8 +115,19 @@ def _own_settings(reading: Tables, text: str) -> Settings:
 class _WithGateways(Tables):
     """Tables of a system file, where a container may be a gateway."""
 
+    def __init__(
+        self, path: Path, text: str, around: Around, entries: Mapping[str, Entry], supervised: Collection[str]
+    ) -> None:
+        super().__init__(path, text, around, entries)
+        self._supervised = supervised
+
     def check_kind(self, name: str, entry: Entry) -> None:
         super().check_kind(name, entry)
+        if entry.program is not None and name not in self._supervised:
+            self.refuse(name, "program", 'only a supervisor starts programs; write supervisor = "keeper" in [system]')
+        if name in self._supervised and (others := set(entry.after) - set(self._supervised)):
+            problem = f"the supervisor of this host cannot wait for {', '.join(sorted(others))}; leave it out"
+            self.refuse(name, "after", problem)
         for key in _SET_BY_GATEWAY if entry.gateway else ():
             if getattr(entry, key):
                 self.refuse(name, key, "is set in the gateway file; leave it out")

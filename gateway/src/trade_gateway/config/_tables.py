@@ -3,14 +3,15 @@
 import importlib.util
 import os
 import re
+import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, NoReturn, TypeVar, cast
+from typing import Any, Final, NoReturn, TypeVar, cast
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from trade import Settings
 from trade._toml import read_toml_text
@@ -18,141 +19,29 @@ from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
 from trade_drivers import check, load, without
+from trade_gateway.config._entry import (
+    INSIDE,
+    KINDS,
+    LOCAL,
+    ONLY_WITH,
+    Around,
+    ContainerSpec,
+    Entry,
+    HttpSpec,
+    RecordSpec,
+)
 
-__all__ = [
-    "LOCAL",
-    "Around",
-    "ContainerSpec",
-    "Entry",
-    "ObjectSpec",
-    "Tables",
-    "at",
-    "converted",
-    "line_of",
-    "read_toml",
-]
+__all__ = ["Tables", "at", "converted", "line_of", "read_toml"]
 
-LOCAL: Final = "local"
-_KINDS: Final = ("robot", "gateway", "providers", "rules", "http")
-_ONLY_WITH: Final = {"sim": "robot", "without": "robot", "allow": "providers"}
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 
-_Text = Annotated[str, Meta(min_length=1)]
+_VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_DEFAULTS: Final = Entry()
 _Read = TypeVar("_Read", bound=Struct)
-
-
-class ObjectSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"class_": "class"}):
-    """An object to create in a container and offer as services."""
-
-    class_: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$")]
-    """The class, such as ``mypkg.vision:Camera``."""
-    groups: list[_Text] = []
-    args: list[Any] | dict[str, Any] = []
-    """Arguments of its constructor, by position or by name."""
-
-
-class HttpSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An HTTP gateway: the options of ``trade http``."""
-
-    listen: _Text = "127.0.0.1:7080"
-    tokens: str = ""
-    """The file of tokens: ``trade http token NAME --tokens FILE``."""
-    tls: str = ""
-    """Folder of the server's certificate."""
-    origins: list[_Text] = []
-    """Allowed origins of web pages."""
-    hosts: list[_Text] = []
-    """Further host names of the server."""
-
-
-class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One container. Paths are relative to the system file; those of another host are paths there."""
-
-    host: _Text = LOCAL
-    """``local``, or as for ssh: HOST or USER@HOST."""
-    robot: str = ""
-    """A robot file."""
-    sim: bool = False
-    """Simulate the robot's devices."""
-    without: list[_Text] = []
-    """Buses, cameras and sensors of the robot to leave out."""
-    gateway: str = ""
-    """A gateway file."""
-    providers: list[ObjectSpec] | None = None
-    """Objects to create in it; modules of this host may be beside the system file."""
-    allow: list[_Text] = []
-    """Further classes that others may create in it."""
-    rules: str = ""
-    """A rules file."""
-    http: HttpSpec | None = None
-    after: list[_Text] = []
-    """Containers that must be up first."""
-    tls: str = ""
-    policy: str = ""
-    audit: str = ""
-    """Folder of its audit record."""
-    metrics: str = ""
-    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
-    connect: list[_Text] | None = None
-    """Endpoints that it connects to; None: those of the system."""
-    listen: list[_Text] = []
-    command: _Text = "trade"
-    """The path of ``trade`` on another host."""
-
-    @property
-    def kind(self) -> str:
-        """The key that sets its kind; a checked file has exactly one."""
-        return next(kind for kind in _KINDS if getattr(self, kind) not in ("", None))
-
-    @property
-    def file(self) -> str:
-        """The file of a robot, a gateway or rules."""
-        return self.robot or self.gateway or self.rules
-
-    @property
-    def is_local(self) -> bool:
-        """Whether it runs on the host of `trade system`."""
-        return self.host == LOCAL
-
-
-_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": ObjectSpec, "http": HttpSpec}
-"""The type of the table under a key of an entry."""
-
-
-class Around(Struct, frozen=True, kw_only=True):
-    """Settings for all containers of a file."""
-
-    system: str
-    """The system id."""
-    tls: str = ""
-    """The default folder of certificates for containers of this host. ``policy`` and ``audit`` are defaults, too."""
-    policy: str = ""
-    audit: str = ""
-    connect: Sequence[str] = ()
-    environment: Mapping[str, str] = {}
-    """Further variables of containers of this host, besides inherited ones."""
-    inherited: Mapping[str, str] = os.environ
-
-
-class ContainerSpec(NamedTuple):
-    """A container, with the command that starts it."""
-
-    name: str
-    entry: Entry
-    words: Sequence[str]
-    """The words after ``trade``."""
-    environment: Mapping[str, str]
-    """Variables besides those that are set anyway."""
-
-    @property
-    def files(self) -> list[str]:
-        """The files that its host must have."""
-        named = [self.environment[name] for name in ("TRADE_TLS", "TRADE_POLICY") if name in self.environment]
-        return [*([self.entry.file] if self.entry.file else []), *named]
 
 
 class Tables:
@@ -191,7 +80,8 @@ class Tables:
         entry = self._entries[name]
         self.check_kind(name, entry)
         environment = {} if entry.gateway else self._environment_of(entry)
-        part = ContainerSpec(name, entry, self._words(name, entry), environment)
+        health = self.program_path(entry.health.command[0]) if entry.health else ""
+        part = ContainerSpec(name, entry, self._words(name, entry), environment, self.beside(entry.folder), health)
         with self.about(name, entry):
             Settings.read(system=self.around.system, container=name, environment={})
         if entry.is_local:
@@ -199,36 +89,64 @@ class Tables:
         return part
 
     @contextmanager
-    def about(self, name: str, entry: Entry) -> Generator[None]:
+    def about(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
         """Reports errors inside as errors of a container's table."""
         try:
             yield
         except ConfigurationError as wrong:
-            self.refuse(name, entry.kind if entry.file else "", str(wrong))
+            self.refuse(name, key or (entry.kind if entry.file else ""), str(wrong))
 
     def check_kind(self, name: str, entry: Entry) -> None:
         """Raises ConfigurationError if keys exclude each other."""
-        kinds = [kind for kind in _KINDS if getattr(entry, kind) not in ("", None)]
+        kinds = [kind for kind in KINDS if getattr(entry, kind) not in ("", None)]
         if len(kinds) != 1:
             found = f"there is {' and '.join(kinds)}" if kinds else "there is none"
-            self.refuse(name, kinds[1] if kinds else "", f"takes one of {', '.join(_KINDS)}; {found}")
-        for key, kind in _ONLY_WITH.items():
-            if getattr(entry, key) and kind not in kinds:
-                self.refuse(name, key, f"goes with {kind}; leave it out")
+            self.refuse(name, kinds[1] if kinds else "", f"takes one of {', '.join(KINDS)}; {found}")
+        for key, goes_with in ONLY_WITH.items():
+            if getattr(entry, key) != getattr(_DEFAULTS, key) and kinds[0] not in goes_with:
+                self.refuse(name, key, f"goes with {' and '.join(goes_with)}; leave it out")
         if entry.is_local and entry.command != "trade":
             self.refuse(name, "command", "goes with another host; leave it out")
+        if entry.program is not None:
+            self._check_program(name, entry)
+
+    def _check_program(self, name: str, entry: Entry) -> None:
+        if not entry.is_local:
+            self.refuse(name, "host", "a program runs on the host of its supervisor; name it in the gateway file there")
+        if entry.announces and entry.health is not None:
+            self.refuse(name, "health", "goes without announces, which is a sign of life already; leave one out")
+        if entry.health is not None and entry.health.within_s > entry.health.every_s:
+            self.refuse(name, "health", "within_s is longer than every_s; checks would overlap")
+        if unset := [key for key in entry.env if not _VARIABLE.fullmatch(key)]:
+            self.refuse(name, "env", f"{unset[0]!r} is no name of a variable")
+
+    def _check_program_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+        folder, path = self.beside(entry.folder), {**self.around.inherited, **environment}.get("PATH")
+        if not folder.is_dir():
+            self.refuse(name, "folder" if entry.folder else "program", f"there is no folder {folder}")
+        for key, words in (("program", entry.program), ("health", entry.health and entry.health.command)):
+            if words and shutil.which(found := self.program_path(words[0]), path=path) is None:
+                problem = f"there is no program {found}" if "/" in found else f"there is no {found} in PATH"
+                self.refuse(name, key, f"{problem} that this user may run")
+        with self.about(name, entry, "announces"):
+            Settings.read(system=self.around.system, container=entry.announces or name, environment={})
+
+    def program_path(self, named: str) -> str:
+        """Returns a program as an absolute path, or its bare name if it is to be found in PATH."""
+        return str(self.beside(named)) if "/" in named else named
 
     def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
         """Raises ConfigurationError if something that it needs on this host is missing or wrong."""
-        if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
-            self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
-        if entry.http and importlib.util.find_spec("uvicorn") is None:
-            self.refuse(name, "http", "needs the extra http; pip install 'trade-gateway[http]'")
-        if entry.http and not (entry.http.tokens or entry.http.tls):
-            self.refuse(name, "http", "no client could log in; name tokens, or tls and its authority's certificates")
-        if entry.http and entry.http.tokens and not (tokens := self.beside(entry.http.tokens)).exists():
-            self.refuse(name, "http", f"there is no {tokens}; make it: trade http token NAME --tokens {tokens}")
+        self._check_installed(name, entry)
+        if entry.http:
+            self._check_http(name, entry.http)
+        if entry.program is not None:
+            self._check_program_here(name, entry, environment)
         with self.about(name, entry):
+            if entry.http and entry.http.twin:
+                load(self.beside(entry.http.twin))
+            if entry.ros:
+                importlib.import_module("trade_gateway.ros").read_ros_file(self.beside(entry.ros))
             if entry.robot:
                 check(without(load(self.beside(entry.robot)), entry.without)[0])
             if entry.rules:
@@ -242,9 +160,29 @@ class Tables:
                 environment={**self.around.inherited, **environment},
             )
 
+    def _check_installed(self, name: str, entry: Entry) -> None:
+        if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
+            self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
+        needed = [("http", "http", "uvicorn"), ("ros", "ros", "rosbags"), ("record", "record", "mcap")]
+        if entry.http and entry.http.mcp:
+            needed.append(("http", "mcp", "mcp"))
+        for kind, extra, module in needed:
+            if getattr(entry, kind) and importlib.util.find_spec(module) is None:
+                self.refuse(name, kind, f"needs the extra {extra}; pip install 'trade-gateway[{extra}]'")
+
+    def _check_http(self, name: str, http: HttpSpec) -> None:
+        if not (http.tokens or http.tls):
+            self.refuse(name, "http", "no client could log in; name tokens, or tls and its authority's certificates")
+        if http.tokens and not (tokens := self.beside(http.tokens)).exists():
+            self.refuse(name, "http", f"there is no {tokens}; make it: trade http token NAME --tokens {tokens}")
+        if (http.ask_first or http.twin) and not http.mcp:
+            self.refuse(name, "http", "ask_first and twin are for agents; add mcp = true")
+
     def _words(self, name: str, entry: Entry) -> list[str]:
+        if entry.program is not None:
+            return [self.program_path(entry.program[0]), *entry.program[1:]]
         dialled = [] if entry.gateway else [word for one in self._connect(entry) for word in ("--connect", one)]
-        file = str(self.beside(entry.file)) if entry.is_local else entry.file
+        file = self._path(entry, entry.file)
         allowed = [pattern for made in entry.providers or () for pattern in (made.class_,)] + entry.allow
         match entry.kind:
             case "robot":
@@ -256,6 +194,10 @@ class Tables:
                 does = ["rules", "run", file, "--name", name]
             case "http":
                 does = ["http", "--name", name, *self._http_words(entry)]
+            case "ros":
+                does = ["ros", file, "--name", name]
+            case "record":
+                does = ["record", "--name", name, *self._record_words(entry)]
             case _:
                 patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
                 does = ["container", "--name", name, *patterns]
@@ -264,9 +206,23 @@ class Tables:
     def _http_words(self, entry: Entry) -> list[str]:
         said = entry.http or HttpSpec()
         options = {"--listen": [said.listen], "--origin": said.origins, "--host": said.hosts}
-        for option, named in (("--tokens", said.tokens), ("--tls", said.tls)):
-            options[option] = [str(self.beside(named)) if entry.is_local else named] if named else []
-        return [word for option, values in options.items() for value in values for word in (option, value)]
+        options["--ask-first"] = said.ask_first
+        for option, named in (("--tokens", said.tokens), ("--tls", said.tls), ("--twin", said.twin)):
+            options[option] = [self._path(entry, named)] if named else []
+        return [*_options(options), "--mcp"] if said.mcp else _options(options)
+
+    def _record_words(self, entry: Entry) -> list[str]:
+        said = entry.record or RecordSpec(folder=".")
+        rates = {"--hz": said.hz, "--camera-hz": said.camera_hz, "--service-hz": said.service_hz}
+        options: dict[str, Sequence[str]] = {"--group": said.groups, "--services": said.services}
+        options |= {option: [f"{hz:g}"] for option, hz in rates.items() if hz is not None}
+        folder = self._path(entry, said.folder)
+        if said.keep_last_s is None:
+            return [f"{folder}/", *_options(options)]
+        return [*_options(options), "--keep-last", f"{said.keep_last_s:g}", "--at-fault", folder]
+
+    def _path(self, entry: Entry, named: str) -> str:
+        return str(self.beside(named)) if entry.is_local else named
 
     def _connect(self, entry: Entry) -> Sequence[str]:
         return self.around.connect if entry.connect is None else entry.connect
@@ -279,11 +235,17 @@ class Tables:
         if entry.metrics:
             named["TRADE_METRICS"] = entry.metrics
         if audit := entry.audit or around.audit:
-            named["TRADE_AUDIT"] = str(self.beside(audit)) if entry.is_local else audit
+            named["TRADE_AUDIT"] = self._path(entry, audit)
         if entry.providers is not None and entry.is_local:
             known = os.environ.get("PYTHONPATH")
-            named["PYTHONPATH"] = os.pathsep.join([str(self.path.parent.absolute()), *([known] if known else [])])
-        return {**around.environment, **named}
+            named["PYTHONPATH"] = os.pathsep.join([str(self.beside(entry.folder)), *([known] if known else [])])
+        if entry.program is not None:
+            named["TRADE_SYSTEM"] = self.around.system
+            if dialled := self._connect(entry):
+                named["TRADE_CONNECT"] = ",".join(dialled)
+            if entry.announces:
+                named["TRADE_CONTAINER"] = entry.announces
+        return {**around.environment, **named, **entry.env}
 
     def environment(self, tls: str, policy: str, host: str = LOCAL) -> dict[str, str]:
         """Returns the variables for a certificate and a policy, with paths on that host."""
@@ -298,6 +260,10 @@ class Tables:
     def refuse(self, name: str, key: str, problem: str) -> NoReturn:
         """Raises ConfigurationError about a container."""
         raise ConfigurationError(where=at(self.path, self._text, ("container", name), key), problem=problem) from None
+
+
+def _options(values: Mapping[str, Sequence[str]]) -> list[str]:
+    return [word for option, named in values.items() for value in named for word in (option, value)]
 
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
@@ -322,7 +288,7 @@ def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tupl
     place = _AT.search(said)
     inside = place.group(1) if place else ""
     key = re.split(r"[.\[]", inside, maxsplit=1)[0]
-    fields = _INSIDE.get(key, kind).__struct_encode_fields__
+    fields = INSIDE.get(key, kind).__struct_encode_fields__
     problem = said[: place.start()] if place else said
     if unknown := _UNKNOWN.search(said):
         key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"

@@ -26,7 +26,7 @@ from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
 from trade_gateway.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
 from trade_gateway.conformance._peer import Peer, end_group
-from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice
+from trade_gateway.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice
 
 IDENTITY: Final = "peer"
 NAME: Final = "peer"
@@ -70,9 +70,12 @@ class Stage:
                     namespace=self._system, listen=[self._endpoint], connect=[], credentials=self._credentials
                 )
             )
-            ending.callback(self._transport.close)
             signs = self._transport.presences(ALIVE)
-            threading.Thread(target=self._watch, args=(signs,), name="suite-presence", daemon=True).start()
+            watching = threading.Thread(target=self._watch, args=(signs,), name="suite-presence", daemon=True)
+            ending.callback(watching.join, PARTING_S)
+            ending.callback(self._transport.close)
+            ending.callback(signs.close)
+            watching.start()
             settings = Settings.read(
                 system=self._system,
                 identity="judge",
@@ -208,11 +211,13 @@ class Stage:
                 while True:
                     heard.append(channel.receive())
 
-        threading.Thread(target=read, name="suite-listening", daemon=True).start()
+        reading = threading.Thread(target=read, name="suite-listening", daemon=True)
+        reading.start()
         try:
             yield heard
         finally:
             channel.close()
+            reading.join(PARTING_S)
 
     # --- clients
 

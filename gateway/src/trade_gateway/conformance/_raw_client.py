@@ -33,6 +33,9 @@ DEADLINE_S: Final = 8.0
 NEVER: Final = object()
 """The expiry of a call that never expires."""
 
+PARTING_S: Final = 2.0
+"""How long a reader may take to end. The end of the interpreter would abort one that is inside the transport."""
+
 
 class Voice:
     """A client with its own identity, whose session has a sign of life until it is closed."""
@@ -54,7 +57,8 @@ class Voice:
         self._publishers: dict[str, Publisher] = {}
         self._offset_ns: int | None = None
         self._sign = transport.appear(alive_key(self.session))
-        threading.Thread(target=self._read, name="suite-replies", daemon=True).start()
+        self._reader = threading.Thread(target=self._read, name="suite-replies", daemon=True)
+        self._reader.start()
 
     # --- requests
 
@@ -152,6 +156,7 @@ class Voice:
         """Ends its session. Idempotent."""
         self._sign.close()
         self._answers.close()
+        self._reader.join(PARTING_S)
         for publisher in self._publishers.values():
             publisher.close()
 

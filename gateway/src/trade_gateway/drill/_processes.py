@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from trade._remote.error_output import last_line
 from trade.errors import TradeError
 
 __all__ = ["Actor", "DrillFailed"]
@@ -128,8 +129,7 @@ class Actor:
                 pipe.close()
 
     def _last_words(self) -> str:
-        lines = self._complaints.read_text(encoding="utf-8", errors="replace").splitlines()
-        return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+        return last_line(self._complaints.read_text(encoding="utf-8", errors="replace")) or "it said nothing"
 
 
 def bare_environment() -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import os
 import secrets
 from pathlib import Path
 from typing import Any, Final, cast
@@ -12,6 +11,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 from tomlkit.exceptions import TOMLKitError
 
+from trade._atomic_file import replace
 from trade._protocol.keys import is_chunk
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
@@ -37,11 +37,8 @@ def add_token(path: Path, identity: str) -> str:
     known = _read(path) if path.exists() else {}
     token = secrets.token_urlsafe(_BYTES)
     text = tomlkit.dumps({_TABLE: {**known, _hash(token): identity}})
-    beside = path.with_name(f".{path.name}.new")
     try:
-        with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            file.write(_HEAD + text)
-        beside.replace(path)
+        replace(path, (_HEAD + text).encode())
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be written ({bad.strerror})") from None
     return token

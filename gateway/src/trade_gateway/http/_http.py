@@ -13,6 +13,7 @@ from starlette.routing import Route
 
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
 from trade_gateway.clients import Client, ClientApi, NoSuchSession
+from trade_gateway.clients import _changes as changes
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._errors import BadMessage, HttpError, NeedsSession, NotAuthenticated
 from trade_gateway.http._authentication import Authenticator
@@ -36,19 +37,36 @@ class Http:
         self._api = api
         self._authenticator = authenticator
         self._leases = leases
+        self._changes = api.administration
+        self._files = api.configuration
 
     def routes(self) -> list[Route]:
         """Returns all routes, for an application."""
         return [
             self._route("/openapi.json", GET=self.openapi),
-            self._route("/services", "group", "name", GET=self.services),
+            self._route("/services", "group", "name", "needs", "achieves", GET=self.services),
             self._route("/me", GET=self.me),
             self._route("/containers", GET=self.containers),
             self._route("/sight", GET=self.reachability),
             self._route("/loads", GET=self.loads),
+            self._route("/system", GET=self.system),
+            self._route("/containers/{container}/restart", POST=self.restart),
+            self._route("/containers/{container}/end", POST=self.end),
+            self._route("/containers/{container}/discovery", POST=self.discovery),
+            self._route("/containers/{container}/broadcast", POST=self.broadcast),
+            self._route("/migrate", POST=self.migrate),
+            self._route("/instantiate", POST=self.instantiate),
+            self._route("/terminate", POST=self.terminate),
             self._route("/notifications", GET=self.notifications),
+            self._route("/notifications/{id}", DELETE=self.cancel_notification),
             self._route("/hooks", GET=self.hooks),
+            self._route("/hooks/{id}", DELETE=self.detach_hook),
             self._route("/policy", GET=self.policy),
+            self._route("/policy/file", GET=self.policy_file, PUT=self.save_policy),
+            self._route("/policy/test", POST=self.try_policy),
+            self._route("/rules", GET=self.rule_files),
+            self._route("/rules/{container}", PUT=self.save_rules),
+            self._route("/rules/{container}/test", POST=self.try_rules),
             self._route("/audit", GET=self.audit),
             self._route("/tracing", POST=self.tracing),
             self._route("/call/{group}/{name}", POST=self.call),
@@ -73,8 +91,7 @@ class Http:
                 return await by_method[method](request)
             except TradeError as error:
                 self._api.note_refused(error)
-                headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotAuthenticated) else None
-                return problem_response(error, headers)
+                return refusal(error)
 
         return Route(path, answer, methods=list(by_method))
 
@@ -84,9 +101,8 @@ class Http:
         return _answer(document(self._api.seen(self._who(request))))
 
     async def services(self, request: Request) -> Response:
-        asked = request.query_params
         who = self._who(request)
-        found = self._api.seen(who, asked.get("group"), asked.get("name"))
+        found = self._api.seen(who, **request.query_params)
         return _answer([self._api.view(who, handle) for handle in found])
 
     async def me(self, request: Request) -> Response:
@@ -108,7 +124,7 @@ class Http:
         return _answer(await self._api.overview.audit(self._who(request)))
 
     async def tracing(self, request: Request) -> Response:
-        who, body = self._who(request), await _body(request, messages.TracingBody)
+        who, body = self._who(request), await _body(request, messages.SwitchBody)
         return _answer({"containers": await self._api.overview.set_tracing(who, on=body.on)})
 
     async def containers(self, request: Request) -> Response:
@@ -116,6 +132,65 @@ class Http:
 
     async def reachability(self, request: Request) -> Response:
         return _answer(await self._api.overview.reachability(self._who(request)))
+
+    # --- changes of the system
+
+    async def system(self, request: Request) -> Response:
+        return _answer(await self._changes.system(self._who(request)))
+
+    async def restart(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, changes.ReasonBody)
+        return _answer(await self._changes.restart(who, request.path_params["container"], body))
+
+    async def end(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, changes.ReasonBody)
+        return _answer(await self._changes.end(who, request.path_params["container"], body))
+
+    async def discovery(self, request: Request) -> Response:
+        return await self._switch(request, "discovery")
+
+    async def broadcast(self, request: Request) -> Response:
+        return await self._switch(request, "broadcast")
+
+    async def _switch(self, request: Request, what: str) -> Response:
+        who, body = self._who(request), await _body(request, messages.SwitchBody)
+        return _answer(await self._changes.switch(who, request.path_params["container"], what, on=body.on))
+
+    async def migrate(self, request: Request) -> Response:
+        return _answer(await self._changes.migrate(self._who(request), await _body(request, changes.MigrateBody)))
+
+    async def instantiate(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, changes.InstantiateBody)
+        return _answer(await self._changes.instantiate(who, body))
+
+    async def terminate(self, request: Request) -> Response:
+        return _answer(await self._changes.terminate(self._who(request), await _body(request, changes.ProviderBody)))
+
+    async def cancel_notification(self, request: Request) -> Response:
+        return _answer(await self._changes.cancel_notification(self._who(request), request.path_params["id"]))
+
+    async def detach_hook(self, request: Request) -> Response:
+        return _answer(await self._changes.detach_hook(self._who(request), request.path_params["id"]))
+
+    async def policy_file(self, request: Request) -> Response:
+        return _answer(await self._files.policy_file(self._who(request)))
+
+    async def try_policy(self, request: Request) -> Response:
+        return _answer(await self._files.try_policy(self._who(request), await _body(request, changes.TextBody)))
+
+    async def save_policy(self, request: Request) -> Response:
+        return _answer(await self._files.save_policy(self._who(request), await _body(request, changes.FileBody)))
+
+    async def rule_files(self, request: Request) -> Response:
+        return _answer(await self._files.rule_files(self._who(request)))
+
+    async def try_rules(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, changes.TextBody)
+        return _answer(await self._files.try_rules(who, request.path_params["container"], body))
+
+    async def save_rules(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, changes.FileBody)
+        return _answer(await self._files.save_rules(who, request.path_params["container"], body))
 
     # --- calls
 
@@ -246,16 +321,26 @@ async def _gone(request: Request) -> None:
         pass
 
 
+def refusal(error: TradeError) -> Response:
+    """Returns the error of a request that was not executed."""
+    headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotAuthenticated) else None
+    return problem_response(error, headers)
+
+
 async def _body(request: Request, kind: type[Body]) -> Body:
     """Decodes the client's body as the given record; an empty body is an empty record."""
+    return messages.read(await received(request) or b"{}", msgspec.json.Decoder(kind))
+
+
+async def received(request: Request) -> bytes:
+    """Returns the client's body. Raises HttpError, TooLarge: it is no JSON, too slow or too large."""
     media_type = request.headers.get("content-type", "application/json").partition(";")[0].strip().lower()
     if media_type != "application/json":
         raise HttpError(status=415, problem=f"send application/json, not {media_type}")
     try:
-        data = await asyncio.wait_for(_read(request), _BODY_S)
+        return await asyncio.wait_for(_read(request), _BODY_S)
     except asyncio.TimeoutError:
         raise HttpError(status=408, problem=f"the body did not arrive within {_BODY_S:g} s") from None
-    return messages.read(data or b"{}", msgspec.json.Decoder(kind))
 
 
 async def _read(request: Request) -> bytes:

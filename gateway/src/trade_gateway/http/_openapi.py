@@ -7,6 +7,7 @@ from typing import Any, Final, cast
 import msgspec
 
 from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Reachability
+from trade_gateway.clients import _changes as changes
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._problems import Problem
 from trade_gateway.http._origin_check import MEDIA_TYPE
@@ -22,6 +23,17 @@ _BODIES: Final = (
     messages.EstopBody,
     messages.ClearBody,
     messages.SessionBody,
+    messages.SwitchBody,
+    changes.ReasonBody,
+    changes.MigrateBody,
+    changes.ProviderBody,
+    changes.InstantiateBody,
+    changes.TextBody,
+    changes.FileBody,
+    changes.FileView,
+    changes.Trial,
+    changes.ContainerState,
+    changes.Done,
     messages.Me,
     messages.ServiceView,
     messages.ContainerView,
@@ -97,6 +109,8 @@ def _call(handle: Handle, call: Schema, schemas: Schema) -> Schema:
         "requestBody": _json(body, required=needs_some),
         "responses": _responses(result),
         "x-trade-effect": handle.effect,
+        "x-trade-needs": handle.needs,
+        "x-trade-achieves": handle.achieves,
     }
 
 
@@ -141,10 +155,14 @@ def _led(part: Any, name: str) -> Any:
 def _fixed() -> Schema:
     query = [
         {"name": name, "in": "query", "schema": {"type": "string"}, "description": text}
-        for name, text in (("group", "This group and beneath it."), ("name", "`*` and `?` are wildcards."))
+        for name, text in (
+            ("group", "This group and beneath it."),
+            ("name", "`*` and `?` are wildcards."),
+            ("needs", "A predicate that one of its pre-conditions fits: `see(?x)`."),
+            ("achieves", "A predicate that one of its post-conditions fits."),
+        )
     ]
     held = {**_SESSION, "required": True}
-    lock = {"name": "lock", "in": "path", "required": True, "schema": {"type": "string"}}
     names = {"type": "array", "items": {"type": "string"}}
     asked = {"type": "object", "properties": {"asked": names}, "required": ["asked"]}
     resumed = {"type": "object", "properties": {"resumed": names}, "required": ["resumed"]}
@@ -160,6 +178,7 @@ def _fixed() -> Schema:
         },
         "/notifications": {"get": _operation("notifications", "Active notifications.", _list("NotificationInfo"))},
         "/hooks": {"get": _operation("hooks", "Attached hooks.", _list("HookInfo"))},
+        **_changes(),
         "/session": {
             "post": _operation(
                 "open_session", "Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"
@@ -192,7 +211,9 @@ def _fixed() -> Schema:
             "post": _operation("break_locks", "Break locks.", _list("LockView"), body="RequestBody", needed=True)
         },
         "/locks/{lock}": {
-            "delete": _operation("release_lock", "Release a lock.", None, parameters=[lock, held], status="204")
+            "delete": _operation(
+                "release_lock", "Release a lock.", None, parameters=[*_in_path("/locks/{lock}"), held], status="204"
+            )
         },
         "/resume": {
             "post": _operation(
@@ -210,6 +231,63 @@ def _fixed() -> Schema:
         },
         "/estop/clear": {"post": _operation("clear_estops", "Clear e-stops.", _ref("Stopped"), body="ClearBody")},
     }
+
+
+def _changes() -> Schema:
+    """The operations that change the system."""
+    posts = {
+        "/containers/{container}/restart": (
+            "restart",
+            "Start a supervised container, or start it again.",
+            "ReasonBody",
+        ),
+        "/containers/{container}/end": ("end", "End a container.", "ReasonBody"),
+        "/containers/{container}/discovery": ("discovery", "Switch discovery of a container.", "SwitchBody"),
+        "/containers/{container}/broadcast": ("broadcast", "Switch broadcasting of a container.", "SwitchBody"),
+        "/migrate": ("migrate", "Move a provider with its state.", "MigrateBody"),
+        "/instantiate": ("instantiate", "Create a provider.", "InstantiateBody"),
+        "/terminate": ("terminate", "End a created provider.", "ProviderBody"),
+    }
+    deletes = {
+        "/notifications/{id}": ("cancel_notification", "End a notification."),
+        "/hooks/{id}": ("detach_hook", "Detach a hook."),
+    }
+    found: Schema = {"/system": {"get": _operation("system", "Containers, and their state.", _list("ContainerState"))}}
+    for path, (name, summary, body) in posts.items():
+        needed = body != "ReasonBody"
+        operation = _operation(name, summary, _ref("Done"), body=body, needed=needed, parameters=_in_path(path))
+        found[path] = {"post": operation}
+    for path, (name, summary) in deletes.items():
+        found[path] = {"delete": _operation(name, summary, _ref("Done"), parameters=_in_path(path))}
+    return {**found, **_files()}
+
+
+def _files() -> Schema:
+    """The operations on the policy and the rules."""
+
+    def put(path: str, name: str, summary: str) -> Schema:
+        return _operation(name, summary, _ref("Done"), body="FileBody", needed=True, parameters=_in_path(path))
+
+    def attempt(path: str, name: str, summary: str) -> Schema:
+        return _operation(name, summary, _ref("Trial"), body="TextBody", needed=True, parameters=_in_path(path))
+
+    return {
+        "/policy/file": {
+            "get": _operation("policy_file", "The policy file.", _ref("FileView")),
+            "put": put("/policy/file", "save_policy", "Replace the policy file."),
+        },
+        "/policy/test": {"post": attempt("/policy/test", "try_policy", "What a changed policy would do.")},
+        "/rules": {"get": _operation("rule_files", "Rules files.", _list("FileView"))},
+        "/rules/{container}": {"put": put("/rules/{container}", "save_rules", "Replace a rules file.")},
+        "/rules/{container}/test": {
+            "post": attempt("/rules/{container}/test", "try_rules", "What changed rules would do now.")
+        },
+    }
+
+
+def _in_path(path: str) -> list[Schema]:
+    names = [word[1:-1] for word in path.split("/") if word.startswith("{")]
+    return [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}} for name in names]
 
 
 def _operation(

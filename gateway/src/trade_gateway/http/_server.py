@@ -5,17 +5,17 @@ import logging
 import ssl
 import threading
 from collections.abc import AsyncGenerator, Collection, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from socket import AF_INET, AF_INET6, SO_REUSEADDR, SOL_SOCKET, socket
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
-from starlette.routing import WebSocketRoute
+from starlette.routing import Route, WebSocketRoute
 
 from trade import Container
 from trade.errors import ConfigurationError
@@ -30,7 +30,12 @@ from trade_gateway.http._session_timeouts import Leases
 from trade_gateway.http._websocket import Socket
 from trade_gateway.process._addresses import in_url, is_loopback
 
+if TYPE_CHECKING:
+    from trade_gateway.http._agents import Agents
+
 _logger = logging.getLogger("trade")
+
+AGENT_SESSION: Final = "Mcp-Session-Id"
 
 MOST_CONNECTIONS: Final = 256
 _MOST_DESCRIPTORS: Final = 2 * MOST_CONNECTIONS
@@ -56,6 +61,9 @@ class HttpGateway:
         tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it.
         origins: other sites whose pages are allowed, such as ``http://localhost:5173``.
         hosts: further names of this host.
+        mcp: whether agents are served at ``/mcp``; needs the extra ``mcp``.
+        ask_first: groups in which every call of an agent with an effect needs approval, whatever the policy says.
+        twin: the robot file to simulate for dry runs of agents.
 
     Raises:
         ConfigurationError: the address is in use or exposes it to a network by accident, or no client could connect.
@@ -70,6 +78,9 @@ class HttpGateway:
         tls: Path | None = None,
         origins: Sequence[str] = (),
         hosts: Sequence[str] = (),
+        mcp: bool = False,
+        ask_first: Sequence[str] = (),
+        twin: Path | None = None,
     ) -> None:
         host, port = _address(listen)
         api = ClientApi(container)
@@ -79,7 +90,13 @@ class HttpGateway:
             raise ConfigurationError(where=f"HTTP gateway {listen}", problem=problem)
         self._api = api
         names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
-        self._app = _application(api, tokens, names, origins)
+        authenticator, leases = Authenticator(tokens, api.judge), Leases(api)
+        agents = None
+        if mcp:
+            from trade_gateway.http._agents import Agents  # noqa: PLC0415 - the extra mcp may be missing
+
+            agents = Agents(container, api, authenticator, leases, ask_first, twin)
+        self._app = _application(api, authenticator, leases, agents, names, origins)
         context = None if tls is None else _context(tls)
         self._socket = BoundedListener(_bound(host, port), _MOST_DESCRIPTORS)
         self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
@@ -138,29 +155,39 @@ class HttpGateway:
         self.close()
 
 
-def _application(api: ClientApi, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
-    authenticator, leases = Authenticator(tokens, api.judge), Leases(api)
-
+def _application(
+    api: ClientApi,
+    authenticator: Authenticator,
+    leases: Leases,
+    agents: "Agents | None",
+    hosts: Collection[str],
+    origins: Sequence[str],
+) -> Starlette:
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
         watching = asyncio.ensure_future(leases.keep_watch())
         try:
-            yield
+            async with nullcontext() if agents is None else agents.running():
+                yield
         finally:
             watching.cancel()
             await api.apart(api.clients.close, stops=True)
 
     middleware = [Middleware(Gate, hosts=hosts, origins=origins)]
     if origins:
-        allowed = ["Authorization", "Content-Type", SESSION]
-        methods = ["GET", "POST", "DELETE"]
-        middleware.append(
-            Middleware(CORSMiddleware, allow_origins=list(origins), allow_methods=methods, allow_headers=allowed)
+        cors = Middleware(
+            CORSMiddleware,
+            allow_origins=list(origins),
+            allow_methods=["GET", "POST", "DELETE"],
+            allow_headers=["Authorization", "Content-Type", SESSION, AGENT_SESSION, "Mcp-Protocol-Version"],
+            expose_headers=[AGENT_SESSION],
         )
+        middleware.append(cors)
     application = Starlette(
         routes=[
             *Http(api, authenticator, leases).routes(),
             WebSocketRoute("/ws", Socket(api, authenticator, leases).serve),
+            *([] if agents is None else [Route("/mcp", agents)]),
             *pages(),
         ],
         middleware=middleware,

@@ -269,6 +269,7 @@ class Conversation:
                 self._stops.pop(which, None)
 
     async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
+        self._api.judge.require_unmarked(self._client.identity, handle)
         async with nullcontext() if handle.effect == "stop" else self._beginning:
             run = await self._api.begin(self._client, handle, asked, ongoing.admitted)
         ongoing.run = run

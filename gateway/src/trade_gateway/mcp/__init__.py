@@ -2,10 +2,10 @@
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.mcp._approvals import Approvals, Request
-from trade_gateway.mcp._server import serve
+from trade_gateway.mcp._server import converse, serve
 from trade_gateway.mcp._simulation_twin import Twin
 from trade_gateway.mcp._tools import Tools
 
-__all__ = ["Approvals", "Tools", "Twin", "serve"]
+__all__ = ["Approvals", "Tools", "Twin", "converse", "serve"]
 
 _publish(__name__, Request)

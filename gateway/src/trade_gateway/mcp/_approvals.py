@@ -12,9 +12,10 @@ import msgspec
 from anyio.to_thread import run_sync
 from msgspec import Struct
 
-from trade import Container, Handle, current_call, service, where
+from trade import Container, Handle, current_call, service
+from trade._context.sessions import client_name, client_of
 from trade.errors import AccessDenied, ConfigurationError
-from trade_gateway.clients import places
+from trade_gateway.clients import ClientAuthorizer
 from trade_gateway.clients._errors import NeedsApproval
 from trade_gateway.clients._schemas import APPROVALS
 
@@ -49,17 +50,18 @@ class _Waiting(Struct):
 
 
 class Approvals:
-    """Requests of one agent's process, as services of group ``approvals``.
+    """Requests of the agents for which a container acts, as services of group ``approvals``.
 
     Clients that may call these services and administer the target may approve, except for the agent itself.
 
     Args:
-        container: the agent's container.
+        container: the agent's container, or that of an HTTP gateway with agents.
         ask_first: groups in which every call with an effect needs approval, whatever the policy says.
     """
 
     def __init__(self, container: Container, ask_first: Sequence[str] = ()) -> None:
         self._container = container
+        self._judge = ClientAuthorizer(container)
         self._ask_first = tuple(ask_first)
         self._guard = threading.Lock()
         self._waiting: dict[str, _Waiting] = {}
@@ -106,41 +108,25 @@ class Approvals:
 
     def _require(self, waiting: _Waiting) -> None:
         call, agent = current_call(), waiting.request.agent
-        if call is None or call.session.startswith(f"{self._container.address}"):
+        client = "" if call is None else client_of(call.session)
+        if call is None or (not client and call.session.startswith(f"{self._container.address}")):
             rule = "the agent's own process cannot approve what it asks for"
             raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
-        if call.caller == agent:
+        if call.caller == agent or client == client_name(agent):
             rule = (
                 "an identity cannot approve its own call, with or without a policy; approve it under another identity"
             )
             raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
-        self._container.access.require(call.caller, "administer", waiting.group, waiting.request.service)
+        for who in filter(None, (call.caller, client)):  # a program that acts for a client has both their limits
+            self._container.access.require(who, "administer", waiting.group, waiting.request.service)
 
     # --- requests
 
-    def needed(self, handle: Handle) -> bool:
-        """Whether a call of the agent needs approval.
+    def needed(self, agent: str, handle: Handle) -> bool:
+        """Whether a call of an agent needs approval."""
+        return self._judge.needs_approval(agent, handle, self._ask_first)
 
-        Calls that move a marked group need it whichever service moves it: the head also as two joints of the neck.
-        """
-        if handle.effect in ("read", "stop"):
-            return False
-        if self._is_marked(handle):
-            return True
-        own = places([handle])
-        others = (one for one in self._container.services(where()) if one.effect == "actuate")
-        return any(not own.isdisjoint(places([one])) and self._is_marked(one) for one in others)
-
-    def _is_marked(self, handle: Handle) -> bool:
-        return any(self._marks(group) for group in dict.fromkeys((handle.key.domain, *handle.groups)))
-
-    def _marks(self, domain: str) -> bool:
-        if any(domain == group or domain.startswith(f"{group}.") for group in self._ask_first):
-            return True
-        policy = self._container.access.policy
-        return policy is not None and policy.asks_first(self._container.address.identity, domain)
-
-    async def ask(self, handle: Handle, args: Any, why: str, wait_s: float) -> None:
+    async def ask(self, agent: str, handle: Handle, args: Any, why: str, wait_s: float) -> None:
         """Waits for approval. Raises NeedsApproval: there was none within ``wait_s``."""
         text = msgspec.json.encode(args).decode()
         if len(text) > _MOST_TEXT:
@@ -154,7 +140,6 @@ class Approvals:
             if not said.done():
                 said.set_result(verdict)
 
-        agent = self._container.address.identity
         request = Request(name, agent, handle.label, text, why[:_MOST_TEXT], now, now + wait_s)
         waiting = _Waiting(request, handle.key.domain, lambda verdict: _soon(loop, partial(settle, verdict)))
         with self._guard:

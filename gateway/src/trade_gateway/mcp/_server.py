@@ -17,10 +17,11 @@ from mcp.server.stdio import stdio_server
 from mcp.shared.message import SessionMessage
 
 from trade import Container
-from trade_gateway.clients import ClientApi
+from trade_gateway.clients import Client, ClientApi
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.language import Lexicon
 from trade_gateway.mcp._approvals import Approvals
+from trade_gateway.mcp._pictures import Pictures
 from trade_gateway.mcp._simulation_twin import Twin
 from trade_gateway.mcp._tools import TOOLS, Tools
 
@@ -48,24 +49,16 @@ async def serve(
         twin: for dry runs.
         leave: ends everything else of the process; called when a signal ends it.
     """
-    async with stdio_server() as (hears, says):
-        await converse(container, approvals, lexicon, twin, hears, says, leave)
-
-
-async def converse(
-    container: Container,
-    approvals: Approvals,
-    lexicon: Lexicon,
-    twin: Twin | None,
-    hears: Hears,
-    says: Says,
-    leave: Callable[[], None],
-) -> None:
-    """As `serve`, over any two streams: the agent's motion stops at the end of its stream."""
     api = ClientApi(container)
     client = await api.apart(api.clients.open, container.address.identity)
     tools = Tools(container, api, client, approvals, lexicon, twin)
-    server = _server_of(tools)
+    async with stdio_server() as (hears, says), _signals(client.close, leave):
+        await converse(api, client, tools, hears, says)
+
+
+async def converse(api: ClientApi, client: Client, tools: Tools, hears: Hears, says: Says) -> None:
+    """Serves an agent over two streams. Its motion stops, and its session ends, at the end of what it hears."""
+    server = _server_of(tools, Pictures(api, client, tools.record))
     passed_on, heard = anyio.create_memory_object_stream[SessionMessage | Exception](0)
 
     async def hear() -> None:
@@ -78,13 +71,13 @@ async def converse(
             with anyio.CancelScope(shield=True):
                 await api.apart(client.close, stops=True)
 
-    async with _signals(client.close, leave), anyio.create_task_group() as tasks:
+    async with anyio.create_task_group() as tasks:
         tasks.start_soon(hear)
         await server.run(heard, says, server.create_initialization_options())
         tasks.cancel_scope.cancel()
 
 
-def _server_of(tools: Tools) -> "Server[Any, Any]":
+def _server_of(tools: Tools, pictures: Pictures) -> "Server[Any, Any]":
     server: Server[Any, Any] = Server("trade", version=version("trade-gateway"), instructions=_INSTRUCTIONS)
 
     async def listed() -> list[types.Tool]:
@@ -107,6 +100,8 @@ def _server_of(tools: Tools) -> "Server[Any, Any]":
 
     server.list_tools()(listed)
     server.call_tool(validate_input=False)(used)
+    server.list_resources()(pictures.listed)
+    server.read_resource()(pictures.read)
     return server
 
 

@@ -26,6 +26,8 @@ _UP_S: Final = 60.0
 _SEEN_S: Final = 10.0
 _PLACED_WITHIN_S: Final = 60.0
 _PLACES: Final = "TRADE_RUNTIME_DIR"
+_NEAR_RAD: Final = 0.005
+"""A joint this near is not moved again."""
 
 
 class Tried(Struct, frozen=True):
@@ -38,7 +40,9 @@ class Tried(Struct, frozen=True):
     took_s: float
     """Duration in simulation, in seconds."""
     began_where_the_robot_is: bool
-    """Whether the twin was first brought to the robot's position."""
+    """Whether the whole twin was first brought to the robot's position."""
+    elsewhere: tuple[str, ...]
+    """The groups that are not where the robot is, or of which the robot's position is unknown."""
     before: Any
     """Its ``state`` before the call, and"""
     after: Any
@@ -60,14 +64,14 @@ class Twin:
         self._process: Actor | None = None
         self._container: Container | None = None
 
-    def call(self, handle: Handle, args: Any, deadline_s: float, state: Any) -> Tried:
-        """Brings the twin to the robot's position and makes the call there; one at a time.
+    def call(self, handle: Handle, args: Any, deadline_s: float, states: Mapping[str, Any]) -> Tried:
+        """Brings the whole twin to the robot's position and makes the call there; one at a time.
 
         Args:
             handle: the service of the real robot.
             args: positional or named.
             deadline_s: the call's deadline in seconds.
-            state: the ``state`` of the same group of the real robot; None if it has none.
+            states: the ``state`` of each group of the real robot; None if it could not be read.
 
         Raises:
             NoTwin: the twin does not start, or has no such service.
@@ -78,7 +82,8 @@ class Twin:
             tried = self._find(here, group, name, _SEEN_S)
             if tried is None:
                 raise NoTwin(reason=f"the twin of {self._robot.name} has no {handle.label}")
-            placed = self._place(here, group, state)
+            ordered = sorted(states.items(), key=lambda one: not isinstance(one[1], list))  # groups before their joints
+            elsewhere = tuple(one for one, state in ordered if not self._place(here, one, state))
             before, began = self._state(here, group), time.monotonic()
             result, error = None, ""
             try:
@@ -86,7 +91,8 @@ class Twin:
             except Exception as failed:  # noqa: BLE001 - any exception of a provider is the result of the dry run
                 error = f"{type(failed).__name__}: {failed}"
             took_s = time.monotonic() - began
-            return Tried(not error, error, result, round(took_s, 3), placed, before, self._state(here, group))
+            placed, after = bool(states) and not elsewhere, self._state(here, group)
+            return Tried(not error, error, result, round(took_s, 3), placed, elsewhere, before, after)
 
     def _up(self) -> Container:
         if self._container is not None and self._process is not None and self._process.running:
@@ -107,24 +113,27 @@ class Twin:
         return self._container
 
     def _place(self, here: Container, group: str, state: Any) -> bool:
-        """Brings a group to the real one's position; returns whether it arrived."""
-        plain = msgspec.to_builtins(state)
+        """Brings a group to the real one's position; returns whether it arrived. A sensor has no position."""
+        plain, there = msgspec.to_builtins(state), self._state(here, group)
         try:
             match plain:
-                case list() if plain:
-                    angles = [one["position_rad"] for one in cast("list[dict[str, Any]]", plain)]
-                    self._do(here, group, "move_to", angles)
+                case None:
+                    return False
+                case [{"position_rad": _}, *_]:
+                    if not _is_at(plain, there):
+                        self._do(here, group, "move_to", [one["position_rad"] for one in plain])
                 case {"positions_rad": list()}:
                     self._do(here, group, "power_on")
                     self._do(here, group, "release_brakes")
                     self._do(here, group, "move_joints", plain["positions_rad"])
                 case {"position_rad": float() | int() as angle}:
-                    self._do(here, group, "move_to", angle)
+                    if not _is_at([plain], [there]):
+                        self._do(here, group, "move_to", angle)
                 case {"width_m": float() | int() as width}:
                     self._do(here, group, "activate")
                     self._do(here, group, "move_to", width)
                 case _:
-                    return False
+                    return True
         except (TradeError, KeyError):
             return False
         return True
@@ -164,6 +173,15 @@ class Twin:
             container.close()
         if process is not None:
             process.close(gently=True)
+
+
+def _is_at(wanted: Sequence[Mapping[str, Any]], actual: Any) -> bool:
+    """Whether joints are at these positions."""
+    try:
+        pairs = zip(wanted, actual, strict=True)
+        return all(abs(one["position_rad"] - other["position_rad"]) < _NEAR_RAD for one, other in pairs)
+    except (TypeError, KeyError, ValueError):
+        return False
 
 
 def _called(handle: Handle, args: Any, deadline_s: float) -> Any:

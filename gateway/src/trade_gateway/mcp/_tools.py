@@ -34,6 +34,10 @@ class Find(Struct, forbid_unknown_fields=True, kw_only=True):
     """This group and those beneath it: ``rosie.head``. Empty: all."""
     name: str = ""
     """``*`` and ``?`` are wildcards."""
+    needs: str = ""
+    """A predicate that one of its pre-conditions fits: ``see(?x)``."""
+    achieves: str = ""
+    """A predicate that one of its post-conditions fits."""
 
 
 class Named(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -77,7 +81,7 @@ class Tools:
     """The tools of one agent; it is a client with its own session, which ends with it.
 
     Args:
-        container: the agent's container; its identity is the agent's.
+        container: the container that acts for the agent.
         api: the operations of clients.
         client: the agent.
         approvals: human approval of calls.
@@ -100,6 +104,7 @@ class Tools:
         self._approvals = approvals
         self._twin = twin
         self._talk = Talk(container, lexicon, Memory())
+        self._trying = anyio.CapacityLimiter(1)
         self._lost: list[str] = []
 
     async def use(self, name: str, given: Any, progress: Progress = lambda _: None) -> Any:
@@ -122,20 +127,22 @@ class Tools:
             about = _about(asked)
             result = await tool.do(self, asked, progress)
         except Exception as error:
-            self._record(name, about, began, type(error).__name__, str(error) if isinstance(error, TradeError) else "")
+            self.record(name, about, began, type(error).__name__, str(error) if isinstance(error, TradeError) else "")
             raise
-        self._record(name, about, began, "ok", "")
+        self.record(name, about, began, "ok", "")
         return result
 
-    def _record(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
+    def record(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
+        """Audits the use of a tool that began at this ``time.monotonic_ns()``."""
         took_ns = time.monotonic_ns() - began
-        self._container.note_asked(f"agent's tool {tool}", about, outcome=outcome, why=why, took_ns=took_ns)
+        what, who = f"agent's tool {tool}", self._client.identity
+        self._container.note_asked(what, about, who=who, outcome=outcome, why=why, took_ns=took_ns)
 
     # --- queries
 
     async def services(self, asked: Find, _: Progress) -> Any:
-        """List services: what they do, which resources they use, their health, and whether they may be called."""
-        found = self._api.seen(self._client.identity, asked.group or None, asked.name or None)
+        """List services: what they do, need, achieve and use, their health, and whether they may be called."""
+        found = self._api.seen(self._client.identity, asked.group, asked.name, asked.needs, asked.achieves)
         return [self._api.view(self._client.identity, handle) for handle in found]
 
     async def describe(self, asked: Named, _: Progress) -> Any:
@@ -147,7 +154,7 @@ class Tools:
             schema["arguments"],
             schema["result"],
             needs_lock=handle.effect == "actuate",
-            needs_approval=self._approvals.needed(handle),
+            needs_approval=self._approvals.needed(self._client.identity, handle),
         )
 
     async def ask(self, asked: Sentence, _: Progress) -> Any:
@@ -155,7 +162,10 @@ class Tools:
 
         It changes nothing: to stop, use the tools `stop` and `estop`.
         """
-        return await self._api.apart(partial(self._talk.say, asked.sentence, orders=False))
+        who = self._client.identity
+        if who != self._container.address.identity:  # the answer is all that the container may know
+            self._api.judge.require_system(who, "read", "ask")
+        return await self._api.counted(who, partial(self._talk.say, asked.sentence, orders=False))
 
     async def locks(self, _asked: NoArgs, _: Progress) -> Any:
         """List all locks, and those of this agent that were lost since it last asked."""
@@ -178,9 +188,9 @@ class Tools:
         self._require_lock(handle)
         self._api.judge.require_call(self._client.identity, handle)
         admitted = self._client.admit(handle)
-        if self._approvals.needed(handle):
+        if self._approvals.needed(self._client.identity, handle):
             progress("waits for a person's approval")
-            await self._approvals.ask(handle, asked.args, asked.why, _APPROVED_WITHIN_S)
+            await self._approvals.ask(self._client.identity, handle, asked.args, asked.why, _APPROVED_WITHIN_S)
             self._require_lock(handle)
         run = await self._api.begin(self._client, handle, asked, admitted)
         run.on_progress(progress)
@@ -193,14 +203,14 @@ class Tools:
         return {"result": run.result(0)}
 
     async def try_on_twin(self, asked: ToCall, _: Progress) -> Any:
-        """Try a call on a simulated twin, brought to the robot's position. Nothing real moves."""
+        """Try a call on a simulated twin, brought to where the whole robot is. Nothing real moves."""
         if self._twin is None:
             raise NoTwin(reason="this server has no twin")
         handle = self._find(asked.group, asked.name, asked.container)
-        state = await self._state_of(handle)
-        trying = partial(self._twin.call, handle, asked.args, min(asked.deadline_s, _TRIED_WITHIN_S), state)
-        tried: Tried = await run_sync(trying, abandon_on_cancel=True)  # nothing of the real robot waits for it
-        return tried
+        states = await self._states_of(handle.key.domain.partition(".")[0])
+        trying = partial(self._twin.call, handle, asked.args, min(asked.deadline_s, _TRIED_WITHIN_S), states)
+        tried: Tried = await run_sync(trying, abandon_on_cancel=True, limiter=self._trying)
+        return tried  # nothing of the real robot waits for it
 
     async def stop(self, asked: messages.GroupBody, _: Progress) -> Any:
         """Stop all motion in a group, by any client. Needs no lock and no right."""
@@ -238,17 +248,18 @@ class Tools:
         if handle.effect == "actuate" and not self._client.has_locked(handle):
             raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
 
-    async def _state_of(self, handle: Handle) -> Any:
-        """The robot's `state` for a service's group; None if it has none."""
+    async def _states_of(self, robot: str) -> dict[str, Any]:
+        """The ``state`` of each group of a robot; None where it could not be read."""
+        readers = self._api.seen(self._client.identity, robot, "state")
+        return {one.key.domain: await self._read(one) for one in readers if one.effect == "read"}
+
+    async def _read(self, reader: Handle) -> Any:
         try:
-            reader = self._find(handle.key.domain, "state", handle.container)
+            run = await self._api.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
+            await run.settled()
+            return run.result(0)
         except TradeError:
             return None
-        if reader.effect != "read":  # another service of that name
-            return None
-        run = await self._api.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
-        await run.settled()
-        return run.result(0)
 
     def _lock_lost(self, name: str, error: LockLost) -> None:
         self._lost.append(f"{name}: {error}")

@@ -25,10 +25,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
+from trade._atomic_file import claim, replace
 from trade._protocol.keys import is_chunk
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-from trade_gateway.process._atomic_file import claim, replace
 
 __all__ = ["Authority", "Issued", "NameRevoked", "NameTaken", "NoAuthority", "Purpose"]
 

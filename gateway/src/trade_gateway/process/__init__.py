@@ -1,1 +1,1 @@
-"""Processes: signals as events, a kernel timer that kills, the parent's end, atomic files."""
+"""Processes: signals as events, a kernel timer that kills, and the parent's end."""

@@ -75,6 +75,7 @@ class Recorder:
             wanted: the parts of the system to record.
             ending: ends ``run`` within half a second after it is set.
         """
+        self.container: Final = container
         self._wake = threading.Event()
         self._ending = ending
         self._sources = Sources(container, wanted, self._wake)

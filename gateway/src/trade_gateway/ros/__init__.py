@@ -4,7 +4,7 @@ from trade._protocol.schema_types import publish as _publish
 from trade_gateway.ros._bridge import Bridge, Bridged
 from trade_gateway.ros._connect import join, planned
 from trade_gateway.ros._file import RosFile, read_ros_file
-from trade_gateway.ros._from_ros_joints import RosJoint
+from trade_gateway.ros.from_ros._joints import RosJoint
 
 __all__ = ["Bridge", "Bridged", "RosFile", "join", "planned", "read_ros_file"]
 

@@ -12,22 +12,25 @@ from msgspec import Struct
 from trade import Container, service
 from trade.errors import TradeError
 from trade_gateway.ros._file import RosFile
-from trade_gateway.ros._from_ros import (
+from trade_gateway.ros._graph import Graph
+from trade_gateway.ros._mapping_sync import Following, Mapping
+from trade_gateway.ros._nodes import Nodes
+from trade_gateway.ros.from_ros._actions import action_from_ros
+from trade_gateway.ros.from_ros._joints import joints_from_ros
+from trade_gateway.ros.from_ros._providers import Records
+from trade_gateway.ros.from_ros._services import (
     Offered,
     parameters_from_ros,
     publisher_from_ros,
     service_from_ros,
     topic_from_ros,
 )
-from trade_gateway.ros._from_ros_joints import joints_from_ros
-from trade_gateway.ros._graph import Graph
-from trade_gateway.ros._mapping_sync import Following, Mapping
-from trade_gateway.ros._nodes import Nodes
-from trade_gateway.ros._providers import Records
-from trade_gateway.ros._to_ros_commands import CommandsToRos
-from trade_gateway.ros._to_ros_services import LocksToRos, ServicesToRos
-from trade_gateway.ros._to_ros_streams import JointStatesToRos, StreamsToRos, Topics
-from trade_gateway.ros._to_ros_trajectories import TrajectoriesToRos
+from trade_gateway.ros.to_ros._actions import ActionsToRos, GrippersToRos
+from trade_gateway.ros.to_ros._commands import CommandsToRos
+from trade_gateway.ros.to_ros._robot import Description, TransformsToRos
+from trade_gateway.ros.to_ros._services import LocksToRos, ServicesToRos
+from trade_gateway.ros.to_ros._streams import JointStatesToRos, StreamsToRos, Topics
+from trade_gateway.ros.to_ros._trajectories import TrajectoriesToRos
 
 __all__ = ["GROUP", "Bridge", "Bridged"]
 
@@ -79,6 +82,9 @@ class Bridge:
             self._nodes = Nodes(container, graph, file.ros.grace_s, self._heard)
             self._leaving.callback(self._nodes.close)
             self._offer(graph, file)
+            for entry in file.to_ros.robot:
+                self._leaving.callback(Description(entry, graph).close)
+                self._say(f"topic {entry.topic} is {entry.urdf}")
             self._following = Following(container, self._mappings(graph, file), say)
             self._leaving.callback(self._following.close)
             self._leaving.callback(self._nodes.close)  # first of all: motion of ROS nodes stops, and no call begins
@@ -92,7 +98,10 @@ class Bridge:
             *(CommandsToRos(entry, graph, nodes, self._container, self._say) for entry in out.command),
             *(StreamsToRos(entry, topics, graph, self._container) for entry in out.stream),
             *(JointStatesToRos(entry, topics, self._container) for entry in out.joint_states),
+            *(TransformsToRos(entry, topics, self._container) for entry in out.robot),
             *(TrajectoriesToRos(entry, graph, nodes, self._container) for entry in out.trajectory),
+            *(ActionsToRos(entry, graph, nodes) for entry in out.action),
+            *(GrippersToRos(entry, graph, nodes) for entry in out.gripper),
         ]
 
     def _offer(self, graph: Graph, file: RosFile) -> None:
@@ -101,6 +110,7 @@ class Bridge:
             *(partial(service_from_ros, entry, graph, records) for entry in into.service),
             *(partial(topic_from_ros, entry, graph, records) for entry in into.topic),
             *(partial(publisher_from_ros, entry, graph, records) for entry in into.publish),
+            *(partial(action_from_ros, entry, graph, records) for entry in into.action),
             *(partial(joints_from_ros, entry, graph) for entry in into.joints),
             *(partial(parameters_from_ros, entry, graph) for entry in into.parameters),
         ]

@@ -9,7 +9,7 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._graph import Graph
-from trade_gateway.ros._types import Types
+from trade_gateway.ros._types import Types, installed_definitions
 
 __all__ = ["join", "planned"]
 
@@ -62,7 +62,7 @@ def planned(read: RosFile, path: Path) -> list[str]:
         ConfigurationError: a type is not known, or has the wrong kind.
     """
     _refuse_others(read, path)
-    types = Types(read.ros.version, read.folders(path))
+    types = Types(read.ros.version, read.folders(path), installed_definitions(read.ros.version))
     return [*_to_ros(read, types), *_from_ros(read, types)]
 
 
@@ -85,8 +85,17 @@ def _to_ros(read: RosFile, types: Types) -> Iterable[str]:
         yield f"to ROS: {stream.service} as topic {stream.topic} ({stream.type}) at {stream.hz:g} Hz"
     for states in out.joint_states:
         yield f"to ROS: joints of {states.group} as topic {states.topic} at {states.hz:g} Hz"
+    for robot in out.robot:
+        yield f"to ROS: {robot.urdf} as topic {robot.topic}, and joints of {robot.group} as /tf at {robot.hz:g} Hz"
     for way in out.trajectory:
-        yield f"to ROS: joints of {way.group} as action {way.action}"
+        beside = f" and topic {way.topic}" if way.topic else ""
+        yield f"to ROS: joints of {way.group} as action {way.action}{beside}"
+    for action in out.action:
+        types.parts(action.type)
+        yield f"to ROS: {action.service} as action {action.action} ({action.type})"
+    for gripper in out.gripper:
+        types.parts(gripper.type)
+        yield f"to ROS: gripper {gripper.group} as action {gripper.action} ({gripper.type})"
 
 
 def _from_ros(read: RosFile, types: Types) -> Iterable[str]:
@@ -100,6 +109,9 @@ def _from_ros(read: RosFile, types: Types) -> Iterable[str]:
     for published in into.publish:
         types.fields(published.type)
         yield f"from ROS: publishing on {published.topic} ({published.type}) in {', '.join(published.groups)}"
+    for action in into.action:
+        types.parts(action.type)
+        yield f"from ROS: action {action.action} ({action.type}, {action.effect}) in {', '.join(action.groups)}"
     for joints in into.joints:
         yield f"from ROS: joints of action {joints.action} in {', '.join(joints.groups)}"
     for parameters in into.parameters:

@@ -6,21 +6,26 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade_gateway.ros._urdf import read_urdf
 
 __all__ = [
+    "ActionEntry",
     "Command",
+    "FromAction",
     "FromJoints",
     "FromParameters",
     "FromPublish",
     "FromService",
     "FromTopic",
+    "GripperEntry",
     "JointStates",
     "Link",
     "LockService",
+    "RobotEntry",
     "RosFile",
     "ServiceEntry",
     "StreamEntry",
@@ -146,9 +151,54 @@ class TrajectoryEntry(_Strict, frozen=True, kw_only=True):
 
     group: _Text
     action: _RosName
+    topic: str = ""
+    """A topic of ``trajectory_msgs/msg/JointTrajectory`` beside it, for goals without an answer."""
     names: _Names = "last"
     joints: Fields = {}
     """For each name in ROS, the TRADE joint."""
+
+
+class ActionEntry(_Strict, frozen=True, kw_only=True):
+    """``[[to_ros.action]]``: a TRADE service as an action of any type."""
+
+    service: _Text
+    action: _RosName
+    type: _Type
+    args: Fields = {}
+    """For each parameter of the service, the field of the goal; not needed for equal names."""
+    fixed: dict[str, Any] = {}
+    """Further arguments: ``{ speed_m_s = 0.1 }``."""
+    result: Fields = {}
+    """For each field of the result, the part of what the service returns; by default by equal names."""
+    feedback: Fields = {}
+    """The same for the feedback and the service's progress."""
+    deadline_s: _Seconds = 600.0
+
+
+class GripperEntry(_Strict, frozen=True, kw_only=True):
+    """``[[to_ros.gripper]]``: a gripper as an action of control_msgs."""
+
+    group: _Text
+    action: _RosName
+    type: Literal["control_msgs/action/GripperCommand", "control_msgs/action/ParallelGripperCommand"] = (
+        "control_msgs/action/GripperCommand"
+    )
+    joint: str = ""
+    """The joint in messages of ParallelGripperCommand; by default the last part of the group."""
+    deadline_s: _Seconds = 10.0
+
+
+class RobotEntry(_Strict, frozen=True, kw_only=True):
+    """``[[to_ros.robot]]``: a robot's description, and the transforms of its links."""
+
+    group: _Text
+    urdf: _Text
+    """Its URDF, relative to the file."""
+    topic: _RosName = "/robot_description"
+    hz: _Hz = 20.0
+    names: _Names = "last"
+    joints: Fields = {}
+    """For each name in the URDF, the TRADE joint, where they differ otherwise."""
 
 
 class ToRos(_Strict, frozen=True, kw_only=True):
@@ -160,6 +210,13 @@ class ToRos(_Strict, frozen=True, kw_only=True):
     stream: list[StreamEntry] = []
     joint_states: list[JointStates] = []
     trajectory: list[TrajectoryEntry] = []
+    action: list[ActionEntry] = []
+    gripper: list[GripperEntry] = []
+    robot: list[RobotEntry] = []
+
+    def actions(self) -> list[str]:
+        """The names of all actions that the bridge serves."""
+        return [one.action for one in (*self.trajectory, *self.action, *self.gripper)]
 
 
 # --- from ROS
@@ -208,6 +265,15 @@ class FromPublish(_Offered, frozen=True, kw_only=True):
     itself, and ``stop`` is published when its session ends."""
 
 
+class FromAction(_Offered, frozen=True, kw_only=True):
+    """``[[from_ros.action]]``: an action of ROS as a TRADE service with progress, a result and a stop."""
+
+    action: _RosName
+    type: _Type
+    effect: Literal["note", "actuate"] = "actuate"
+    """``note``: it moves nothing, needs no lock and has no stop."""
+
+
 class FromJoints(_Strict, frozen=True, kw_only=True):
     """``[[from_ros.joints]]``: joints of ROS, by a topic and an action, as a TRADE provider."""
 
@@ -237,6 +303,7 @@ class FromRos(_Strict, frozen=True, kw_only=True):
     service: list[FromService] = []
     topic: list[FromTopic] = []
     publish: list[FromPublish] = []
+    action: list[FromAction] = []
     joints: list[FromJoints] = []
     parameters: list[FromParameters] = []
 
@@ -264,12 +331,27 @@ def read_ros_file(path: Path) -> RosFile:
     except (OSError, ValueError) as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
     try:
-        read = msgspec.convert(raw, RosFile)
+        read = _placed(msgspec.convert(raw, RosFile), path.parent)
     except msgspec.ValidationError as bad:
         raise _explained(path, str(bad)) from None
+    for entry in read.to_ros.robot:
+        _read_description(entry)
     for place, problem in _problems(read):
         raise ConfigurationError(where=f"{path}: {place}", problem=problem)
     return read
+
+
+def _placed(read: RosFile, folder: Path) -> RosFile:
+    """The same with whole paths."""
+    robots = [structs.replace(entry, urdf=str(folder / entry.urdf)) for entry in read.to_ros.robot]
+    return structs.replace(read, to_ros=structs.replace(read.to_ros, robot=robots))
+
+
+def _read_description(entry: RobotEntry) -> None:
+    try:
+        read_urdf(Path(entry.urdf).read_text(encoding="utf-8"), entry.urdf)
+    except (OSError, UnicodeDecodeError) as bad:
+        raise ConfigurationError(where=entry.urdf, problem=f"cannot be read: {bad}") from None
 
 
 def _explained(path: Path, said: str) -> ConfigurationError:
@@ -302,9 +384,14 @@ def _problems(read: RosFile) -> Iterable[tuple[str, str]]:
             yield place, "is missing: what moves something needs a message that stops it, such as { linear = {} }"
         if published.effect == "note" and published.stop is not None:
             yield place, 'does not go with effect = "note", which moves nothing'
+    for number, trajectory in enumerate(read.to_ros.trajectory):
+        if trajectory.topic and not _NAME.fullmatch(trajectory.topic):
+            yield f"to_ros.trajectory[{number}].topic", "is not a ROS name: words of letters, digits and _, joined by /"
+    yield from _twice("to_ros.trajectory", [one.topic for one in read.to_ros.trajectory if one.topic])
     yield from _twice("to_ros.lock", [one.name or one.group for one in read.to_ros.lock])
     yield from _twice("to_ros.service", [one.name for one in read.to_ros.service if one.name])
-    yield from _twice("to_ros.trajectory", [one.action for one in read.to_ros.trajectory])
+    yield from _twice("to_ros", read.to_ros.actions())
+    yield from _twice("to_ros.robot", [one.topic for one in read.to_ros.robot])
     yield from _twice("to_ros.command", [one.topic for one in read.to_ros.command])
     yield from _circles(read)
 
@@ -330,7 +417,9 @@ def _circles(read: RosFile) -> Iterable[tuple[str, str]]:
     published = {entry.topic for entry in (*read.to_ros.stream, *read.to_ros.joint_states)}
     for name in sorted(published & {entry.topic for entry in read.from_ros.topic}):
         yield "from_ros.topic", f"{name} is published by this bridge itself. Remove one of the two entries"
-    for name in sorted({one.action for one in read.to_ros.trajectory} & {one.action for one in read.from_ros.joints}):
-        yield "from_ros.joints", f"{name} is served by this bridge itself. Remove one of the two entries"
+    served = set(read.to_ros.actions())
+    for kind, entries in (("joints", read.from_ros.joints), ("action", read.from_ros.action)):
+        for name in sorted(served & {one.action for one in entries}):
+            yield f"from_ros.{kind}", f"{name} is served by this bridge itself. Remove one of the two entries"
     for name in sorted({one.topic for one in read.to_ros.command} & {one.topic for one in read.from_ros.publish}):
         yield "from_ros.publish", f"{name} would command the bridge's own service again. Remove one of the two entries"

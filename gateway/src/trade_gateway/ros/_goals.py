@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade.errors import InvalidArgument, ToleranceExceeded
-from trade_gateway.ros._conversion import failure, ros_stamp, seconds
+from trade_gateway.ros._conversion import ros_stamp, seconds
 from trade_gateway.ros._joints import JointNames
 from trade_gateway.ros._types import Message
+from trade_gateway.ros.to_ros._served_goals import Unacceptable
 
 __all__ = [
     "ACTION",
@@ -19,12 +20,10 @@ __all__ = [
     "OLD_HEADER_TIMESTAMP",
     "PATH_TOLERANCE_VIOLATED",
     "SUCCESSFUL",
-    "Unacceptable",
     "code_of",
     "goal_of",
     "lasts_s",
     "starts_late",
-    "text_of",
     "tolerances_of",
     "trajectory_of",
 ]
@@ -39,15 +38,6 @@ GOAL_TOLERANCE_VIOLATED: Final = -5
 
 _CLOCKS_S: Final = 1.0
 """Greatest difference between the clock of a goal's sender and ours."""
-
-
-class Unacceptable(Exception):
-    """A goal that is refused before anything moves."""
-
-    def __init__(self, code: int, problem: str) -> None:
-        super().__init__(problem)
-        self.code = code
-        """The error code of its result."""
 
 
 def starts_late(goal: Message, now_s: float) -> None:
@@ -135,11 +125,6 @@ def code_of(error: BaseException) -> int:
     if isinstance(error, InvalidArgument) and error.argument == "trajectory.joints":
         return INVALID_JOINTS
     return INVALID_GOAL
-
-
-def text_of(error: BaseException) -> str:
-    """The text of an error, for the result."""
-    return str(error) if isinstance(error, Unacceptable) else failure(error)
 
 
 def goal_of(joints: Sequence[str], points: Sequence[Mapping[str, Any]]) -> Message:

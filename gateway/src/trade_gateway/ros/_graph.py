@@ -27,6 +27,7 @@ __all__ = [
     "Outcome",
     "Publisher",
     "Pursuit",
+    "Refuse",
     "RosRefused",
     "RosUnreachable",
 ]
@@ -120,6 +121,11 @@ class Goal(Protocol):
         ...
 
 
+Refuse = Callable[[Message], Outcome | None]
+"""Takes the message of a goal that has arrived; None: it can be carried out. Else why it cannot: ROS 1 reports all of
+it, ROS 2 only that it was rejected."""
+
+
 class Pursuit(Protocol):
     """A goal that TRADE sent to an action of ROS."""
 
@@ -169,8 +175,15 @@ class Graph(Protocol):
         """
         ...
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
-        """Serves an action; each goal has its own thread, and a later one cancels the one before."""
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
+        """Serves an action; each goal has its own thread, and a later one cancels the one before.
+
+        Args:
+            name: of the action.
+            type_name: its type.
+            do: carries out a goal to its end.
+            refuse: decides about a goal without a wait. A goal that it refuses is rejected, and cancels none.
+        """
         ...
 
     def pursue(

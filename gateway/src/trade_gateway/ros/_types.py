@@ -4,6 +4,8 @@ A message is a dict of its fields: numbers, booleans, text, lists of them, messa
 ``byte[]`` are ``bytes``. A time or duration is ``{"sec": ..., "nanosec": ...}``, as in ROS 2, for both.
 """
 
+import os
+import re
 import struct
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -17,7 +19,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Field", "Message", "Types"]
+__all__ = ["Field", "Message", "Types", "installed_definitions"]
 
 Message = dict[str, Any]
 
@@ -25,6 +27,7 @@ _SHIPPED: Final = Path(__file__).parent / "definitions"
 _FILLER: Final = "structure_needs_at_least_one_member"
 """Placeholder field of ROS 2 in a message without fields."""
 _PARTS: Final = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
+_TYPE: Final = re.compile(r"\w+/(msg|srv|action)/\w+", re.ASCII)
 _TEXTS: Final = ("string", "wstring")
 _MALFORMED: Final = (
     SerdeError,
@@ -54,10 +57,11 @@ class Field(NamedTuple):
 class Types:
     """The types of one side of the bridge: the standard ones, those shipped here, and those in further folders."""
 
-    def __init__(self, ros: Literal[1, 2], folders: Iterable[Path] = ()) -> None:
+    def __init__(self, ros: Literal[1, 2], folders: Iterable[Path] = (), installed: Iterable[Path] = ()) -> None:
         """Args:
             ros: the version whose encoding applies.
             folders: each with packages as ROS lays them out: ``PACKAGE/msg/NAME.msg``, ``srv``, ``action``.
+            installed: the same, of which only types that are asked for are read.
 
         Raises:
             ConfigurationError: a definition cannot be read.
@@ -65,6 +69,7 @@ class Types:
         self.ros: Final = ros
         self._store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
         self._wholes: dict[str, tuple[str, ...]] = {}
+        self._installed = tuple(installed)
         for folder in (_SHIPPED / f"ros{ros}", *folders):
             self._read(folder)
         self._fields = cache(self._look_up)
@@ -81,9 +86,10 @@ class Types:
         Raises:
             ConfigurationError: it is not known.
         """
+        self._seek(type_name)
         found = self._wholes.get(type_name)
         if found is None:
-            raise ConfigurationError(where="ROS type", problem=_unknown(type_name, self._wholes))
+            raise ConfigurationError(where="ROS type", problem=self._unknown(type_name, self._wholes))
         return found
 
     def definition(self, type_name: str) -> tuple[str, str]:
@@ -181,10 +187,12 @@ class Types:
         return value.tolist() if isinstance(value, np.ndarray) else list(value)
 
     def _look_up(self, type_name: str) -> tuple[Field, ...]:
+        self._seek(type_name)
         try:
             found = self._store.fielddefs[type_name][1]
         except KeyError:
-            raise ConfigurationError(where="ROS type", problem=_unknown(type_name, self._store.fielddefs)) from None
+            problem = self._unknown(type_name, self._store.fielddefs)
+            raise ConfigurationError(where="ROS type", problem=problem) from None
         fields = tuple(_field(name, kind) for name, kind in found if name != _FILLER)
         for field in fields:
             if field.many and not field.length and self._is_nothing(field.type):
@@ -192,7 +200,7 @@ class Types:
                     f"{field.name} is an array of {field.type}, which has no bytes, so its length cannot be checked"
                 )
                 raise ConfigurationError(where=type_name, problem=problem)
-            if field.type in self._store.fielddefs:
+            if "/" in field.type:
                 self.fields(field.type)
         return fields
 
@@ -202,6 +210,26 @@ class Types:
             return False
         fields = [_field(name, kind) for name, kind in self._store.fielddefs[type_name][1] if name != _FILLER]
         return all((field.length or not field.many) and self._is_nothing(field.type) for field in fields)
+
+    def _seek(self, type_name: str) -> None:
+        """Reads the definition of a type from the installation of ROS, unless it is known."""
+        if type_name in self._store.fielddefs or type_name in self._wholes or not _TYPE.fullmatch(type_name):
+            return
+        package, kind, name = type_name.split("/")
+        for folder in self._installed:
+            path = folder / package / kind / f"{name}.{kind}"
+            if path.is_file():
+                self._add(path, type_name, kind)
+                return
+
+    def _unknown(self, type_name: str, known: Iterable[str]) -> str:
+        package, name = type_name.partition("/")[0], type_name.rpartition("/")[2]
+        near = [one for one in known if one.rpartition("/")[2] == name]
+        if near:
+            return f"{type_name} is not known; there is {', '.join(near)}"
+        here = any((folder / package).is_dir() for folder in self._installed)
+        which = f"package {package} is installed, but without it" if here else f"package {package} is not installed"
+        return f"{type_name} is not known: {which}. Put its definition in a folder of types"
 
     def _read(self, folder: Path) -> None:
         if not folder.is_dir():
@@ -279,7 +307,10 @@ def _text(value: Any) -> str:
     return value
 
 
-def _unknown(type_name: str, known: Iterable[str]) -> str:
-    near = [name for name in known if name.rpartition("/")[2] == type_name.rpartition("/")[2]]
-    there = f"; there is {', '.join(near)}" if near else "; put its definition in a folder of types"
-    return f"{type_name} is not known{there}"
+def installed_definitions(ros: Literal[1, 2]) -> list[Path]:
+    """The folders with the definitions of an installation of ROS, by its environment."""
+    if ros == 2:
+        prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+        return [Path(prefix) / "share" for prefix in prefixes if prefix]
+    paths = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
+    return [*(Path(path) for path in paths if path), Path("/usr/share")]

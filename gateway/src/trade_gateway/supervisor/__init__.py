@@ -2,11 +2,12 @@
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.config._children import Child, read_children
+from trade_gateway.config._described import ChildTables
 from trade_gateway.supervisor._child_state import ChildInfo, News
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._services import ChildServices
 from trade_gateway.supervisor._supervisor import Supervisor
 
-__all__ = ["Child", "ChildInfo", "ChildServices", "News", "Supervisor", "read_children"]
+__all__ = ["Child", "ChildInfo", "ChildServices", "ChildTables", "News", "Supervisor", "read_children"]
 
-_publish(__name__, ChildInfo, Lease)
+_publish(__name__, ChildInfo, ChildTables, Lease)

@@ -50,6 +50,8 @@ class Unit:
         self.process: Process | None = None
         self.boot = 0
         """Counts processes, so that reports about an earlier one are ignored."""
+        self.before: frozenset[str] = frozenset()
+        """Boots of the container that its program announces, seen before its process was started."""
         self.furnished: CreatedObjects | None = None
         self.begun = False
         self.was_up = False

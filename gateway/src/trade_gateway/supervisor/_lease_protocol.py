@@ -4,16 +4,18 @@ import math
 import secrets
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 import msgspec
 
-from trade import Container, Handle, Run, where
+from trade import Container, Handle, LoadInfo, Run, where
 from trade.errors import AccessDenied, ConfigurationError, NoSuchService, TradeError
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease, uptime_s
+from trade_gateway.supervisor._host_loads import HostLoads
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease
 from trade_gateway.supervisor._objects import GROUP
 from trade_gateway.supervisor._single_instance import is_free
@@ -25,6 +27,9 @@ _KEEP_S: Final = 5.0
 """How long the arbiter may take to save states, in seconds."""
 _MOST_BYTES: Final = 16 * 1024 * 1024
 """The limit of the states of one container, in bytes."""
+_MEASURE_EVERY_S: Final = 2.0
+_HERE: Final = ""
+"""This host, among the names of other gateways."""
 _LOOK_EVERY_S: Final = 0.25
 """How often to check whether the previous process has ended, in seconds."""
 
@@ -51,6 +56,11 @@ class Leased(Protocol):
     @property
     def due(self) -> float:
         """When to `look` again, by `uptime_s`."""
+        ...
+
+    @property
+    def keeps(self) -> bool:
+        """Whether the container's states can be saved now."""
         ...
 
     def look(self, *, alive: bool, wanted: bool) -> bool:
@@ -115,6 +125,10 @@ class Asking:
     def due(self) -> float:
         return self._holder.due
 
+    @property
+    def keeps(self) -> bool:
+        return self._holder.keeps(uptime_s())
+
     def look(self, *, alive: bool, wanted: bool) -> bool:
         now, holder = uptime_s(), self._holder
         if holder.asks(now) and wanted:
@@ -163,7 +177,7 @@ class Asking:
             seen = not isinstance(error, NoSuchService)
             self._holder.unanswered(str(error) if seen else f"{self._from} is not visible")
             return
-        run.when_done(lambda run: self._post(partial(self._answered, now, turn, run)))
+        run.add_done_callback(lambda run: self._post(partial(self._answered, now, turn, run)))
 
     def _answered(self, now: float, turn: str, run: Run) -> None:
         error = run.exception(0)
@@ -185,23 +199,36 @@ class StandIn:
 
     Args:
         child: the container.
+        member: returns the gateway's container.
+        post: runs a function on the supervisor's thread.
         store: the store of states.
         lock: see `Leased`.
-        rung: wakes the supervisor.
     """
 
-    def __init__(self, child: Child, store: StateStore, lock: Path, rung: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        child: Child,
+        member: Callable[[], Container],
+        post: Callable[[Callable[[], None]], None],
+        store: StateStore,
+        lock: Path,
+    ) -> None:
         self.lock = lock
         self._name = child.name
-        self._asker = child.terms.stands_in_for
+        self._askers = child.terms.askers
+        self._member = member
+        self._post = post
         self._store = store
-        self._rung = rung
+        self._above: float | None = None
+        self._loads = HostLoads()
+        self._measure_at = math.inf
         self._lease_s = 0.0
         self._longest_s = 0.0
         """The longest lease ever given, from the store."""
         self._guard = threading.Lock()
         """Guards the arbiter and the number of the last save."""
-        self._arbiter = Arbiter(self._asker, secrets.token_hex(4))
+        known = store.load(self._own).get("holder", "")
+        self._arbiter = Arbiter(self._askers, secrets.token_hex(4), known if known in self._askers else "")
         self._saved = 0
         self._look_at = 0.0
         self.go_by(child)
@@ -209,12 +236,18 @@ class StandIn:
     # --- on the supervisor's thread
 
     def go_by(self, child: Child) -> None:
-        """Applies the lease time of the container's table from now on."""
-        lease_s, own = child.terms.lease_s, f"{self._name} leases"  # no container has a space in its name
-        known_s = max(self._longest_s, self._store.load(own).get("longest_s", 0.0))
+        """Applies the lease time and the load of the container's table from now on."""
+        lease_s, self._above = child.terms.lease_s, child.terms.move_above
+        self._measure_at = math.inf if self._above is None else min(self._measure_at, uptime_s())
+        known_s = max(self._longest_s, self._store.load(self._own).get("longest_s", 0.0))
         if lease_s > known_s:
-            self._store.save(own, {"longest_s": lease_s})
+            self._store.save(self._own, {"longest_s": lease_s})
         self._lease_s, self._longest_s = lease_s, max(lease_s, known_s)
+
+    @property
+    def _own(self) -> str:
+        """The name of the lease's own rows in the store; no container has a space in its name."""
+        return f"{self._name} leases"
 
     @property
     def why(self) -> str:
@@ -226,7 +259,11 @@ class StandIn:
 
     @property
     def due(self) -> float:
-        return min(self._look_at, self._arbiter.due)
+        return min(self._look_at, self._measure_at, self._arbiter.due)
+
+    @property
+    def keeps(self) -> bool:
+        return True
 
     def look(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - one given up here runs nowhere
         ended, now = not alive and is_free(self.lock), uptime_s()
@@ -236,6 +273,10 @@ class StandIn:
             self._arbiter.looked(now)
             mine, handing = self._arbiter.mine, self._arbiter.handing
         self._look_at = now + _LOOK_EVERY_S if mine and not alive and not ended else math.inf
+        if self._above is not None and now >= self._measure_at:
+            self._measure_at = now + _MEASURE_EVERY_S
+            self._measure(now)
+            self._balance(now, self._above)
         return mine and not handing and (alive or ended)
 
     def load(self) -> dict[str, Any]:
@@ -244,18 +285,55 @@ class StandIn:
     def keep(self) -> Keep:
         return partial(self._store.save, self._name)
 
+    def _measure(self, now: float) -> None:
+        """Asks the other gateways for the load of their hosts, and notes this one's."""
+        member = self._member()
+        self._noted(_HERE, now, member.system.load())
+        for handle in member.services(where(name="load", group=GROUP)):
+            address, certified = handle.key.address, member.settings.tls is not None
+            gateway = address.container
+            if gateway in self._askers and (not certified or address.identity == gateway):
+                with suppress(TradeError):
+                    run = handle.with_(deadline_s=_MEASURE_EVERY_S).start()
+                    run.add_done_callback(partial(self._answered, gateway, now))
+
+    def _answered(self, gateway: str, now: float, run: Run) -> None:
+        if run.exception(0) is None:
+            self._post(partial(self._noted, gateway, now, run.result(0)))
+
+    def _noted(self, host: str, now: float, load: LoadInfo) -> None:
+        if load.host_cpu_percent is not None:
+            self._loads.note(host, load.host_cpu_percent / 100, now)
+
+    def _balance(self, now: float, above: float) -> None:
+        """Begins to move the container to the least loaded host, if its own one is too busy."""
+        with self._guard:
+            arbiter = self._arbiter
+            asking = {gateway for gateway, at in arbiter.asked_at.items() if now - at <= self._lease_s}
+            here = _HERE if arbiter.mine else arbiter.holder
+            if arbiter.handing or arbiter.moves_to is not None or not (arbiter.mine or arbiter.turn):
+                return
+            to = self._loads.choice(here, {_HERE, *asking}, above, now)
+            if to is not None:
+                arbiter.move("" if to == _HERE else to)
+
     # --- from other threads
 
     def lease(self, caller: str | None, gateway: str, turn: str) -> Lease:
         """Handles a request of the other gateway; ``caller`` is None without certificates. Raises AccessDenied."""
         self._check(caller, gateway)
         with self._guard:
-            given = self._arbiter.asked(uptime_s(), turn, self._lease_s)
-            its = self._arbiter.turn
+            arbiter, before = self._arbiter, self._arbiter.holder
+            given = arbiter.asked(uptime_s(), gateway, turn, self._lease_s)
+            its, moves_to, leave = arbiter.turn, arbiter.moves_to, before == gateway and bool(turn)
             if given and its != turn:
                 self._saved = 0
+        if not given and moves_to is not None:
+            return Lease("", why=f"it moves to {moves_to or 'the standby'}", leave=leave)
         if not given:
-            return Lease("", why="the standby has it")
+            return Lease("", why="the standby has it" if arbiter.mine else f"{before} may have it")
+        if before != gateway and len(self._askers) > 1 and not self._store.save(self._own, {"holder": gateway}):
+            return Lease("", why="the standby cannot write down who has it")
         states = b"" if its == turn else msgspec.msgpack.encode(self.load())
         return Lease(its, self._lease_s, states=states)
 
@@ -281,14 +359,15 @@ class StandIn:
         with self._guard:
             if not self._arbiter.mine:
                 problem = f"it does not run here: {self._arbiter.why}"
-            elif uptime_s() - self._arbiter.asked_at > self._lease_s:
-                problem = f"{self._asker} has not requested it for {self._lease_s:g} s; is it up and connected?"
+            elif uptime_s() - max(self._arbiter.asked_at.values(), default=-math.inf) > self._lease_s:
+                names = " and ".join(self._askers)
+                problem = f"{names} has not requested it for {self._lease_s:g} s; is it up and connected?"
             else:
                 self._arbiter.hand_back()
                 problem = ""
         if problem:
             raise ConfigurationError(where=f"container {self._name}", problem=problem)
-        self._rung()
+        self._post(lambda: None)
 
     def _is_newest(self, turn: str, number: int) -> bool:
         with self._guard:
@@ -299,8 +378,8 @@ class StandIn:
 
     def _check(self, caller: str | None, gateway: str) -> None:
         asks = gateway if caller is None else caller
-        if asks != self._asker:
-            rule = f"only {self._asker} may request it"
+        if asks != gateway or asks not in self._askers:
+            rule = f"only {' and '.join(self._askers)} may request it"
             raise AccessDenied(who=asks, verb="call", what=f"the lease of {self._name}", rule=rule)
 
 

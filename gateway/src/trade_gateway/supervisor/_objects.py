@@ -10,7 +10,7 @@ from trade import Container, Handle, where
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway.config._children import Child
-from trade_gateway.config._tables import ContainerSpec, ObjectSpec
+from trade_gateway.config._entry import ContainerSpec, ObjectSpec
 
 __all__ = ["GROUP", "CreatedObjects", "function_of", "furnish", "lacking", "make", "name_of", "save"]
 
@@ -66,8 +66,8 @@ _MADE_S: Final = 30.0
 class CreatedObjects(NamedTuple):
     """A child with all objects of its table."""
 
-    clock: Handle
-    """The service for health checks."""
+    clock: Handle | None
+    """The service for health checks; None: a program without one."""
     made: dict[str, Handle]
     """A service of each object that may have a state, by object name."""
     problems: list[str]

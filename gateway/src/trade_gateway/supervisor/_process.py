@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -10,20 +11,26 @@ from typing import Final
 
 import msgspec
 
+from trade import Settings
+from trade._remote.error_output import last_line
+from trade._transport.credentials import user_secret
 from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
+from trade_gateway.process._program import order
 from trade_gateway.supervisor._single_instance import alone
 
 __all__ = ["Process", "rss_mb"]
 
 _LONGEST: Final = 300
 """The longest quotation of its last line, in characters."""
+_MARK: Final = "SUPERVISED_PROGRAM"
+"""A variable that all processes of a program inherit."""
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 
 
 class Process:
-    """``trade WORDS --json`` as a child process, which ends when this process ends for any reason.
+    """A child process, ``trade WORDS --json`` or a program, which ends when this process ends for any reason.
 
     Args:
         child: the child.
@@ -36,18 +43,21 @@ class Process:
     """
 
     def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: TimerLease | None = None) -> None:
-        leased = [] if term is None else ["--leased"]
         self._log = logs / f"{child.name}.log"
+        self._is_program = child.part.entry.program is not None
         self._said = b""
+        self._mark = secrets.token_hex(8)
+        self._pid = 0
+        """The process id of a program that was started; `_process` watches it."""
         errors = _fresh(self._log)
         try:
             with alone(lock) as locked:
                 self._process = subprocess.Popen(  # noqa: S603 - this very program
-                    [sys.executable, "-m", "trade_gateway", "--with-stdin", *leased, *child.part.words, "--json"],
+                    _command(child, self._log, leased=term is not None),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL if errors is None else errors,
-                    env=dict(child.environment),
+                    env={**_environment(child, logs), **({_MARK: self._mark} if self._is_program else {})},
                     start_new_session=True,  # Ctrl-C is for this process, which ends them in order
                     pass_fds=locked,
                 )
@@ -67,8 +77,8 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
+        """Its process id; of a program, the program's own."""
+        return self._pid or self._process.pid
 
     @property
     def _input(self) -> int:
@@ -97,7 +107,9 @@ class Process:
         self._said = line + ended
         if not ended:
             return None, True
-        return msgspec.json.decode(line, type=Started), True
+        started = msgspec.json.decode(line, type=Started)
+        self._pid = started.pid if self._is_program else 0
+        return started, True
 
     def stay(self, term: TimerLease) -> None:
         """Sends a lease; a process that does not read keeps the earlier one."""
@@ -109,17 +121,21 @@ class Process:
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Sends SIGKILL; the watchdogs of its devices stop their motion."""
+        """Sends SIGKILL; the watchdogs of its devices stop their motion. `close` kills what a program has started."""
         self._process.kill()
 
     def close(self) -> str:
         """Describes how it ended; to be called when `end` becomes readable."""
         os.close(self.end)
+        if self._is_program:  # the ended process is not collected yet, so that its group is no other one
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
         code = self._forget()
-        if code < 0:
-            return f"crashed (signal {-code})"
-        words = self._last_words() if code else ""
-        return f"ended (exit code {code}{f': {words}' if words else ''})"
+        if self._is_program and code < 0:  # perhaps it was killed, and has not ended what the program started
+            _kill_marked(self._mark)
+        words = self._last_words() if code > 0 or self._is_program else ""
+        said = f": {words}" if words else ""
+        return f"crashed (signal {-code}{said})" if code < 0 else f"ended (exit code {code}{said})"
 
     def _forget(self) -> int:
         code = self._process.wait()
@@ -131,10 +147,39 @@ class Process:
 
     def _last_words(self) -> str:
         try:
-            lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+            return last_line(self._log.read_text(encoding="utf-8", errors="replace"))[:_LONGEST]
         except OSError:
             return ""
-        return next((line.strip()[:_LONGEST] for line in reversed(lines) if line.strip()), "")
+
+
+def _command(child: Child, log: Path, *, leased: bool) -> list[str]:
+    entry, words = child.part.entry, child.part.words
+    if entry.program is None:
+        return [sys.executable, "-m", "trade_gateway", "--with-stdin", *["--leased"][: int(leased)], *words, "--json"]
+    asked = order(child.name, words, child.part.folder, log, entry.log_mb, entry.grace_s)
+    return [sys.executable, "-m", "trade_gateway.process._program", asked]
+
+
+def _environment(child: Child, logs: Path) -> dict[str, str]:
+    """Returns its variables; a program that opens a container gets all that the wire protocol lists."""
+    known = dict(child.environment)
+    if not child.part.entry.announces:
+        return known
+    known.setdefault("TRADE_STATE_DIR", str(logs.parent.parent))
+    known.setdefault("TRADE_IDENTITY", Settings.read(environment=known).identity)
+    if not known.get("TRADE_TLS"):
+        known.setdefault("TRADE_CREDENTIALS", ":".join(user_secret()))
+    return known
+
+
+def _kill_marked(mark: str) -> None:
+    """Kills the processes that have a program's mark, also those of other sessions."""
+    wanted = f"{_MARK}={mark}".encode()
+    for entry in os.scandir("/proc"):
+        if entry.name.isdecimal():
+            with contextlib.suppress(OSError):  # it has ended, or is another user's
+                if wanted in Path(entry.path, "environ").read_bytes().split(b"\0"):
+                    os.kill(int(entry.name), signal.SIGKILL)
 
 
 def rss_mb(pid: int) -> float:

@@ -133,7 +133,7 @@ class Life:
             return None
         self.state, self._missed = State.SILENT, self._missed + 1
         if self._missed >= self.terms.misses:
-            return self._end(now, f"it did not answer within {self.terms.answers_within_s:g} s", _After.FAILED)
+            return self._end(now, self.terms.silence, _After.FAILED)
         self.deadline = max(now, self._asked + self.terms.question_s)
         return None
 

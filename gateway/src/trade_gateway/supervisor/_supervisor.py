@@ -1,4 +1,7 @@
-"""The supervisor: one thread that starts, checks, restarts and ends child processes."""
+"""The supervisor: one thread that starts, checks, restarts and ends child processes.
+
+It has over 400 lines, since all of them run on that thread and share its state.
+"""
 
 import contextlib
 import math
@@ -23,6 +26,7 @@ from trade_gateway.supervisor._child_state import ChildInfo, News, Unit
 from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
 from trade_gateway.supervisor._objects import CreatedObjects, furnish, save
 from trade_gateway.supervisor._process import Process, rss_mb
+from trade_gateway.supervisor._program_health import await_program, epochs_of, health_problem
 from trade_gateway.supervisor._restart_policy import GRACE_S, SAVE_S, State, Transition
 from trade_gateway.supervisor._single_instance import lock_of
 from trade_gateway.supervisor._store import StateStore
@@ -105,6 +109,13 @@ class Supervisor:
         self._post(partial(self._restart, name, who))
         return True
 
+    def stop(self, name: str, who: str) -> bool:
+        """Ends a child until it is restarted by request; returns whether the name is known."""
+        if all(info.name != name for info in self._shown):
+            return False
+        self._post(partial(self._stop, name, who))
+        return True
+
     def stand_in(self, name: str) -> StandIn:
         """Returns the standby's end of a child's lease. Raises ConfigurationError if it has none."""
         unit = self._units.get(name)
@@ -113,11 +124,15 @@ class Supervisor:
             raise ConfigurationError(where=f"container {name}", problem=problem)
         return unit.lease
 
+    def leave(self) -> None:
+        """Begins to end them, as `close` does, and does not wait."""
+        self._post(self._close)
+
     def close(self) -> None:
         """Ends them in reverse order of their dependencies, after it saved their state. Idempotent."""
         if not self._thread.is_alive():
             return
-        self._post(self._close)
+        self.leave()
         self._thread.join(_ENDS_S * (len(self._units) + 1))
         for job in list(self._jobs):
             job.join(_ENDS_S)
@@ -159,7 +174,7 @@ class Supervisor:
         lease, now = unit.lease, self._clock()
         if lease is not None and unit.begun and not unit.given_up:
             unit.begun = False
-            self._do(unit, unit.life.stop(now, lease.why, save=lease.term is None))
+            self._do(unit, unit.life.stop(now, lease.why, save=lease.keeps))
         return False
 
     def _look(self, unit: Unit, now: float) -> None:
@@ -213,7 +228,7 @@ class Supervisor:
         if child.terms.lease_from:
             return Asking(child, self._member, self._post, self._complain, lock)
         if child.terms.stands_in_for:
-            return StandIn(child, self._store, lock, partial(self._post, lambda: None))
+            return StandIn(child, self._member, self._post, self._store, lock)
         return None
 
     def _restart(self, name: str, who: str) -> None:
@@ -226,6 +241,13 @@ class Supervisor:
             self._report(unit, f"{name} is restarted at the request of {who}")
             unit.begun = True
             self._do(unit, unit.life.start(self._clock()))
+
+    def _stop(self, name: str, who: str) -> None:
+        unit = self._units.get(name)
+        if unit is not None and not unit.leaving:
+            self._report(unit, f"{name} is stopped at the request of {who}")
+            unit.begun = True
+            self._do(unit, unit.life.stop(self._clock(), f"{who} stops it"))
 
     def _close(self) -> None:
         self._closing = True
@@ -255,9 +277,10 @@ class Supervisor:
     def _launch(self, unit: Unit) -> None:
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         try:
+            unit.before = epochs_of(self._member(), unit.child)
             lock, unit.sent = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
             unit.process = self._new_process(unit.child, self._folder / "logs", lock, unit.sent)
-        except OSError as none:
+        except (OSError, ConfigurationError) as none:
             self._ended(unit, f"its process could not be started: {none}")
             return
         self._selector.register(unit.process.end, selectors.EVENT_READ, partial(self._died, unit))
@@ -276,7 +299,7 @@ class Supervisor:
             self._selector.unregister(process.output)
         if started is not None:
             load = partial(self._store.load, unit.child.name) if unit.lease is None else unit.lease.load
-            self._job(unit, "furnish", partial(self._furnish, unit, unit.child, started, load))
+            self._job(unit, "furnish", partial(self._furnish, unit, unit.child, started, load, unit.boot))
 
     def _died(self, unit: Unit) -> None:
         process, unit.process = unit.process, None
@@ -313,13 +336,16 @@ class Supervisor:
         if terms.max_rss_mb is not None and (took := rss_mb(unit.process.pid)) > terms.max_rss_mb:
             self._do(unit, unit.life.fail(now, f"it took {took:.0f} MB of memory"))
             return
+        if furnished.clock is None:
+            self._job(unit, "health", partial(self._check_program, unit, unit.child))
+            return
         try:
             run = _again(self._member(), furnished.clock).with_(deadline_s=terms.question_s).start()
         except TradeError:
             self._do(unit, unit.life.missed(now))
             return
         boot = unit.boot
-        run.when_done(lambda run: self._post(partial(self._answered, unit, boot, run)))
+        run.add_done_callback(lambda run: self._post(partial(self._answered, unit, boot, run)))
 
     def _answered(self, unit: Unit, boot: int, run: Run) -> None:
         if boot != unit.boot:
@@ -329,6 +355,11 @@ class Supervisor:
             self._do(unit, unit.life.missed(now))
         else:
             unit.life.answered(now)
+
+    def _check_program(self, unit: Unit, child: Child) -> Callable[[], None]:
+        if health_problem(child):
+            return lambda: self._do(unit, unit.life.missed(self._clock()))
+        return lambda: unit.life.answered(self._clock())
 
     # --- slow work, on its own threads
 
@@ -345,9 +376,14 @@ class Supervisor:
         self._jobs.add(thread)
         thread.start()
 
-    def _furnish(self, unit: Unit, child: Child, started: Started, load: Callable[[], Any]) -> Callable[[], None]:
+    def _furnish(
+        self, unit: Unit, child: Child, started: Started, load: Callable[[], Any], boot: int
+    ) -> Callable[[], None]:
         try:
-            furnished = self._furnishes(self._member, child, started, load())
+            if child.part.entry.program is None:
+                furnished = self._furnishes(self._member, child, started, load())
+            else:
+                furnished = await_program(self._member, child, unit.before, lambda: unit.boot != boot)
         except Exception as wrong:  # noqa: BLE001 - an object may raise its own types
             why = f"it came up, but: {wrong}"
             return lambda: self._do(unit, unit.life.fail(self._clock(), why))

@@ -8,14 +8,15 @@ from typing import Any
 
 import anyio
 import pytest
+from anyio.to_thread import run_sync
 from mcp import ClientSession
 from mcp.shared.memory import create_client_server_memory_streams
 from mcp.types import CancelledNotification, CancelledNotificationParams, ClientNotification
 
 from trade import Container, Resource, service
+from trade_gateway.clients import ClientApi
 from trade_gateway.language import read_lexicon
-from trade_gateway.mcp import Approvals
-from trade_gateway.mcp._server import converse
+from trade_gateway.mcp import Approvals, Tools, converse
 
 POLICY = """
 [roles.behaviour]
@@ -131,8 +132,10 @@ async def connected(
     container: Container, *, ask_first: tuple[str, ...] = (), twin: Any = None
 ) -> AsyncGenerator[Client]:
     async with create_client_server_memory_streams() as (ours, theirs), anyio.create_task_group() as tasks:
-        approvals = Approvals(container, ask_first)
-        tasks.start_soon(converse, container, approvals, read_lexicon(), twin, *theirs, lambda: None)
+        api = ClientApi(container)
+        agent = await run_sync(api.clients.open, container.address.identity)
+        tools = Tools(container, api, agent, Approvals(container, ask_first), read_lexicon(), twin)
+        tasks.start_soon(converse, api, agent, tools, *theirs)
         async with ClientSession(*ours) as session:
             await session.initialize()
             yield Client(session)

@@ -138,6 +138,24 @@ def test_S03_a_dry_run_that_does_not_end_keeps_nothing_of_an_agent_that_is_gone(
     twin.go_on.set()
 
 
+class AttentiveTwin:
+    """Remembers where the robot is said to be."""
+
+    def call(self, _handle: Any, _args: Any, _deadline_s: float, states: Any) -> str:
+        self.states = states
+        return "tried"
+
+
+def test_a_dry_run_knows_where_each_part_of_the_robot_is(robot: Robot, agent: Container) -> None:
+    twin, robot.legs.angle = AttentiveTwin(), 0.4
+
+    async def tries(client: Client) -> None:
+        assert await client("dry_run", group="rosie.head", name="turn", args=[0.5]) == "tried"
+        assert twin.states == {"rosie.head": {"position_rad": 0.0}, "rosie.legs": {"position_rad": 0.4}}
+
+    run(tries, agent, twin=twin)
+
+
 def test_a_stop_needs_no_lock_and_ends_what_moves(robot: Robot, agent: Container) -> None:
     async def stops(client: Client) -> None:
         taken = await client("lock", group="rosie.head")

@@ -142,10 +142,10 @@ def test_a_marked_group_needs_approval_whichever_service_moves_it(
     memory.settle()
     approvals = Approvals(agent, ("rosie.head",))
     found = {(one.key.domain, one.name): one for one in agent.services(where())}
-    assert approvals.needed(found["rosie.neck.pan", "move_to"])
-    assert approvals.needed(found["lab.lamp", "turn"])
-    assert not approvals.needed(found["rosie.neck.pan", "stop"])
-    assert not approvals.needed(found["rosie.legs", "turn"])
+    assert approvals.needed("agent", found["rosie.neck.pan", "move_to"])
+    assert approvals.needed("agent", found["lab.lamp", "turn"])
+    assert not approvals.needed("agent", found["rosie.neck.pan", "stop"])
+    assert not approvals.needed("agent", found["rosie.legs", "turn"])
 
 
 def test_without_a_policy_the_command_line_marks(memory: MemorySystem, robot: Robot, agent: Container) -> None:

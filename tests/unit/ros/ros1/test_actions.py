@@ -18,7 +18,7 @@ pytestmark = pytest.mark.realtime
 
 TEST = "actionlib/action/Test"
 ENDLESS, ABORTS, HANGS = 0, -1, -2
-SUCCEEDED, PREEMPTED, ABORTED, RECALLED = 3, 2, 4, 8
+SUCCEEDED, PREEMPTED, ABORTED, REJECTED, RECALLED = 3, 2, 4, 5, 8
 
 
 def server(stand: Stand, name: str = "mover", job: str = "act") -> Peer:
@@ -216,6 +216,23 @@ def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) ->
     assert peer.wait_for("done") == {"goal": 3, "state": SUCCEEDED, "result": 3, "text": "done"}
     assert mover.came == [(3, "/planner")]
     assert began < mover.times[0] < time.monotonic()
+
+
+def test_a_client_learns_why_its_goal_is_rejected_and_the_one_before_it_continues(graph: Ros1, stand: Stand) -> None:
+    mover = Mover()
+    mover.go_on.clear()
+
+    def refuse(message: dict[str, int]) -> Outcome | None:
+        return Outcome(Ended.ABORTED, {"result": -7}, "too far") if message["goal"] > 9 else None
+
+    graph.act("/move", TEST, mover.do, refuse)
+    first = client(stand, 3)
+    wait_until(lambda: mover.came, "it has begun")
+    second = client(stand, 10, "other")
+    assert second.wait_for("done") == {"goal": 10, "state": REJECTED, "result": -7, "text": "too far"}
+    mover.go_on.set()
+    assert first.wait_for("done")["state"] == SUCCEEDED
+    assert [number for number, _ in mover.came] == [3]
 
 
 def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand: Stand) -> None:

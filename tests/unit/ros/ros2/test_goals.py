@@ -49,6 +49,22 @@ def test_a_goal_is_sent_heard_of_and_answered_in_the_bytes_of_ros(graph: Ros2, r
     assert doing.goals[0].message == {"order": 5}
 
 
+def test_a_goal_that_is_refused_is_not_accepted_and_the_one_before_it_is_not_canceled(
+    graph: Ros2, raw: zenoh.Session
+) -> None:
+    doing = Doing()
+
+    def refuse(message: dict[str, int]) -> Outcome | None:
+        return Outcome(Ended.ABORTED, {}, "too many") if message["order"] > 9 else None
+
+    graph.act("/fib11", FIBONACCI, doing, refuse)
+    assert ask(raw, "fib11", "send_goal", ID + struct.pack("<i", 5))[0] == 1
+    assert ask(raw, "fib11", "send_goal", OTHER + struct.pack("<i", 10))[0] == 0
+    doing.go_on.set()
+    assert ask(raw, "fib11", "get_result", ID) == b"\4\0\0\0" + numbers(5)
+    assert [goal.message for goal in doing.goals] == [{"order": 5}]
+
+
 def test_a_client_may_ask_for_the_result_before_there_is_one(graph: Ros2, raw: zenoh.Session) -> None:
     doing = Doing()
     graph.act("/fib2", FIBONACCI, doing)

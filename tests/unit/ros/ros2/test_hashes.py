@@ -120,5 +120,5 @@ def test_services_have_the_hashes_that_another_package_gives_them(
 
 
 def test_a_type_that_is_not_known_is_refused(hashes: Hashes) -> None:
-    with pytest.raises(ConfigurationError, match="put its definition in a folder of types"):
+    with pytest.raises(ConfigurationError, match="Put its definition in a folder of types"):
         hashes.message("missing/msg/Unknown")

@@ -8,11 +8,13 @@ from typing import Any, Final
 from msgspec import structs
 
 from trade._protocol.codec import Codec
-from trade._protocol.messages import EMPTY, MOST_BYTES, Call, ServiceInfo, encode_message
+from trade._protocol.messages import EMPTY, LARGE, MOST_BYTES, Call, LargeBytes, ServiceInfo, encode_message
 from trade._services.signature import too_many
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
 
 _UNSENDABLE: Final = (TypeError, ValueError, OverflowError, RecursionError)
+
+_EMPTY_BYTES: Final = len(encode_message(b""))
 
 
 class ArgumentEncoder:
@@ -51,6 +53,19 @@ class ArgumentEncoder:
             if len(data) - frame > MOST_BYTES:
                 raise self._too_large(len(data) - frame)
         return data
+
+    def encode_parts(self, call: Call) -> tuple[bytes, ...]:
+        """The same in parts. If the last argument is large bytes, it is a part itself and not copied."""
+        args: Any = call.args
+        values: tuple[Any, ...] = args if type(args) is tuple else ()
+        last = values[-1] if values else None
+        if type(last) is not bytes or len(last) < LARGE:
+            return (self.encode_call(call),)
+        data, large = self.encode_call(structs.replace(call, args=(*values[:-1], b""))), LargeBytes(last)
+        if len(data) + len(last) > MOST_BYTES:
+            return (self.encode_call(call),)  # which looks at the limit more closely
+        end = len(data) - len(encode_message(call.behalf))
+        return data[: end - _EMPTY_BYTES] + large.head, last, data[end:]
 
     def _too_large(self, size: int) -> TooLarge:
         return TooLarge(service=self._label, what="arguments", size_bytes=size, limit_bytes=MOST_BYTES)

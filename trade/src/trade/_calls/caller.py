@@ -10,15 +10,17 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from msgspec import Raw, structs
 
-from trade._calls.peer import NEVER, CallPublishers, OnReply, Peer, Pending, ReplySlot, Route
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, reply_key
+from trade._calls.arguments import ArgumentEncoder
+from trade._calls.local_path import LocalPath, LocalSlot, LocalStarter
+from trade._calls.peer import CallPublishers, OnReply, Peer, Pending, ReplySlot, Route, Slot, ended
+from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, call_key, reply_key
 from trade._protocol.messages import (
     CANCEL,
-    EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,
     Call,
@@ -31,17 +33,32 @@ from trade._protocol.messages import (
     encode_message,
 )
 from trade._telemetry.spans import Spans
+from trade._threads.alarm import NEVER, Alarm
+from trade._threads.condition import InterruptibleCondition
 from trade._transport.base import ChannelClosed, Message, Publisher, Transport
+from trade._transport.local_connection import ConnectionEnded
 
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0
+_GRANTING: Final = frozenset(("acquire", "renew"))
+"""The services of locks whose answer counts only while its connection lasts: a callee that loses this container breaks
+its connections off before it ends its locks. A process that was frozen would else take an old answer for a lock, which
+another client has by now. For the same reason such a call is not sent again."""
+_NEVER_RAN: Final = (Status.UNSENT, Status.BUSY, Status.GONE)
 
 
 class Caller:
-    """Sends the calls of one container."""
+    """Sends the calls of one container.
 
-    def __init__(self, transport: Transport, own: Address) -> None:
+    Args:
+        transport: carries its calls.
+        own: the container.
+        local: carries its calls to containers of this host; none: the transport carries them, too.
+    """
+
+    def __init__(self, transport: Transport, own: Address, local: LocalPath | None = None) -> None:
         self._transport = transport
+        self._local = local
         self.own: Final = own
         """The container that calls."""
         self.session: Final = str(own)
@@ -59,12 +76,13 @@ class Caller:
         self._closed = False
         self.leaving = False
         """Whether its container closes: the callees see that, and end its calls."""
-        self._next_deadline_ns: float = NEVER
-        self._sooner = threading.Event()
+        self.clock: Final = transport.clock
+        """The clock of its deadlines."""
+        self._deadlines = Alarm("trade-deadlines", self._end_overdue, transport.clock)
         self.malformed = 0
         self.spans: Spans | None = None
         """Records its calls while this container is traced."""
-        self._spawn("trade-deadlines", self._watch_deadlines)
+        self._deadlines.start()
 
     @property
     def closed(self) -> bool:
@@ -77,6 +95,18 @@ class Caller:
         """Another container; one without a liveliness token counts as lost."""
         return self._peers.get(address) or Peer(address, lost=True)
 
+    def answers(self, address: Address) -> int:
+        """The number of calls that a container has answered since it appeared."""
+        return self.peer(address).answers
+
+    def route(
+        self, peer: Peer, domain: str, provider: str, *, stop: bool, arguments: ArgumentEncoder | None = None
+    ) -> Route:
+        """How calls reach a provider there. Raises ChannelClosed if the transport is closed."""
+        key = call_key(self.own.identity, peer.address, domain, provider, stop=stop)
+        middleware = (domain, provider) == (DOMAIN, PROVIDER)
+        return Route(peer, self.publishers.get(key, stop=stop), key.encode(), stop, arguments, middleware)
+
     # --- calling
 
     def new_call(self, service: str, args: Raw) -> Call:
@@ -84,26 +114,117 @@ class Caller:
         return Call(PROTOCOL, self.new_id(), service, "", self.session, None, (), args)
 
     def ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
-        """Sends a call and waits for its reply, which always comes, at the deadline from this container itself."""
+        """Sends a call and waits for its reply, which always comes, at the deadline from this container itself.
+
+        The deadline is a time of its clock, as for `start` and `cancel`.
+        """
+        peer = route.peer
+        local = peer.local
+        if local is None:
+            return self._ask(call, route, deadline_ns)
+        if peer.unarrived and not route.stops and not self._reads_replies():
+            before = tuple(peer.unarrived)
+            reply = (self._ask_behind if local.starts() else self._ask)(call, route, deadline_ns)
+            if reply.status < Status.TIMED_OUT:
+                peer.unarrived.difference_update(before)
+            return reply
+        slot = local.borrow(deadline_ns, stops=route.stops)
+        if slot is None:
+            return self._ask(call, route, deadline_ns)
+        try:
+            return self._ask_locally(slot, call, route, deadline_ns)
+        finally:
+            slot.waiting = None
+            local.take_back(slot)
+
+    def _reads_replies(self) -> bool:
+        """Whether this is a thread that the replies of started calls need, in the callback of one."""
+        return threading.current_thread() in (self._deadlines.thread, *self._threads)
+
+    def _ask_behind(self, call: Call, route: Route, deadline_ns: int) -> Reply:
+        """The same on the way that started calls took, so that it arrives after them."""
+        replies: list[Reply] = []
+        answered = InterruptibleCondition()
+
+        def heard(reply: Reply) -> None:
+            replies.append(reply)
+            answered.notify_all()
+
+        self.start(call, route, deadline_ns, heard)
+        answered.wait_for(lambda: bool(replies), None)
+        return replies[0]
+
+    def _ask_locally(self, slot: LocalSlot, call: Call, route: Route, deadline_ns: int) -> Reply:
+        """The same on a connection, or on the transport if that breaks."""
+        peer = route.peer
+        call.reply = slot.name
+        parts = route.encode_parts(call)
+        self._wait_with(slot, (call.id, peer, deadline_ns))
+        if peer.lost or self._closed:
+            return ended(call.id, Status.UNSENT)
+        sent_ns = time.monotonic_ns()
+        try:
+            slot.whole = False
+            slot.connection.send(*parts, key=route.key)
+            reply = self._await_locally(slot, call.id)
+            if _grants(call, route) and slot.connection.ended_there:
+                raise ConnectionEnded
+            slot.whole = slot.answered = True
+        except ConnectionEnded:
+            if slot.ended_id == call.id:
+                return ended(call.id, slot.ended_status)
+            if _grants(call, route):
+                return ended(call.id, Status.LOST)
+            return self._ask_again(decode_call(b"".join(parts)), route, deadline_ns)
+        peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
+        return reply
+
+    def _ask_again(self, call: Call, route: Route, deadline_ns: int) -> Reply:
+        """Sends a call on the transport that may have been sent already."""
+        again = Route(route.peer, route.publisher, route.key, stops=route.stops)
+        return self._of_repeated(self._ask(call, again, deadline_ns))
+
+    def _of_repeated(self, reply: Reply) -> Reply:
+        """The reply to a call that was sent twice: where the second one did not run, the first one may have."""
+        if reply.status in _NEVER_RAN:
+            return ended(reply.id, Status.CLOSED if self._closed else Status.LOST)
+        return reply
+
+    def _await_locally(self, slot: LocalSlot, call_id: int) -> Reply:
+        """Waits for the answer; a blocking caller does not read progress. Raises ConnectionEnded."""
+        while True:
+            try:
+                reply = decode_reply(slot.connection.receive()[1])
+            except Malformed as bad:
+                self._note_malformed(slot.name, bad)
+                raise ConnectionEnded from None
+            if reply.id == call_id and reply.status < Status.PROGRESS:
+                return reply
+
+    def _wait_with(self, slot: Slot, waiting: tuple[int, Peer, int]) -> None:
+        slot.waiting = waiting
+        if waiting[2] < self._deadlines.next_ns:
+            self._deadlines.ring()
+
+    def _ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
+        """The same on the transport."""
         try:
             box = self._borrow()
         except ChannelClosed:
-            return _ended(call.id, Status.UNSENT)
+            return ended(call.id, Status.UNSENT)
         peer, publisher = route.peer, route.publisher
         try:
             call.reply = box.name
             data = route.encode(call)
             box.sent = (publisher, data)
-            box.waiting = (call.id, peer, deadline_ns)
-            if deadline_ns < self._next_deadline_ns:
-                self._sooner.set()
+            self._wait_with(box, (call.id, peer, deadline_ns))
             if peer.lost or self._closed:
-                return _ended(call.id, Status.UNSENT)
+                return ended(call.id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
             publisher.put(data)
             return self._await_reply(box, call.id, peer, sent_ns)
         except ChannelClosed:  # the publisher closed with its provider, or the whole container closes
-            return _ended(call.id, Status.UNSENT)
+            return ended(call.id, Status.UNSENT)
         finally:
             box.waiting = box.sent = None
             self._free.append(box)
@@ -113,7 +234,7 @@ class Caller:
             try:
                 message = box.channel.receive()
             except ChannelClosed:
-                return _ended(call_id, Status.CLOSED)
+                return ended(call_id, Status.CLOSED)
             reply = self._decode(message)
             if reply is None or reply.id != call_id or not self._may_answer(message, peer, reply):
                 continue
@@ -131,30 +252,94 @@ class Caller:
         self, call: Call, route: Route, deadline_ns: int, on_reply: OnReply, on_progress: OnReply | None = None
     ) -> None:
         """Sends a call without waiting; the callbacks get its reply and progress on another thread."""
+        peer, publisher = route.peer, route.publisher
+        local = peer.local
+        starter = None if local is None else local.starter(deadline_ns, stops=route.stops, begin=self._begin_reading)
         try:
-            call.reply = self._shared_box().name
+            call.reply = self._shared_box().name if starter is None else starter.name
         except ChannelClosed:
-            on_reply(_ended(call.id, Status.UNSENT))
+            on_reply(ended(call.id, Status.UNSENT))
             return
-        peer, publisher, data = route.peer, route.publisher, route.encode(call)
-        self._pending[call.id] = Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
-        if deadline_ns < self._next_deadline_ns:
-            self._sooner.set()
+        data = route.encode(call)
+        grants, sent = _grants(call, route), (publisher, data)
+        pending = Pending(peer, deadline_ns, on_reply, on_progress, sent, starter, grants=grants)
+        self._pending[call.id] = pending
+        if deadline_ns < self._deadlines.next_ns:
+            self._deadlines.ring()
         if peer.lost or self._closed:
-            self._finish(_ended(call.id, Status.UNSENT))
+            self._finish(ended(call.id, Status.UNSENT))
             return
         try:
-            publisher.put(data)
+            if starter is None:
+                publisher.put(data)
+            else:
+                starter.send(data, route.key)
+            if local is not None and not route.stops and call.id in self._pending:
+                peer.unarrived.add(call.id)
         except ChannelClosed:
-            self._finish(_ended(call.id, Status.UNSENT))
+            self._finish(ended(call.id, Status.UNSENT))
+        except ConnectionEnded:
+            self._start_again(call.id, pending, starter)
+
+    def _start_again(self, call_id: int, pending: Pending, starter: LocalStarter | None) -> None:
+        """Sends a started call on the transport, after the connection that it took has ended."""
+        if pending.grants:
+            self._finish(ended(call_id, Status.LOST))
+            return
+        with self._lock:
+            if pending.starter is not starter or call_id not in self._pending:  # another thread does, or it has ended
+                return
+            pending.starter, pending.again = None, True
+        publisher, data = pending.sent
+        call = decode_call(data)
+        try:
+            if not (pending.peer.lost or self._closed):
+                call.reply = self._shared_box().name
+                data = encode_message(call)
+                pending.sent = (publisher, data)
+                publisher.put(data)
+                return
+        except ChannelClosed:
+            _logger.debug("%s is not sent again, because its provider is gone", call.service)
+        self._finish(ended(call_id, Status.UNSENT))
+
+    def _begin_reading(self, starter: LocalStarter) -> None:
+        self._spawn("trade-local-replies", lambda: self._read_started(starter))
+
+    def _read_started(self, starter: LocalStarter) -> None:
+        try:
+            while True:
+                reply = self._decode(Message(starter.name, starter.receive()))
+                pending = None if reply is None else self._pending.get(reply.id)
+                if reply is None or pending is None or pending.starter is not starter:
+                    continue
+                if pending.grants and starter.ended_there:
+                    return
+                if reply.status < Status.TIMED_OUT:  # only this container ends a wait itself
+                    self._take_reply(reply, pending)
+        except (ConnectionEnded, Malformed):
+            return
+        finally:
+            starter.end()
+            for call_id, pending in self._pending.copy().items():
+                if pending.starter is starter:
+                    self._start_again(call_id, pending, starter)
+            with self._lock, suppress(ValueError):
+                self._threads.remove(threading.current_thread())
+
+    def _take_reply(self, reply: Reply, pending: Pending) -> None:
+        if reply.status != Status.PROGRESS:
+            self._finish(reply)
+        elif pending.on_progress is not None:
+            pending.on_progress(reply)
 
     def cancel(self, peer: Peer, call_id: int, service: str, deadline_ns: int) -> None:
         """Asks the callee to end a call, or not to begin it; does not wait."""
-        now = time.monotonic_ns()
+        now = self.clock.now_ns()
         if call_id not in self._pending or now >= deadline_ns:
             return
         asked = Raw(encode_message(CancelArguments(call_id, service, min(86_400.0, (deadline_ns - now) / 1e9))))
-        route = Route(peer, self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=True))
+        route = self.route(peer, DOMAIN, PROVIDER, stop=True)
         self.start(self.new_call(CANCEL, asked), route, now + int(_CANCEL_S * 1e9), lambda _: None)
 
     # --- sending again
@@ -165,11 +350,12 @@ class Caller:
         The callee runs no id twice. Its clock is requested first, as it may have been suspended meanwhile.
         """
         sent = [box.sent for box in list(self._every) if box.waiting is not None and box.waiting[1] is peer]
-        sent += [pending.sent for pending in list(self._pending.values()) if pending.peer is peer]
+        started = [pending for pending in list(self._pending.values()) if pending.peer is peer]
+        sent += [pending.sent for pending in started if pending.starter is None]
         due = [one for one in sent if one is not None]
         if due:
-            clock = Route(peer, self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=False))
-            soon = time.monotonic_ns() + int(_CANCEL_S * 1e9)
+            clock = self.route(peer, DOMAIN, PROVIDER, stop=False)
+            soon = self.clock.now_ns() + int(_CANCEL_S * 1e9)
 
             def clock_heard(reply: Reply) -> None:
                 if reply.status == Status.OK:
@@ -184,7 +370,7 @@ class Caller:
             return
         expires_ns = call.expires_ns
         if expires_ns is not None:
-            expires_ns = min(expires_ns, peer.expiry_ns(deadline_ns) or 0)
+            expires_ns = min(expires_ns, peer.expiry_ns(deadline_ns - self.clock.ahead_ns) or 0)
         try:
             publisher.put(encode_message(structs.replace(call, expires_ns=expires_ns)))
         except ChannelClosed:
@@ -201,6 +387,9 @@ class Caller:
         pending = self._pending.pop(reply.id, None)
         if pending is None:
             return
+        pending.peer.unarrived.discard(reply.id)
+        if pending.again:
+            reply = self._of_repeated(reply)
         if reply.status < Status.TIMED_OUT:
             pending.peer.heard(reply.clock_ns, pending.sent_ns, time.monotonic_ns())
         try:
@@ -221,7 +410,8 @@ class Caller:
             index = f"{self.own.epoch}-{len(self._every)}"  # another container may have the same name
             key = reply_key("*", self.own.identity, self.own.container, index)
             own = reply_key(self.own.identity, self.own.identity, self.own.container, index)
-            box = ReplySlot(f"{self.own.container}/{index}", own, self._transport.subscribe(key))
+            name = f"{self.own.container}/{index}"
+            box = ReplySlot(name, self._transport, own, self._transport.subscribe(key))
             self._every.append(box)
             return box
 
@@ -231,7 +421,11 @@ class Caller:
             with self._lock:
                 if self._shared is None:
                     self._shared = box
-                    self._spawn("trade-replies", self._read_shared)
+                    try:
+                        self._spawn("trade-replies", self._read_shared)
+                    except RuntimeError:
+                        self._shared = None
+                        raise
                     return box
             self._free.append(box)
         return self._shared
@@ -247,19 +441,19 @@ class Caller:
             pending = self._pending.get(reply.id) if reply is not None else None
             if reply is None or pending is None or not self._may_answer(message, pending.peer, reply):
                 continue
-            if reply.status != Status.PROGRESS:
-                self._finish(reply)
-            elif pending.on_progress is not None:
-                pending.on_progress(reply)
+            self._take_reply(reply, pending)
 
     def _decode(self, message: Message) -> Reply | None:
         try:
             return decode_reply(message.payload or b"")
         except Malformed as bad:
-            self.malformed += 1
-            if self.malformed == 1:
-                _logger.warning("dropped an answer on %s: %s", message.key, bad)
+            self._note_malformed(message.key, bad)
             return None
+
+    def _note_malformed(self, where: str, bad: Malformed) -> None:
+        self.malformed += 1
+        if self.malformed == 1:
+            _logger.warning("dropped an answer on %s: %s", where, bad)
 
     # --- ends without an answer
 
@@ -269,51 +463,53 @@ class Caller:
         A lost peer is forgotten with its clock, which may stop while it is unreachable, as on a suspended computer.
         """
         if back:
-            self.resend(self._peers.setdefault(address, Peer(address)))
+            local = None if self._local is None else self._local.to(address)
+            self.resend(self._peers.setdefault(address, Peer(address, local=local)))
         elif (peer := self._peers.pop(address, None)) is not None:
             peer.lost = True
+            peer.close()
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 
-    def _watch_deadlines(self) -> None:
-        while not self._closed:
-            self._sooner.clear()
-            self._next_deadline_ns = NEVER  # a call that starts during the scan wakes this thread
-            now = time.monotonic_ns()
-            self._end_overdue(now)
-            soonest = min(self._deadlines(), default=NEVER)
-            self._next_deadline_ns = soonest
-            self._sooner.wait(None if soonest == NEVER else max(0.0, (soonest - now) / 1e9))
-
-    def _deadlines(self) -> list[int]:
-        waiting = [(box.waiting, box.ended_id) for box in list(self._every)]
-        blocked = [call[2] for call, ended_id in waiting if call is not None and call[0] != ended_id]
-        return blocked + [pending.deadline_ns for pending in list(self._pending.values())]
-
-    def _end_overdue(self, now_ns: int) -> None:
+    def _end_overdue(self) -> float:
+        """Ends the calls that are too late; returns the next deadline."""
+        now_ns = self.clock.now_ns()
+        self.clock.give_time(lambda: self._next_deadline_ns() <= now_ns)
         self._end(lambda _, deadline_ns: deadline_ns <= now_ns, Status.TIMED_OUT)
+        return self._next_deadline_ns()
+
+    def _next_deadline_ns(self) -> float:
+        waiting = [(slot.waiting, slot.ended_id) for slot in self._slots()]
+        blocked = [call[2] for call, ended_id in waiting if call is not None and call[0] != ended_id]
+        return min(blocked + [pending.deadline_ns for pending in list(self._pending.values())], default=NEVER)
 
     def _end(self, meant: Callable[[Peer, float], bool], status: int) -> None:
-        for box in list(self._every):
-            waiting = box.waiting
+        for slot in self._slots():
+            waiting = slot.waiting
             if waiting is None:
                 continue
             call_id, peer, deadline_ns = waiting
-            if call_id != box.ended_id and meant(peer, deadline_ns):
-                box.ended_id = call_id
-                self._transport.wake(box.wake_key, encode_message(_ended(call_id, status)))
+            if call_id != slot.ended_id and meant(peer, deadline_ns):
+                slot.end(call_id, status)
         for call_id, pending in self._pending.copy().items():  # list(...items()) is not atomic
             if meant(pending.peer, pending.deadline_ns):
-                self._finish(_ended(call_id, status))
+                self._finish(ended(call_id, status))
+
+    def _slots(self) -> list[Slot]:
+        return [*self._every, *(() if self._local is None else self._local.slots)]
 
     def _spawn(self, name: str, target: Callable[[], None]) -> None:
         thread = threading.Thread(target=target, name=name, daemon=True)
         self._threads.append(thread)
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:  # the process may have no more threads
+            self._threads.remove(thread)
+            raise
 
     def finish_stops(self, limit_s: float) -> None:
         """Waits, as the container closes, until no stop is under way, at most ``limit_s`` seconds."""
         self.leaving = True
-        if threading.current_thread() in self._threads:  # the thread that their replies need
+        if self._reads_replies():
             return
         until = time.monotonic() + limit_s
         while self._stopping() and time.monotonic() < until:
@@ -321,26 +517,34 @@ class Caller:
 
     def _stopping(self) -> bool:
         sent = [box.sent for box in list(self._every)] + [pending.sent for pending in list(self._pending.values())]
-        return any(one is not None and self.publishers.of_stops(one[0]) for one in sent)
+        local = () if self._local is None else list(self._local.slots)
+        return any(one is not None and self.publishers.of_stops(one[0]) for one in sent) or any(
+            slot.stops and slot.waiting is not None for slot in local
+        )
 
     def close(self) -> None:
         """Ends every wait and every thread. Idempotent."""
         self._closed = True
-        self._sooner.set()
         self._end(lambda _peer, _deadline: True, Status.CLOSED)
         self._wait_until_free(time.monotonic() + 2)
         for box in list(self._every):
             box.channel.close()
-        for thread in self._threads:
+        if self._local is not None:
+            self._local.close()
+        for peer in list(self._peers.values()):
+            peer.close()
+        self._deadlines.close()
+        for thread in list(self._threads):
             if thread is not threading.current_thread():
                 thread.join(2)
         self.publishers.close()
 
     def _wait_until_free(self, deadline: float) -> None:
         """Waits until no thread is inside the transport: otherwise the end of the interpreter would abort it."""
-        while any(box.waiting is not None for box in list(self._every)) and time.monotonic() < deadline:
+        while any(slot.waiting is not None for slot in self._slots()) and time.monotonic() < deadline:
             time.sleep(0.001)
 
 
-def _ended(call_id: int, status: int) -> Reply:
-    return Reply(PROTOCOL, call_id, status, 0, EMPTY)
+def _grants(call: Call, route: Route) -> bool:
+    """Whether its answer may grant a lock, or renew one."""
+    return route.middleware and call.service in _GRANTING

@@ -1,24 +1,38 @@
 """Handles: values that name one service of one epoch."""
 
 import asyncio
+import inspect
 import logging
 import operator
 from collections.abc import Callable, Mapping
 from contextvars import Context
 from types import MappingProxyType
-from typing import Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, Generic, NoReturn, ParamSpec, Protocol, TypeVar, cast
 
 import msgspec
 
 from trade._calls.run import Run
 from trade._protocol.codec import Codec
 from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import Scalar, encode_message
-from trade._protocol.schema import read_schema
+from trade._protocol.messages import Parameter, Scalar, encode_message
+from trade._protocol.schema import read_schema, schema_name
 from trade._registry.registry import Record
 from trade.errors import ConfigurationError
 
-__all__ = ["Bound", "Handle"]
+__all__ = ["Bound", "Handle", "handle_of", "start_call"]
+
+if TYPE_CHECKING:
+    from typing_extensions import ParamSpec as ParamSpecWithDefault  # every type checker has it
+    from typing_extensions import TypeVar as TypeVarWithDefault
+
+    _Arguments = ParamSpecWithDefault("_Arguments", default=...)
+    _Result = TypeVarWithDefault("_Result", default=Any)
+else:
+    _Arguments = ParamSpec("_Arguments")
+    _Result = TypeVar("_Result")
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 _logger = logging.getLogger("trade")
 
@@ -45,11 +59,28 @@ class CallHost(Protocol):
     def asked_for(self, handle: "Handle") -> tuple[str, tuple[str, ...]]: ...
 
 
-class Handle:
+class _Doc:
+    """The docstring of a class, and of each object the docstring of its service."""
+
+    def __init__(self, of_class: str | None) -> None:
+        self._of_class = of_class
+
+    def __get__(self, handle: "Handle | None", owner: type) -> str | None:
+        record = None if handle is None else handle.last_record
+        if record is None:
+            return self._of_class
+        info = record.info
+        return "\n\n".join(filter(None, (info.signature, info.doc, info.conditions)))
+
+
+class Handle(Generic[_Arguments, _Result]):
     """One service of one epoch: call it, compare it, keep it, pass it as an argument or a result.
 
-    A call raises ServiceGone after the service was deregistered, or its container ended or restarted.
+    A call raises ServiceGone after the service was deregistered, or its container ended or restarted. Type checkers
+    know its arguments and its result if it belongs to a class that ``trade stubs`` wrote.
     """
+
+    __doc__ = _Doc(__doc__)  # pyright: ignore[reportAssignmentType]  # for help() and shells
 
     __slots__ = ("_deadline_s", "_home", "_record", "key")
     __trade_type__: Final = "Handle"
@@ -64,15 +95,15 @@ class Handle:
 
     # --- calling
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         """Calls the service and waits for the result, at most until the deadline."""
         return self._home.invoke(self, args, kwargs, self._deadline_s)
 
-    def start(self, *args: Any, **kwargs: Any) -> Run:
+    def start(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> "Run[_Result]":
         """Calls the service without waiting."""
         return self._home.begin(self, args, kwargs, self._deadline_s)
 
-    async def acall(self, *args: Any, **kwargs: Any) -> Any:
+    async def acall(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         """Calls the service from asyncio. Cancelling the waiting task cancels the call, see `Run.cancel`."""
         run = self.start(*args, **kwargs)
         try:
@@ -87,7 +118,7 @@ class Handle:
         level = logging.DEBUG if self._home.closed else logging.WARNING
         _logger.log(level, "%s could not be cancelled: %s: %s", self.label, type(error).__name__, error)
 
-    def with_(self, *, deadline_s: float) -> "Handle":
+    def with_(self, *, deadline_s: float) -> "Handle[_Arguments, _Result]":
         """The same service with other options for its calls.
 
         Args:
@@ -98,7 +129,7 @@ class Handle:
             raise ConfigurationError(problem=problem)
         return Handle(self._home, self.key, self._record, deadline_s)
 
-    def bind(self, *args: Any, **kwargs: Any) -> "Bound":
+    def bind(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> "Bound":
         """The call as a value, to be made later; its arguments are checked then."""
         return Bound(self, args, kwargs)
 
@@ -156,6 +187,15 @@ class Handle:
         return self.record.info.signature
 
     @property
+    def __signature__(self) -> inspect.Signature:
+        """The parameters, for `inspect.signature` and shells; the types are texts."""
+        info = self.record.info
+        schema = read_schema(info.arguments_schema)
+        return inspect.Signature(
+            [_parameter(one, schema.get("properties", {}).get(one.name, {})) for one in info.parameters]
+        )
+
+    @property
     def doc(self) -> str:
         """The method's docstring."""
         return self.record.info.doc
@@ -169,6 +209,11 @@ class Handle:
     def resources(self) -> tuple[str, ...]:
         """The resources that it needs exclusively."""
         return self.record.info.uses
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Its pre-conditions."""
+        return self.record.info.needs
 
     @property
     def achieves(self) -> tuple[str, ...]:
@@ -240,6 +285,14 @@ class Handle:
         return f"<Handle {self.label} in {self.container}>"
 
 
+def _parameter(described: Parameter, schema: Mapping[str, Any]) -> inspect.Parameter:
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    if described.keyword_only or described.positional_only:
+        kind = inspect.Parameter.KEYWORD_ONLY if described.keyword_only else inspect.Parameter.POSITIONAL_ONLY
+    default = inspect.Parameter.empty if described.required else schema.get("default", ...)
+    return inspect.Parameter(described.name, kind, default=default, annotation=schema_name(schema))
+
+
 class Bound:
     """A bound call: a handle with arguments. Call it, compare it, put it into a sequence."""
 
@@ -281,6 +334,40 @@ class Bound:
         return f"<Bound {self.handle.label}({', '.join(given)}) in {self.handle.container}>"
 
 
+def handle_of(service: Callable[_P, _R], /) -> Handle[_P, _R]:
+    """The handle of a service that type checkers know as a method: ``handle_of(arm.move_line).with_(deadline_s=60)``.
+
+    Args:
+        service: a service of an object that ``trade.find(JointGroup)`` returned, or a handle.
+
+    Raises:
+        ConfigurationError: it is no service.
+    """
+    return cast("Handle[_P, _R]", service_of(service, "trade.handle_of"))
+
+
+def start_call(service: Callable[_P, _R], /, *args: _P.args, **kwargs: _P.kwargs) -> Run[_R]:
+    """Calls a service without waiting: what ``service.start(...)`` does, with the types of its class.
+
+    Args:
+        service: a service of an object that ``trade.find(JointGroup)`` returned, or a handle.
+        args: its positional arguments.
+        kwargs: its arguments by name.
+
+    Raises:
+        ConfigurationError: it is no service.
+    """
+    return service_of(service, "trade.start_call").start(*args, **kwargs)
+
+
+def service_of(service: object, function: str) -> Handle:
+    """A service that is typed as a method, as the handle that it is. Raises ConfigurationError for anything else."""
+    if not isinstance(service, Handle):
+        problem = f"give a service that trade.find or trade.robot returned, not {service!r}"
+        raise ConfigurationError(where=function, problem=problem)
+    return cast("Handle", service)
+
+
 def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[ServiceKey], Handle]) -> Codec:
     """A codec whose handles travel as the keys of their services.
 
@@ -291,7 +378,7 @@ def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[Se
 
     def to_data(value: Any) -> Any:
         if isinstance(value, Handle):
-            return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(value)))
+            return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(cast("Handle", value))))
         if isinstance(value, float):  # a subclass of float, as in arrays
             return float(value)
         if hasattr(value, "__index__"):

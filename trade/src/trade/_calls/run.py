@@ -6,22 +6,33 @@ import logging
 from collections.abc import Callable, Generator
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic
 
 from trade._context.active_calls import ActiveCall, end_calls
 from trade._threads.condition import InterruptibleCondition
 from trade.errors import OutcomeUnknown
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeVar  # every type checker has it
+
     from trade._calls.handle import Handle
+
+    _Result = TypeVar("_Result", default=Any)
+else:
+    from typing import TypeVar
+
+    _Result = TypeVar("_Result")
 
 __all__ = ["Run"]
 
 _logger = logging.getLogger("trade")
 
 
-class Run:
-    """A call under way. Wait with ``result()`` or ``await``; it ends at its deadline at the latest."""
+class Run(Generic[_Result]):
+    """A call under way. Wait with ``result()`` or ``await``; it ends at its deadline at the latest.
+
+    Type checkers know the type of its result if the call was made with `trade.start_call`.
+    """
 
     def __init__(self, handle: "Handle") -> None:
         self._handle = handle
@@ -38,7 +49,7 @@ class Run:
         state = "under way" if self._outcome is None else "ended" if self._outcome[1] is None else "failed"
         return f"<Run of {self._handle.label}, {state}>"
 
-    def result(self, timeout_s: float | None = None) -> Any:
+    def result(self, timeout_s: float | None = None) -> _Result:
         """Returns the service's result, or raises its error.
 
         Args:
@@ -67,7 +78,7 @@ class Run:
             raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it continues")
         return self._outcome
 
-    def when_done(self, tell: "Callable[[Run], object]") -> None:
+    def add_done_callback(self, tell: "Callable[[Run], object]") -> None:
         """Calls this when the run has ended, on the thread that notices it; at once if it has."""
         self._done_callbacks.append(tell)
         if self._outcome is not None:
@@ -111,7 +122,7 @@ class Run:
                 self._handle.log_not_cancelled(error)
 
         if self._handle.record.info.cancel is not None:
-            self._handle.cancel_service().start().when_done(look)
+            self._handle.cancel_service().start().add_done_callback(look)
 
     def _soon(self, do: Callable[[], None]) -> None:
         try:
@@ -190,7 +201,7 @@ class Run:
                 end_calls([partial(around.run, call_off)])
 
         forget = outer.on_cancel(end)
-        self.when_done(look)
+        self.add_done_callback(look)
         return forget
 
     async def settled(self) -> None:
@@ -201,12 +212,12 @@ class Run:
             with contextlib.suppress(RuntimeError):  # that loop has ended
                 loop.call_soon_threadsafe(ended.set)
 
-        self.when_done(tell)
+        self.add_done_callback(tell)
         await ended.wait()
 
-    def __await__(self) -> Generator[Any, None, Any]:
+    def __await__(self) -> Generator[Any, None, _Result]:
         return self._awaited().__await__()
 
-    async def _awaited(self) -> Any:
+    async def _awaited(self) -> _Result:
         await self.settled()
         return self.result()

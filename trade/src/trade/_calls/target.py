@@ -11,7 +11,7 @@ from msgspec import Raw
 
 from trade._calls.arguments import ArgumentEncoder
 from trade._calls.caller import Caller
-from trade._calls.peer import Peer, Route
+from trade._calls.peer import Peer
 from trade._calls.run import Run
 from trade._context.active_calls import ActiveCall
 from trade._context.call_context import CallContext, patience_s, running
@@ -48,6 +48,7 @@ from trade.errors import (
     OutcomeUnknown,
     RemoteError,
     ServiceGone,
+    as_never_ran,
 )
 
 _logger = logging.getLogger("trade")
@@ -181,9 +182,8 @@ class RemoteTarget:
         self._peer: Peer = caller.peer(address)
         self.is_stop = record.info.effect == "stop"
         self._arguments = ArgumentEncoder(codec, record.info, record.label)
-        publisher = caller.publishers.get(address, key.domain, key.provider, stop=self.is_stop)
-        self._route = Route(self._peer, publisher, self._arguments)
-        self._clock = Route(self._peer, caller.publishers.get(address, DOMAIN, PROVIDER, stop=False))
+        self._route = caller.route(self._peer, key.domain, key.provider, stop=self.is_stop, arguments=self._arguments)
+        self._clock = caller.route(self._peer, DOMAIN, PROVIDER, stop=False)
         self._decode = result_decoder(codec, known or record.info)
         self._decode_any = codec.decoder(Any)
         self._traceable = traceable(key)
@@ -195,12 +195,13 @@ class RemoteTarget:
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
         """Makes the call of a request."""
         values = self._values(args, kwargs, request)
+        deadline_ns = request.deadline_ns + self._caller.clock.ahead_ns
         if not self._may_go:
-            reply = self._caller.ask(self._clock_call(request), self._clock, request.deadline_ns)
+            reply = self._caller.ask(self._clock_call(request), self._clock, deadline_ns)
             if reply.status != Status.OK:
                 raise self._not_begun(reply, request)
         call = self._call(values, request)
-        return self._unpack(self._caller.ask(call, self._route, request.deadline_ns), request)
+        return self._unpack(self._caller.ask(call, self._route, deadline_ns), request)
 
     def begin(
         self,
@@ -213,14 +214,15 @@ class RemoteTarget:
     ) -> None:
         """Makes the call without waiting; the run gets its outcome."""
         values = self._values(args, kwargs, request)
+        deadline_ns = request.deadline_ns + self._caller.clock.ahead_ns
 
         def go() -> None:
             if run.cancelling:
                 run.fail(Cancelled(service=self._label))
                 return
             call = self._call(values, request)
-            self._caller.start(call, self._route, request.deadline_ns, finish, note)
-            run.on_cancel(partial(self._caller.cancel, self._peer, call.id, self._label, request.deadline_ns))
+            self._caller.start(call, self._route, deadline_ns, finish, note)
+            run.on_cancel(partial(self._caller.cancel, self._peer, call.id, self._label, deadline_ns))
 
         def note(reply: Reply) -> None:
             try:
@@ -237,7 +239,7 @@ class RemoteTarget:
         if self._may_go:
             go()
         else:
-            self._caller.start(self._clock_call(request), self._clock, request.deadline_ns, clock_heard)
+            self._caller.start(self._clock_call(request), self._clock, deadline_ns, clock_heard)
 
     @property
     def _may_go(self) -> bool:
@@ -293,7 +295,7 @@ class RemoteTarget:
         if self._caller.closed:
             return container_closed(self._caller.own)
         reason = f"container {self._peer.address.container} has ended, restarted or cannot be reached"
-        return ServiceGone(service=self._label, reason=reason)
+        return as_never_ran(ServiceGone(service=self._label, reason=reason), self._record.key)
 
     def _failure(self, reply: Reply, request: Request) -> BaseException:
         container = self._peer.address.container
@@ -304,11 +306,11 @@ class RemoteTarget:
                     return ContainerLost(service=self._label, container=self._caller.own.container)
                 return error
             case Status.BUSY:
-                return Busy(service=self._label, container=container)
+                return as_never_ran(Busy(service=self._label, container=container), self._record.key)
             case Status.EXPIRED:
                 return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
             case Status.GONE:
-                return ServiceGone(service=self._label)
+                return as_never_ran(ServiceGone(service=self._label), self._record.key)
             case Status.TIMED_OUT:
                 return OutcomeUnknown(service=self._label, deadline_s=request.deadline_s)
             case Status.UNSENT:

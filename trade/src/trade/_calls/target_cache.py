@@ -14,11 +14,10 @@ from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._threads.thread_pool import ThreadPool
 from trade._transport.base import ChannelClosed
-from trade.errors import AccessDenied, ServiceGone
+from trade.errors import AccessDenied, ServiceGone, as_never_ran
 
 Target = LocalTarget | RemoteTarget
 
-_PATIENCE_S: Final = 1.0
 """How long a call waits for the registry entry of a handle that arrived in a message before it."""
 
 
@@ -55,9 +54,8 @@ class Targets:
             ConfigurationError: the container is closed.
         """
         key, policy = handle.key, self._access.policy
-        known = self._registry.get(key) is not None or handle.last_record is not None or self._registry.removed(key)
-        if not known:
-            self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
+        if handle.last_record is None:
+            self._registry.wait_until_known([key])
         record = self._registry.get(key)
         if record is not None:
             self._require(record)
@@ -102,6 +100,9 @@ class Targets:
 
     def gone(self, handle: Handle) -> ServiceGone:
         """The error of a handle without a target."""
+        return as_never_ran(self._gone(handle), handle.key)
+
+    def _gone(self, handle: Handle) -> ServiceGone:
         address = handle.key.address
         if moved_to := self._registry.moved_to(handle.key):
             return gone_to(handle.label, moved_to)

@@ -1,6 +1,7 @@
 """The components of a container: built in order, each from earlier ones, and closed in reverse order."""
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Protocol
@@ -8,6 +9,7 @@ from typing import Final, Protocol
 from trade._audit.events import open_audit
 from trade._calls.caller import Caller
 from trade._calls.handle import CallHost, Handle, handle_codec
+from trade._calls.local_path import MARK, LocalPath
 from trade._calls.target_cache import Targets
 from trade._container.connect import join
 from trade._container.policy_reload import begin_watching
@@ -19,18 +21,22 @@ from trade._discovery.dialer import Dialer
 from trade._discovery.listener import RegistryListener
 from trade._estop.controller import LIMIT_S, EstopController, check_limit, is_stop
 from trade._hooks import hook
-from trade._hooks.hook import Hooks
+from trade._hooks.guard import Guards
+from trade._hooks.hook import CallCopies, Hooks
 from trade._locks import api
 from trade._locks.api import LockApi
 from trade._locks.inherited import InheritedLock
 from trade._locks.remote_locks import RemoteLocks
 from trade._migration import factory
+from trade._migration.delivered_code import CodeStore
 from trade._migration.factory import ProviderFactory
 from trade._migration.quiesce import Quiescer
 from trade._migration.source import MigrationSource
 from trade._migration.target import MigrationTarget
 from trade._notifications import notification
+from trade._notifications.events import EventLog
 from trade._notifications.notifier import Notifier
+from trade._notifications.states import States
 from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._registry.constraints import where
@@ -39,6 +45,7 @@ from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder
 from trade._services.dispatcher import Dispatcher
 from trade._services.event_loop import AsyncLoop
+from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
 from trade._settings import Settings
@@ -53,8 +60,13 @@ from trade._telemetry.spans import Spans, new_spans
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade._transport.base import Transport
+from trade._transport.credentials import user_secret
+from trade._transport.host_socket import host_sockets, listen_on_host
+from trade._transport.local_greeting import Passport
 from trade._transport.zenoh import ZenohTransport
-from trade.errors import AccessDenied
+from trade.errors import AccessDenied, TradeError
+
+_logger = logging.getLogger("trade")
 
 _LOOK_S: Final = 0.1
 
@@ -91,7 +103,7 @@ class Components:
             self._build_calls(leaving)
             self._build_locks(leaving)
             self._build_services(leaving)
-            self._build_notifications_and_hooks()
+            self._build_notifications_and_hooks(leaving)
             self._build_telemetry(leaving)
             self._build_streams(leaving)
             self._build_estop(leaving)
@@ -99,14 +111,25 @@ class Components:
             self._build_dispatch(leaving)
             self._build_stop_line(leaving)
             self._build_measures(leaving)
+            self._build_states()
             self._leaving = leaving.pop_all()
 
     def _build_transport(self, leaving: contextlib.ExitStack, transport: Transport | None) -> None:
         self.audit = open_audit(self._settings, self._address, leaving)
-        self.transport = transport or join(self._settings, leaving)
+        self._given = transport is not None
+        """Whether the transport was given: then it carries everything."""
+        self.events = EventLog(self._home.name)
+        self._certificate = None if self._given else self._settings.certificate()
+        self.transport = transport or join(
+            self._settings,
+            self._certificate,
+            leaving,
+            lambda until: self.events.note("certificate_ends", self._address.identity, until),
+        )
         leaving.callback(self.transport.close)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
+        self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
         if isinstance(self.transport, ZenohTransport):
             self.dialer = Dialer(self.transport.links, self._settings.check_may_dial, self._settings.connect)
             leaving.callback(self.dialer.close)
@@ -115,12 +138,23 @@ class Components:
         home, address = self._home, self._address
         self.codec = handle_codec(lambda handle: handle.key, home.handle)
         self.registry = Registry(address, self._access.may_offer, self._access.may_have_stops)
-        self.caller = Caller(self.transport, address)
+        self.local_path = self._local_path()
+        self.caller = Caller(self.transport, address, self.local_path)
         leaving.callback(self.caller.close)
         self.scheduler = Scheduler("trade-clock")
         leaving.callback(self.scheduler.close)
-        self.notifier = Notifier(home, self.scheduler, address.epoch, lambda record: Handle(home, record.key, record))
+        notified = Scheduler("trade-notifications", self.transport.clock)
+        leaving.callback(notified.close)
+        self.notifier = Notifier(home, notified, address.epoch, lambda record: Handle(home, record.key, record))
         leaving.callback(self.notifier.close)
+
+    def _local_path(self) -> LocalPath | None:
+        """The local path to others; None if it is switched off, or the transport was given."""
+        settings = self._settings
+        if not settings.local_path or self._given:
+            return None
+        password = "" if settings.tls is not None else "\n".join(settings.credentials or user_secret())
+        return LocalPath(settings.system, Passport(self._address, settings.certificate, password))
 
     def _build_locks(self, leaving: contextlib.ExitStack) -> None:
         address = self._address
@@ -130,8 +164,8 @@ class Components:
             leaving.callback(handed_down.pop, address)
         self.event_loop = AsyncLoop()
         leaving.callback(self.event_loop.close)
-        self.lock_api = LockApi(self._home)
-        self.locks = LockTable(address.epoch, self._home.name, audit=self.audit)
+        self.lock_api = LockApi(self._home, self.transport.clock)
+        self.locks = LockTable(address.epoch, self._home.name, self.transport.clock, self.audit)
         leaving.callback(self.locks.close)
         self.remote_locks = RemoteLocks(self.locks, address.epoch)
 
@@ -145,13 +179,19 @@ class Components:
         self.targets = Targets(access, self.registry, self.providers, self.caller, self.codec, self.audit)
         self.registry.changes.subscribe(self.targets.changed)  # before all other subscribers: they may make calls
 
-    def _build_notifications_and_hooks(self) -> None:
+    def _build_notifications_and_hooks(self, leaving: contextlib.ExitStack) -> None:
         self.registry.changes.subscribe(self.notifier.changed)
+        self.events.occurred.subscribe(lambda occurred: self.notifier.occurred(*occurred))
         self.session_end.subscribe(self.notifier.session_ended)
+        copies = CallCopies(self.codec)
+        self.guards = Guards(self._home, copies, self.providers.prepare_again)
+        leaving.callback(self.guards.pool.close)
+        self.providers.prepare = self.guards.apply
         self.hooks = Hooks(
             self._home,
-            self.codec,
+            copies,
             self.scheduler,
+            self._settings.hook_limit_s,
             self.providers.service,
             lambda: self.registry.select(where.local),
             self._denied_hook,
@@ -188,7 +228,10 @@ class Components:
     def _build_migration(self, leaving: contextlib.ExitStack) -> None:
         home, address, access = self._home, self._address, self._access
         self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-        self.factory = ProviderFactory(home, self.providers, self.withdrawn, self._settings.instantiable)
+        state_dir = self._settings.state_dir
+        kept = None if state_dir is None else state_dir / self._settings.system / "code"
+        code = CodeStore(kept, self._settings.code, address.container)
+        self.factory = ProviderFactory(home, self.providers, self.withdrawn, self._settings.instantiable, code)
         leaving.callback(self.factory.close)
         quiescer = Quiescer(self.locks, address)
         self.migration_source = MigrationSource(
@@ -204,6 +247,20 @@ class Components:
             self.transport, self._address, self.providers, self.event_loop, self._access, self.audit
         )
         leaving.callback(self.dispatcher.close)
+        self.local_server: LocalServer | None = None
+        if self.local_path is not None:
+            self._take_local_calls(self.local_path.passport)
+
+    def _take_local_calls(self, passport: Passport) -> None:
+        try:
+            listening = listen_on_host(self._settings.system, MARK, self._address.epoch)
+            host_sockets(self._settings.system, MARK)  # this removes those of ended processes
+        except (OSError, TradeError) as bad:
+            _logger.warning("no local path here: %s. Calls from this host take the transport, which is slower", bad)
+            return
+        if listening is not None:
+            self.local_server = LocalServer(*listening, passport, self.dispatcher, self._caller_ended)
+            self.dispatcher.pools.append(self.local_server)
 
     def _build_stop_line(self, leaving: contextlib.ExitStack) -> None:
         self.stop_lines = StopLines(self._settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
@@ -218,10 +275,26 @@ class Components:
             if self._settings.bridge:
                 self.stop_line.listen_on_host()
 
-    def _build_measures(self, leaving: contextlib.ExitStack) -> None:
-        self.load_meter = LoadMeter(
-            self._home.name, lambda: list(self.dispatcher._worker_pools), self.providers.waiting
+    def _build_states(self) -> None:
+        self.states = States(
+            self._home.name,
+            self.events,
+            self.registry,
+            self.dialer,
+            self._links,
+            self._certificate,
+            self._settings.bridge,
+            self.caller.answers,
+            self.spans,
+            self.trace,
         )
+        self.registry.changes.subscribe(self.states.changed)
+        suspended = self.states.hook_suspended
+        self.hooks.suspended.subscribe(lambda hook: suspended(hook.name, hook.last_error, hook.call.key))
+        self.streams.notify = self.states.listener_changed
+
+    def _build_measures(self, leaving: contextlib.ExitStack) -> None:
+        self.load_meter = LoadMeter(self._home.name, lambda: list(self.dispatcher.pools), self.providers.waiting)
         self.shutdown = Shutdown(
             self._home.name, self.deadman.rest, self.locks.resources, lambda: self.load_meter.running, self._home.close
         )
@@ -247,7 +320,7 @@ class Components:
                 self._lost,
                 self.session_ended,
                 self.locks.session_back,
-                self.announcer.beat,
+                self._beat,
                 self.estop.learn,
             )
             self._leaving.callback(self.watch.close)
@@ -289,6 +362,11 @@ class Components:
         if self.stop_line is not None and any(record.local and is_stop(record) for record in change.joined):
             self.stop_line.listen_on_host()
 
+    def _beat(self) -> None:
+        """Announces the revision if it is due, and looks at the links; called every two seconds."""
+        self.announcer.beat()
+        self.states.links.infos()
+
     def _lost(self, address: Address, *, back: bool = False) -> None:
         """Handles the loss, or the return, of a container; called by the registry listener."""
         self.caller.lost(address, back=back)
@@ -297,7 +375,16 @@ class Components:
         self.lock_api.lease_client.lost(address)
         if self.inherited is not None:
             self.inherited.lost(address)
-        self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+        self._caller_ended(address)
+
+    def _caller_ended(self, address: Address) -> None:
+        """Handles the end of a container as a caller; of one on this host, its process may be the first sign of it.
+
+        Calls to it, and locks of its resources, wait for the transport's sign: its last answers may be under way.
+        """
+        self.dispatcher.hang_up(address)  # before its locks end: see `Caller` on answers that grant
+        if self.locks.gone((str(address),)) is None:  # the other sign was earlier
+            self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
         self.dispatcher.forget(address)
 
     def session_ended(self, session: str, reason: str = "it was closed") -> None:
@@ -347,7 +434,7 @@ class Components:
             yield from measure()
 
     def _taken(self) -> list[int]:
-        return [pool.taken for pool in list(self.dispatcher._worker_pools)]
+        return [pool.taken for pool in list(self.dispatcher.pools)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)
@@ -381,6 +468,9 @@ class Components:
         self._leaving.close()
 
     def abandon(self) -> None:
-        """Closes nothing, in a forked child."""
+        """Closes nothing but connections, in a forked child."""
         self.targets.close()
+        for local in (self.local_path, self.local_server):
+            if local is not None:
+                local.abandon()
         self._leaving.pop_all()

@@ -12,6 +12,7 @@ from trade._locks.services import LockServices
 from trade._migration.services import FactoryServices, MigrationServices
 from trade._notifications.services import NotificationServices
 from trade._notifications.services import NotificationServicesHost as Member
+from trade._notifications.states import StateServices
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade._streams.services import StreamServices
@@ -61,6 +62,7 @@ class OwnServices(
     FactoryServices,
     MigrationServices,
     StreamServices,
+    StateServices,
 ):
     """One provider, so that one registry entry lists all the container's own services."""
 
@@ -78,8 +80,9 @@ class OwnServices(
             parts.remote_locks,
         )
         NotificationServices.__init__(self, parts.notifier, parts.registry, home, access)
-        HookServices.__init__(self, parts.hooks, home, access)
+        HookServices.__init__(self, parts.hooks, parts.registry, home, access)
         TraceServices.__init__(self, home.name, parts.spans, parts.trace)
         FactoryServices.__init__(self, home.system)
         MigrationServices.__init__(self, parts.migration_source, parts.migration_target)
         StreamServices.__init__(self, parts.streams)
+        StateServices.__init__(self, parts.states)

@@ -1,12 +1,13 @@
-"""How a container joins its system: its endpoints, the peers that it dials, its credentials, and its bridges."""
+"""How a container joins its system: its endpoints, the peers that it dials or the hub, its credentials, its bridges."""
 
 import contextlib
 import logging
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from trade._discovery.host_folder import HostFolder
+from trade._discovery.hub_file import HubFile
 from trade._security.certificates import Certificate, ExpiryWatch
 from trade._security.network_crossings import crossings
 from trade._security.policy_file import read_policy
@@ -25,10 +26,22 @@ _logger = logging.getLogger("trade")
 _PORTS_TRIED: Final = 4
 
 
-def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
-    """Opens the transport, and adds to the stack what has to close with the container."""
-    networks, certificate = _networks(settings.bridge), settings.certificate()
-    transport = _join(settings, certificate, networks, leaving)
+def join(
+    settings: Settings,
+    certificate: Certificate | None,
+    leaving: contextlib.ExitStack,
+    warned: Callable[[str], None] = lambda _: None,
+) -> ZenohTransport:
+    """Opens the transport, and adds to the stack what has to close with the container.
+
+    Args:
+        settings: of the container.
+        certificate: of the container.
+        leaving: the stack.
+        warned: called with each warning that the certificate ends.
+    """
+    networks = _networks(settings)
+    transport = _attached(settings, certificate) or _join(settings, certificate, networks, leaving)
     try:
         _check_bridged(settings.bridge, transport.links)
     except ConfigurationError:
@@ -37,8 +50,33 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     guard = PortGuard((own.port for own in transport.links.listen), transport.links.count)
     leaving.callback(guard.close)
     if certificate is not None:
-        leaving.callback(ExpiryWatch(certificate).close)
+        leaving.callback(ExpiryWatch(certificate, warned).close)
     return transport
+
+
+def _attached(settings: Settings, certificate: Certificate | None) -> ZenohTransport | None:
+    """The transport through the hub of this host; None if there is none that this container can use."""
+    if settings.hub != "auto" or settings.listen or settings.connect or settings.bridge:
+        return None
+    hub = HubFile(settings.system).running()
+    if hub is None or not _of_our_kind([hub.endpoint], certificate is not None):
+        return None
+    why = _distrust(settings, hub.identity)
+    if not why:
+        try:
+            return ZenohTransport(_configuration(settings, certificate, hub=hub.endpoint))
+        except ConfigurationError:
+            why = "it does not accept the link; does it have the same credentials, and does it answer?"
+    _logger.warning("does not use the hub of this host at %s: %s Trying the other containers", hub.endpoint, why)
+    return None
+
+
+def _distrust(settings: Settings, identity: str) -> str:
+    """Why a hub may not pass on what others say, by the policy; empty if it may."""
+    policy = read_policy(settings.policy) if settings.policy and settings.tls else None
+    if policy is None or (identity in policy.gateways and identity not in policy.revoked):
+        return ""
+    return f"the policy does not list its identity, {identity}, in gateways."
 
 
 def _join(
@@ -46,6 +84,48 @@ def _join(
 ) -> ZenohTransport:
     anywhere_here = Endpoint("tcp" if certificate is None else "tls", "127.0.0.1", 0)
     wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
+    if settings.hub == "serve":
+        return _serve(settings, certificate, wanted, networks, leaving)
+    return _join_anywhere(settings, certificate, wanted, networks, leaving)
+
+
+def _serve(
+    settings: Settings,
+    certificate: Certificate | None,
+    wanted: list[Endpoint],
+    networks: list[list[str]],
+    leaving: contextlib.ExitStack,
+) -> ZenohTransport:
+    """Joins as the hub of this host, at the port of the one before: attached containers look for it only there."""
+    if why := _distrust(settings, settings.identity):
+        raise ConfigurationError(where="hub", problem=f"{why} No container could attach; add it")
+    file = HubFile(settings.system)
+    file.claim()
+    leaving.callback(file.release)
+    before, transport = file.last(), None
+    port = 0 if before is None else Endpoint.read(before.endpoint).port
+    if port and not all(endpoint.port for endpoint in wanted):
+        again = [endpoint if endpoint.port else endpoint._replace(port=port) for endpoint in wanted]
+        try:
+            transport = _join_at(settings, certificate, list(map(str, again)), networks, leaving)
+        except ConfigurationError:
+            _logger.warning("port %d of the last hub is taken: containers that were attached have to restart", port)
+    transport = transport or _join_anywhere(settings, certificate, wanted, networks, leaving)
+    try:
+        file.announce(_nearest(list(map(str, transport.links.listen))), settings.identity)
+    except ConfigurationError:
+        transport.close()
+        raise
+    return transport
+
+
+def _join_anywhere(
+    settings: Settings,
+    certificate: Certificate | None,
+    wanted: list[Endpoint],
+    networks: list[list[str]],
+    leaving: contextlib.ExitStack,
+) -> ZenohTransport:
     for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
         with contextlib.suppress(ConfigurationError):  # another process took the free port first
             return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
@@ -64,26 +144,37 @@ def _join_at(
     leaving: contextlib.ExitStack,
 ) -> ZenohTransport:
     connect, certified = list(settings.connect), certificate is not None
-    if settings.bridge or not connect:
+    if networks or not connect:
         rendezvous = HostFolder(settings.system)
         leaving.callback(rendezvous.leave)
         connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
-    return ZenohTransport(
-        configuration(
-            namespace=settings.system,
-            listen=listen,
-            connect=connect,
-            credentials=None if certified else settings.credentials or user_secret(),
-            certificate=certificate,
-            bridge=networks,
-            rules=_rules(settings, networks),
-        )
+    return ZenohTransport(_configuration(settings, certificate, listen=listen, connect=connect, bridge=networks))
+
+
+def _configuration(
+    settings: Settings,
+    certificate: Certificate | None,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    bridge: Sequence[Sequence[str]] = (),
+    hub: str = "",
+) -> dict[str, Any]:
+    return configuration(
+        namespace=settings.system,
+        listen=listen,
+        connect=connect,
+        credentials=None if certificate is not None else settings.credentials or user_secret(),
+        certificate=certificate,
+        bridge=bridge,
+        hub=hub,
+        rules=_rules(settings, bridge),
     )
 
 
-def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
+def _rules(settings: Settings, networks: Sequence[Sequence[str]]) -> dict[str, Any]:
     """The transport's access rules: the rights of certified identities, and what crosses a gateway."""
     policy = read_policy(settings.policy) if settings.policy and settings.tls else None
     if policy is None and settings.exports is None:
@@ -121,20 +212,25 @@ def _nearest(listen: list[str]) -> str:
     return dialled_from_here(endpoints[0])
 
 
-def _networks(bridge: Sequence[str]) -> list[list[str]]:
+def _networks(settings: Settings) -> list[list[str]]:
     """The interfaces of each network that a bridge joins; the containers of its own host belong to the first.
+
+    A hub that is no bridge has one network, of all interfaces.
 
     Raises:
         ConfigurationError: an interface does not exist.
     """
-    known = [name for _, name in socket.if_nameindex()] if bridge else []
+    bridge = settings.bridge
+    if not bridge:
+        return [[]] if settings.hub == "serve" else []
+    known = [name for _, name in socket.if_nameindex()]
     for name in bridge:
         if name not in known:
             problem = f"this host has no such interface, or not yet; it has {', '.join(known)}"
             raise ConfigurationError(where=f"bridge {name}", problem=problem)
     networks = [[name] for name in dict.fromkeys(bridge)]
     here = loopback_interface()
-    if networks and here and here not in bridge:
+    if here and here not in bridge:
         networks[0].append(here)
     return networks
 

@@ -1,12 +1,13 @@
 """The container: one participant of a system. Each feature has its own module and is listed here."""
 
+import asyncio
 import functools
 import itertools
 import secrets
 import threading
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
-from typing import Any, Concatenate, Final, Literal, ParamSpec, TypeVar
+from typing import Any, Concatenate, Final, Literal, ParamSpec, TypeVar, cast
 
 from trade._calls.handle import Handle
 from trade._calls.run import Run
@@ -16,7 +17,7 @@ from trade._container.assembly import Components
 from trade._container.builtin_services import OwnServices
 from trade._container.federating import Federating
 from trade._container.hooking import Hooking
-from trade._container.lookup import Lookup
+from trade._container.lookup import Acall, Afind, Find, FindRobot, Lookup
 from trade._container.migrating import Migrating
 from trade._container.notifying import Notifying
 from trade._container.registering import Registering
@@ -25,17 +26,19 @@ from trade._container.system import System
 from trade._container.tracing import Tracing
 from trade._context.call_context import running
 from trade._context.outgoing import new_request
-from trade._context.sessions import Session
+from trade._context.sessions import Session, client_name
 from trade._counters import Measure
 from trade._discovery.dialer import Dialer
 from trade._estop.controller import EstopController
 from trade._estop.services import EstopServices
+from trade._hooks.guard import Guards
 from trade._locks.api import LockApi
 from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import Address, ServiceKey, alive_key, as_chunk
 from trade._registry.registry import Record, Registry
 from trade._security.authorizer import Authorizer, verb_of
 from trade._settings import Settings
+from trade._table import Table
 from trade._threads import fork_guard
 from trade._threads.event import Event
 from trade._transport.base import ChannelClosed, Transport
@@ -44,6 +47,14 @@ from trade.errors import ConfigurationError
 __all__ = ["Container"]
 
 _STOPPING_S: Final = 2.0
+_COLUMNS: Final = {
+    "CONTAINER": "name",
+    "IDENTITY": "identity",
+    "HOST": "host",
+    "PID": "pid",
+    "SERVICES": "services",
+    "EPOCH": "epoch",
+}
 
 
 _P = ParamSpec("_P")
@@ -70,6 +81,21 @@ def adelegated(
     async def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         self._check_open()
         return await method(getattr(self, part), *args, **kwargs)
+
+    return call
+
+
+def in_thread(
+    method: "Callable[Concatenate[Container, _P], _R]",
+) -> "Callable[Concatenate[Container, _P], Coroutine[Any, Any, _R]]":
+    """A method of the container as a coroutine function: it waits on a thread, not on the event loop.
+
+    Its session and its locks apply on that thread, too. Cancelling the coroutine does not end what the thread does.
+    """
+
+    @functools.wraps(method)
+    async def call(self: "Container", /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        return await asyncio.to_thread(method, self, *args, **kwargs)
 
     return call
 
@@ -105,6 +131,8 @@ class Container:
         """Its locks on services, its own and others'."""
         self.estopping: Final = self._parts.estop
         """Its e-stops."""
+        self.guarding: Final = self._parts.guards
+        """Its guards."""
         self.borrowed: Final = self._parts.remote_locks
         """The locks in other systems behind its grants."""
         self.withdrawn: Final = self._parts.withdrawn
@@ -115,6 +143,8 @@ class Container:
         """The providers that migrate to it, and restored ones."""
         self.meter: Final = self._parts.load_meter
         """Its load."""
+        self.events: Final = self._parts.events
+        """The events of its states."""
         self.terminating: Final = self._parts.shutdown
         """Its shutdown on request."""
         self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estop))
@@ -151,13 +181,15 @@ class Container:
     # --- finding and calling
 
     services = delegated("_lookup", Lookup.services)
-    find = delegated("_lookup", Lookup.find)
+    find: Find = cast("Find", delegated("_lookup", Lookup.find))
+    robot: FindRobot = cast("FindRobot", delegated("_lookup", cast("Any", Lookup.robot)))
     await_services = delegated("_lookup", Lookup.await_services)
     reachability = delegated("_lookup", Lookup.reachability)
     call = delegated("_lookup", Lookup.call)
     call_all = delegated("_lookup", Lookup.call_all)
     call_sequence = delegated("_lookup", Lookup.call_sequence)
-    acall = adelegated("_lookup", Lookup.acall)
+    afind: Afind = cast("Afind", in_thread(cast("Any", find)))
+    acall: Acall = cast("Acall", adelegated("_lookup", Lookup.acall))
     acall_all = adelegated("_lookup", Lookup.acall_all)
     acall_sequence = adelegated("_lookup", Lookup.acall_sequence)
 
@@ -171,6 +203,10 @@ class Container:
     stop = delegated("_parts", Components.stop)
     estop = delegated("estopping", EstopController.estop)
     estops = delegated("estopping", EstopController.estops)
+    astop = in_thread(stop)
+    aestop = in_thread(estop)
+    aresume = in_thread(resume)
+    alocks = in_thread(locks)
     estop_clear = delegated("estopping", EstopController.estop_clear)
 
     # --- notifications, hooks, streams, traces
@@ -178,6 +214,7 @@ class Container:
     joined = delegated("_notifying", Notifying.joined)
     left = delegated("_notifying", Notifying.left)
     changed = delegated("_notifying", Notifying.changed)
+    occurred = delegated("_notifying", Notifying.occurred)
     once = delegated("_notifying", Notifying.once)
     after = delegated("_notifying", Notifying.after)
     at = delegated("_notifying", Notifying.at)
@@ -186,9 +223,12 @@ class Container:
     cancel_notification = delegated("_notifying", Notifying.cancel_notification)
     before_service = delegated("_hooking", Hooking.before_service)
     after_service = delegated("_hooking", Hooking.after_service)
+    guard = delegated("guarding", Guards.guard)
+    guards = delegated("guarding", Guards.guards)
     hooks = delegated("_hooking", Hooking.hooks)
     detach_hook = delegated("_hooking", Hooking.detach_hook)
     stream = delegated("_streaming", Streaming.stream)
+    astream = in_thread(stream)
     set_tracing = delegated("_tracing", Tracing.set_tracing)
     spans = delegated("_tracing", Tracing.spans)
     trace = delegated("_tracing", Tracing.trace)
@@ -274,10 +314,10 @@ class Container:
         """The addresses of the system's containers, this one included."""
         return [state.address for state in self._parts.registry.containers()]
 
-    def containers(self) -> list[ContainerInfo]:
+    def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
         self._check_open()
-        infos: list[ContainerInfo] = []
+        infos = Table[ContainerInfo]((), _COLUMNS)
         for state in self._parts.registry.containers():
             records = [record for entry in list(state.providers.values()) for record in entry.records]
             first = records[0] if records else None
@@ -372,7 +412,7 @@ class Container:
         """
         self._check_open()
         whose = f"{as_chunk(system)[:20]}:" if system else ""
-        name = f"{self.address}/{whose}{as_chunk(client)[:40]}.{next(self._clients)}"
+        name = f"{self.address}/{whose}{client_name(client)}.{next(self._clients)}"
         try:
             presence = self._parts.transport.appear(alive_key(name))
         except ChannelClosed:  # closed by another thread meanwhile

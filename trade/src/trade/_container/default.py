@@ -1,9 +1,12 @@
 """The default container of the process, and functions that use it."""
 
+import contextlib
 import functools
 import inspect
+import signal
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Generator
+from types import FrameType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from trade._container.container import Container
@@ -12,6 +15,8 @@ from trade.errors import ConfigurationError
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+_LOOK_S = 0.2
 
 _lock = threading.RLock()
 _default: Container | None = None
@@ -50,6 +55,38 @@ def close() -> None:
         running, _default = _default, None
     if running is not None:
         running.close()
+
+
+def serve() -> None:
+    """Keeps the default container in the system until Ctrl-C, SIGTERM, or its end from elsewhere; then closes it.
+
+    For the end of a script that offers services. Starts the container if necessary.
+    """
+    running = container()
+    try:
+        with _ended_by_sigterm():
+            while not running.closed:
+                threading.Event().wait(_LOOK_S)
+    except KeyboardInterrupt:
+        pass
+    close()
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Generator[None]:
+    """Turns SIGTERM into KeyboardInterrupt. Only the main thread of a process may do so."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def of_default(method: Callable[Concatenate[Container, _P], _R]) -> Callable[_P, _R]:

@@ -12,7 +12,7 @@ from trade._container.notifying import Notifying
 from trade._hooks.hook import HookInfo, Side
 from trade._notifications.notification import Notification
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
-from trade._registry.constraints import Constraint, where
+from trade._registry.constraints import Constraint, as_constraint, services_at, where
 from trade._security.authorizer import Authorizer
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 
@@ -93,14 +93,15 @@ class Hooking:
         self._access = access
         self._numbers = itertools.count(1)
 
-    def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
+    def before_service(self, target: Handle | Constraint | str, call: Handle) -> Hook:
         """Calls a service before each call of another one, with a copy of its arguments.
 
         It runs in that service's container and delays its call by 0.1 s at most, together with other hooks by 0.25 s.
         It never changes the call. After three failures in a row it is suspended.
 
         Args:
-            target: a service, or all that match, later ones included. A stop has no hooks before it.
+            target: a service, or all that match a constraint or a text, later ones included. A stop has no hooks
+                before it.
             call: takes one argument, a `Called`.
 
         Raises:
@@ -109,17 +110,16 @@ class Hooking:
         """
         return self._hook("before", target, call)
 
-    def after_service(self, target: Handle | Constraint, call: Handle) -> Hook:
+    def after_service(self, target: Handle | Constraint | str, call: Handle) -> Hook:
         """Calls a service after each call of another one, with its outcome, before the caller gets the answer.
 
         After a stop it runs when the caller has the answer. The rest is as for `before_service`.
         """
         return self._hook("after", target, call)
 
-    def _hook(self, side: Side, target: Handle | Constraint, call: Handle) -> Hook:
+    def _hook(self, side: Side, given: Handle | Constraint | str, call: Handle) -> Hook:
         named = f"trade.{side}_service"
-        if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise ConfigurationError(where=named, problem=f"target must be a handle or where(...), not {target!r}")
+        target = given if isinstance(given, Handle) else as_constraint(given, named, services_at)
         if not isinstance(call, Handle):  # pyright: ignore[reportUnnecessaryIsInstance]
             rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
             raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")

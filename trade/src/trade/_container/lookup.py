@@ -1,20 +1,111 @@
 """Lookup: finds services by constraints, and calls them."""
 
 import asyncio
+import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final
+from typing import Any, Final, ParamSpec, Protocol, TypeVar, cast, overload
 
 from trade._calls import batch
-from trade._calls.handle import Bound, CallHost, Handle
+from trade._calls.handle import Bound, CallHost, Handle, service_of
+from trade._calls.picking import Pick, Picker, narrowed, required
+from trade._container.group_view import GroupView, Members
 from trade._container.reachability import Reachability, look_around
 from trade._context.call_context import patience_s
 from trade._discovery.dialer import Dialer
 from trade._protocol.keys import DOMAIN, ServiceKey
-from trade._registry.constraints import Constraint, where
-from trade._registry.registry import Record, Registry
+from trade._registry.constraints import Constraint, as_constraint, group_at, service_at, services_at, where
+from trade._registry.registry import Change, Record, Registry
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services
 from trade._security.authorizer import Authorizer
-from trade.errors import AccessDenied
+from trade._table import Table
+from trade.errors import AccessDenied, ConfigurationError
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_Provider = TypeVar("_Provider")
+
+_WAIT_S: Final = 2.0
+"""How long a call waits for a service that matches."""
+_COLUMNS: Final = {
+    "SERVICE": "label",
+    "CALLED AS": "signature",
+    "EFFECT": "effect",
+    "HEALTH": "health",
+    "CONTAINER": "container",
+    "HOST": "host",
+}
+
+
+class Find(Protocol):
+    """The types of `Lookup.find`: type checkers cannot see them through a function that delegates to it."""
+
+    @overload
+    def __call__(
+        self,
+        which: Constraint | str,
+        *,
+        group: str | None = None,
+        container: str | None = None,
+        wait_s: float = 2.0,
+        pick: Pick | None = None,
+    ) -> Handle: ...
+    @overload
+    def __call__(
+        self,
+        which: Callable[..., _Provider],  # a class; type[...] would leave out interfaces
+        *,
+        group: str | None = None,
+        container: str | None = None,
+        wait_s: float = 2.0,
+        follow: bool = False,
+    ) -> _Provider: ...
+
+
+class FindRobot(Protocol):
+    """The types of `Lookup.robot`."""
+
+    @overload
+    def __call__(self, group: str, *, wait_s: float = 2.0, follow: bool = False) -> GroupView: ...
+    @overload
+    def __call__(
+        self, group: str, kind: Callable[..., _Provider], *, wait_s: float = 2.0, follow: bool = False
+    ) -> _Provider: ...
+
+
+class Afind(Protocol):
+    """The types of `Container.afind`."""
+
+    @overload
+    async def __call__(
+        self,
+        which: Constraint | str,
+        *,
+        group: str | None = None,
+        container: str | None = None,
+        wait_s: float = 2.0,
+        pick: Pick | None = None,
+    ) -> Handle: ...
+    @overload
+    async def __call__(
+        self,
+        which: Callable[..., _Provider],
+        *,
+        group: str | None = None,
+        container: str | None = None,
+        wait_s: float = 2.0,
+        follow: bool = False,
+    ) -> _Provider: ...
+
+
+class Acall(Protocol):
+    """The types of `Lookup.acall`."""
+
+    @overload
+    async def __call__(
+        self, which: Constraint | str, /, *args: Any, pick: Pick | None = None, **kwargs: Any
+    ) -> Any: ...
+    @overload
+    async def __call__(self, which: Callable[_P, _R], /, *args: _P.args, **kwargs: _P.kwargs) -> _R: ...
 
 
 class Lookup:
@@ -35,23 +126,105 @@ class Lookup:
         self._access = access
         self._system = system
         self._check_open = check_open
+        self._picker = Picker(home.address, self.handle)
 
     # --- looking up
 
-    def services(self, constraint: Constraint | None = None) -> list[Handle]:
-        """Handles of all matching services, ordered by group and name; without a constraint, of all services."""
-        self._check_open()
-        wanted = where() if constraint is None else constraint
-        return [Handle(self.home, record.key, record) for record in self._registry.select(wanted)]
+    def services(self, which: Constraint | str | None = None) -> Table[Handle]:
+        """Handles of all matching services, ordered by group and name.
 
-    def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
-        """The only service that matches; waits for it to appear.
+        Args:
+            which: a constraint, or a group as text; by default all services.
+        """
+        self._check_open()
+        wanted = where() if which is None else as_constraint(which, "trade.services", services_at)
+        found = (Handle(self.home, record.key, record) for record in self._registry.select(wanted))
+        return Table(found, _COLUMNS)
+
+    def find(
+        self,
+        which: Constraint | str | type,
+        *,
+        group: str | None = None,
+        container: str | None = None,
+        wait_s: float = 2.0,
+        follow: bool = False,
+        pick: Pick | None = None,
+    ) -> Any:
+        """The only service that matches, or the only provider of a class; waits for it to appear.
+
+        ``find("rosie.head.move_to")`` returns a `Handle`. ``find(JointGroup, group="rosie.head")`` returns an object
+        whose methods are the provider's services; type checkers know it as a ``JointGroup``.
+
+        Args:
+            which: a constraint; a service as text, by its group and name, where a service of exactly that group comes
+                before services of groups beneath it; or the class of a provider, or a base or interface of it.
+            group: a group that it belongs to.
+            container: the name of its container.
+            wait_s: how long to wait for it, in seconds.
+            follow: for a class: whether its methods are found again after a restart of the container; else they raise
+                ServiceGone then.
+            pick: for a service: which one to return if several match; see `call`.
 
         Raises:
             NoSuchService: none within ``wait_s`` seconds.
             TooManyServices: more than one.
         """
         self._check_open()
+        if pick is not None:
+            return self._picked(which, where(group=group, container=container), pick, "trade.find", wait_s)[0]
+        if isinstance(which, type):
+            wanted = where(kind=which.__name__, group=group, container=container)
+            return self._provider(wanted, group, wait_s=wait_s, follow=follow)
+        constraint = as_constraint(which, "trade.find", service_at)
+        if group is not None or container is not None:
+            constraint &= where(group=group, container=container)
+        matches = self._await_matches(constraint, wait_s)
+        if len(matches) > 1 and isinstance(which, str):
+            exact = [record for record in matches if which.rpartition(".")[0] in record.groups]
+            matches = exact if len(exact) == 1 else matches
+        if len(matches) > 1:
+            raise too_many_services(constraint, matches)
+        return Handle(self.home, matches[0].key, matches[0])
+
+    def robot(self, group: str, kind: type | None = None, *, wait_s: float = 2.0, follow: bool = False) -> GroupView:
+        """A robot, or any other group, as an object: ``rosie.head.move_to([0.3, -0.2])``, ``rosie.neck.pan.limits()``.
+
+        Its attributes are the services of the group, as handles, and the groups beneath it. Services that join later
+        are attributes, too.
+
+        Args:
+            group: a dotted group.
+            kind: a class that ``trade stubs`` wrote: type checkers know the result as this class. It changes nothing
+                else.
+            wait_s: how long to wait for it and for each attribute that does not exist yet, in seconds.
+            follow: whether an attribute is found again after a restart of its container; else the service raises
+                ServiceGone then. Locks and torque do not survive a restart.
+
+        Raises:
+            NoSuchService: no service of that group within ``wait_s`` seconds.
+            ConfigurationError: it is no group, or ``kind`` is no class.
+        """
+        self._check_open()
+        if not isinstance(kind, type | None):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ConfigurationError(where="trade.robot", problem=f"kind must be a class, not {kind!r}")
+        beneath = as_constraint(group, "trade.robot", group_at)
+        self._await_matches(beneath, wait_s)
+        return GroupView(self._members(wait_s, follow=follow), beneath, group, group)
+
+    def _provider(self, wanted: Constraint, group: str | None, *, wait_s: float, follow: bool) -> GroupView:
+        """The only provider with services that match, as a group of these."""
+        matches = self._await_matches(wanted, wait_s)
+        exact = [record for record in matches if group in record.groups]
+        records = exact or matches
+        first = {(record.key.address, record.key.domain, record.key.provider): record for record in records}
+        if len(first) > 1:
+            raise too_many_services(wanted, list(first.values()))
+        own = records[0].groups[0] if records[0].groups else None
+        return GroupView(self._members(wait_s, follow=follow), wanted, own, own or records[0].kind)
+
+    def _await_matches(self, constraint: Constraint, wait_s: float) -> list[Record]:
+        """The services that match, at least one. Raises NoSuchService after ``wait_s`` seconds."""
         matches: list[Record] = []
 
         def found() -> bool:
@@ -59,9 +232,26 @@ class Lookup:
             return bool(matches)
 
         self.await_services(constraint, found, wait_s)
-        if len(matches) > 1:
-            raise too_many_services(constraint, matches)
-        return Handle(self.home, matches[0].key, matches[0])
+        return matches
+
+    def _members(self, wait_s: float, *, follow: bool) -> Members:
+        members = Members(
+            self._registry.select,
+            self.await_services,
+            lambda record: Handle(self.home, record.key, record),
+            wait_s=wait_s,
+            follow=follow,
+        )
+        if follow:
+            living = weakref.ref(members)
+
+            def changed(change: Change) -> None:
+                known = living()
+                if known is not None and change.left:
+                    known.forget(record.key for record in change.left)
+
+            weakref.finalize(members, self._registry.changes.subscribe(changed)).atexit = False
+        return members
 
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
         """Waits until a condition on the services of a constraint holds.
@@ -86,7 +276,7 @@ class Lookup:
         reach = self._dialer
         if wait_s > 0 or reach is None:
             return self.reachability(limit_s=0).unanswered
-        return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
+        return tuple(f"{endpoint} ({reach.source})" for endpoint in reach.configured)
 
     def reachability(self, *, limit_s: float = 3.0) -> Reachability:
         """The containers that it has found: without them, an empty answer of the system means nothing.
@@ -106,17 +296,37 @@ class Lookup:
 
     # --- calling
 
-    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
-        """Calls the only service that matches. Raises the errors of `find` and of the call."""
-        return self.find(constraint)(*args, **kwargs)
+    def call(self, which: Constraint | str, /, *args: Any, pick: Pick | None = None, **kwargs: Any) -> Any:
+        """Calls the only service that matches, or one of them. Raises the errors of `find` and of the call.
+
+        Args:
+            which: a constraint, or a service as text.
+            args: positional arguments of the service.
+            pick: which one of several to call. ``"any"``: a random one. ``"local"``: one of this host, of this
+                container first. ``"least_busy"``: one of the container with the least to do, by calls and by busy
+                cores. ``"nearest"``: one of this container, else of this host, else of the container that answers
+                first. If the service is gone or its container has no room, so that the call never ran, the next one is
+                called. No other error is passed over.
+            kwargs: arguments of the service by name; one called ``pick`` needs a handle from `find`.
+        """
+        if pick is None:
+            return self.find(which)(*args, **kwargs)
+        self._check_open()
+        return self._picker.call(self._picked(which, where(), pick, "trade.call", _WAIT_S), args, kwargs)
+
+    def _picked(self, which: object, more: Constraint, pick: object, named: str, wait_s: float) -> list[Handle]:
+        """The services that match, the best one first."""
+        wanted = narrowed(as_constraint(which, named, service_at) & more, chosen := required(pick, named))
+        matches = self._picker.order(self._await_matches(wanted, wait_s), chosen)
+        return [Handle(self.home, record.key, record) for record in matches]
 
     def call_all(
-        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+        self, which: Constraint | str | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
     ) -> list[batch.Outcome]:
         """Calls several services at once and waits for all of them.
 
         Args:
-            which: a constraint (all that match now), or handles; bound calls have their own arguments.
+            which: a constraint or a text (all that match now), or handles; bound calls have their own arguments.
             args: positional arguments of each call.
             kwargs: arguments of each call by name.
 
@@ -137,13 +347,28 @@ class Lookup:
         """
         return batch.sequence(self._bound(calls, (), {}), go_on=go_on)
 
-    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
-        """`call` from asyncio."""
-        handle = await asyncio.to_thread(self.find, constraint)
+    async def acall(
+        self,
+        which: Constraint | str | Callable[..., Any],
+        /,
+        *args: Any,
+        pick: Pick | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """`call` from asyncio. It also takes a service; type checkers know the result of a service that has a class.
+
+        With ``pick``, it waits on a thread, and cancelling it does not cancel the call.
+        """
+        if pick is not None:
+            return await asyncio.to_thread(self.call, cast("Any", which), *args, pick=pick, **kwargs)
+        if isinstance(which, Constraint | str):
+            handle = await asyncio.to_thread(self.find, which)
+        else:
+            handle = service_of(which, "trade.acall")
         return await handle.acall(*args, **kwargs)
 
     async def acall_all(
-        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+        self, which: Constraint | str | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
     ) -> list[batch.Outcome]:
         """`call_all` from asyncio."""
         return await batch.all_outcomes_async(self._bound(which, args, kwargs))
@@ -165,7 +390,7 @@ class Lookup:
         return [outcome.result for outcome in outcomes if outcome.ok]
 
     def _bound(
-        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
+        self, which: Constraint | str | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> list[Bound]:
         self._check_open()
-        return batch.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)
+        return batch.bound(self.services(which) if isinstance(which, Constraint | str) else which, args, kwargs)

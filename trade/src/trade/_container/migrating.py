@@ -6,13 +6,11 @@ from typing import Any, Final
 from trade._calls.handle import Handle
 from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
-from trade._registry.constraints import Constraint
+from trade._registry.constraints import Constraint, as_constraint, services_at
 from trade._registry.registry import Registry
 from trade.errors import NoSuchService, TooManyServices
 
 _LONGEST_S: Final = 45.0
-_HEARD_S: Final = 1.0
-"""How long to wait until its new place is known here."""
 
 
 class Migrating:
@@ -23,7 +21,7 @@ class Migrating:
         self._registry = registry
 
     def migrate(
-        self, which: Handle | Constraint, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
+        self, which: Handle | Constraint | str, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
     ) -> tuple[Handle, ...]:
         """Moves a provider with its state to another container, on this host or another one.
 
@@ -33,7 +31,7 @@ class Migrating:
         they raise ServiceGone, which names the new place; constraints find it.
 
         Args:
-            which: a service of the provider, or a constraint that only its services match.
+            which: a service of the provider, or a constraint or a group as text that only its services match.
             to: name of the container; with ``*`` or ``?`` the least busy one that fits. It must allow the class.
             args: for the constructor there; by default those that it was instantiated with, if any.
 
@@ -53,10 +51,10 @@ class Migrating:
                 it is offered as before.
         """
         moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
-        self._registry.wait_for(lambda: all(self._registry.get(one.key) is not None for one in moved), _HEARD_S)
+        self._registry.wait_until_known(one.key for one in moved)
         return moved
 
-    def save_state(self, which: Handle | Constraint) -> Any:
+    def save_state(self, which: Handle | Constraint | str) -> Any:
         """The state that a provider returns from ``save_state()``, while it neither runs nor moves: plain data.
 
         Raises:
@@ -65,7 +63,7 @@ class Migrating:
         """
         return self._of(which, "save_state")
 
-    def restore_state(self, which: Handle | Constraint, state: Any) -> None:
+    def restore_state(self, which: Handle | Constraint | str, state: Any) -> None:
         """Gives a provider an earlier state back. Motion that it commands meanwhile is refused (S18).
 
         Raises:
@@ -74,8 +72,8 @@ class Migrating:
         """
         self._of(which, "restore_state", state)
 
-    def _of(self, which: Handle | Constraint, name: str, *args: Any) -> Any:
-        service = which if isinstance(which, Handle) else self._one(which)
+    def _of(self, which: Handle | Constraint | str, name: str, *args: Any) -> Any:
+        service = which if isinstance(which, Handle) else self._one(as_constraint(which, f"trade.{name}", services_at))
         key = ServiceKey(service.key.address, DOMAIN, PROVIDER, name)
         return self._lookup.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
 

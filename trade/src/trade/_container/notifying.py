@@ -1,17 +1,19 @@
 """The notification methods of a container: when an event occurs and a condition holds, make a call."""
 
 import time
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Final
 
 from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
+from trade._notifications.events import EventKind
 from trade._notifications.notification import Notification, NotificationInfo, Owner
 from trade._notifications.notifier import Notifier
 from trade._notifications.services import Hosted, placed
-from trade._notifications.triggers import OF_SERVICES, TriggerSpec, What, action_of, epoch_s, target_of
+from trade._notifications.triggers import OF_CHANGES, TriggerSpec, What, action_of, epoch_s, target_of
 from trade._protocol.keys import DOMAIN
-from trade._registry.constraints import Constraint, where
+from trade._registry.constraints import Constraint, as_constraint, services_at, where
 from trade._registry.registry import Registry
 from trade.errors import NoSuchNotification
 
@@ -29,14 +31,14 @@ class Notifying:
     # --- of services
 
     def joined(
-        self, constraint: Constraint, call: What, *, existing: bool = False, if_: What | None = None, host: str = ""
+        self, which: Constraint | str, call: What, *, existing: bool = False, if_: What | None = None, host: str = ""
     ) -> Notification:
         """Makes a call, with its handle, for every matching service that appears, one after the other.
 
         Args:
-            constraint: which services.
-            call: a handle, a bound call (the handle comes before its own arguments), a constraint that one service
-                matches, or a function of this process.
+            which: the services, by a constraint or as text.
+            call: a handle, a bound call (the handle comes before its own arguments), one service by a constraint or as
+                text, or a function of this process.
             existing: also once for each present service.
             if_: only if this returns True then; called without arguments.
             host: the container that keeps it; by default this one. It also ends with this one, unless it is detached.
@@ -45,20 +47,46 @@ class Notifying:
             ConfigurationError: the call is not callable, is a function for another container, or too many exist there.
             AccessDenied: with ``host=``, by the policy.
         """
-        terms = TriggerSpec(occasion="joined", constraint=constraint, existing=existing)
+        services = as_constraint(which, "trade.joined", services_at)
+        terms = TriggerSpec(occasion="joined", constraint=services, existing=existing)
         return self._notify(terms, call, if_, None, host)
 
-    def left(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
+    def left(self, which: Constraint | str, call: What, *, if_: What | None = None, host: str = "") -> Notification:
         """Makes a call, with its (stale) handle, for every matching service that disappears; else like `joined`."""
-        return self._notify(TriggerSpec(occasion="left", constraint=constraint), call, if_, None, host)
+        services = as_constraint(which, "trade.left", services_at)
+        return self._notify(TriggerSpec(occasion="left", constraint=services), call, if_, None, host)
 
-    def changed(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
+    def changed(self, which: Constraint | str, call: What, *, if_: What | None = None, host: str = "") -> Notification:
         """Makes a call for every service whose groups, metadata, health or description change, with its handle.
 
         It fires for services that match, and once more when they no longer do. One call may report several quick
         changes. The rest is as for `joined`.
         """
-        return self._notify(TriggerSpec(occasion="changed", constraint=constraint), call, if_, None, host)
+        services = as_constraint(which, "trade.changed", services_at)
+        return self._notify(TriggerSpec(occasion="changed", constraint=services), call, if_, None, host)
+
+    def occurred(
+        self,
+        events: EventKind | Sequence[EventKind],
+        call: What,
+        *,
+        about: Constraint | str | None = None,
+        if_: What | None = None,
+        host: str = "",
+    ) -> Notification:
+        """Makes a call, with the `StateEvent`, at each event of these kinds in one container; else like `joined`.
+
+        Args:
+            events: one kind or several, such as ``"unlinked"``, ``"hook_suspended"`` or ``"call_deviated"``.
+            call: as for `joined`; it takes a `StateEvent`.
+            about: only events about these services. An event about a container is about its service ``clock``: so
+                ``where(container="base")`` selects those about container base.
+            if_: as for `joined`.
+            host: the container whose events these are, and which keeps it; by default this one.
+        """
+        kinds = (events,) if isinstance(events, str) else tuple(events)
+        services = None if about is None else as_constraint(about, "trade.occurred", services_at)
+        return self._notify(TriggerSpec(occasion="occurred", events=kinds, constraint=services), call, if_, None, host)
 
     # --- of time
 
@@ -170,7 +198,7 @@ class Notifying:
     def _notify(self, terms: TriggerSpec, call: What, if_: What | None, when: What | None, host: str) -> Notification:
         terms.check()
         named = f"trade.{terms.occasion}"
-        target = target_of(call, named, "call", 1 if terms.occasion in OF_SERVICES else 0)
+        target = target_of(call, named, "call", 1 if terms.occasion in OF_CHANGES else 0)
         conditions = [None if what is None else target_of(what, named, "a condition", 0) for what in (if_, when)]
         own = self._lookup.home.address
         if not host or host == own.container:

@@ -33,6 +33,7 @@ class _ProxyMethod(Signature):
         self.info = info
         self._codec = codec
         self._plain = codec.decoder(Any)
+        self._result_is_plain = Any
         self._positional = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
         properties: dict[str, Any] = read_schema(info.arguments_schema).get("properties", {})
         self._secrets = frozenset(name for name, schema in properties.items() if schema.get("writeOnly"))

@@ -3,7 +3,7 @@
 import time
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from trade._discovery.dialer import Dialer
 from trade._protocol.keys import Address
@@ -27,12 +27,14 @@ class Reachability(Struct, frozen=True):
     silent: tuple[str, ...] = ()
     """The present containers that have not listed their services yet."""
     apart: dict[str, str] = {}
-    """The endpoints of ``Settings.connect`` where no container was found, and the reasons, as far as is known."""
+    """The endpoints of ``Settings.connect``, or of the hub, where no container was found; with reasons, if known."""
+    source: str = "TRADE_CONNECT"
+    """Where these endpoints are from."""
 
     @property
     def unanswered(self) -> tuple[str, ...]:
         """These endpoints and reasons, as text for errors."""
-        return tuple(f"{endpoint} (TRADE_CONNECT): {why}" for endpoint, why in self.apart.items())
+        return tuple(f"{endpoint} ({self.source}): {why}" for endpoint, why in self.apart.items())
 
     @property
     def complete(self) -> bool:
@@ -55,7 +57,7 @@ def look_around(registry: Registry, reach: Dialer | None, own: Address, system: 
     until = time.monotonic() + limit_s
     while not (found := _reachability(registry, reach, own)).complete and time.monotonic() < until:
         time.sleep(_LOOK_S)
-    return found if reach is None else Reachability(found.others, found.silent, _apart(reach, own, system, found))
+    return found if reach is None else structs.replace(found, apart=_apart(reach, own, system, found))
 
 
 def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Reachability:
@@ -65,6 +67,7 @@ def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Rea
         others=tuple(state.address.who for state in states),
         silent=tuple(state.address.who for state in states if not state.heard.complete),
         apart=dict.fromkeys(unlinked, ""),
+        source="" if reach is None else reach.source,
     )
 
 

@@ -12,6 +12,7 @@ from trade._estop.deadman import Deadman
 from trade._protocol.keys import DOMAIN
 from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
 from trade._registry.constraints import checked_meta
+from trade._services.decorator import provider_of
 from trade._services.providers import Providers
 from trade._services.registration import checked_groups, checked_health
 from trade._services.withdrawn import Withdrawn
@@ -40,7 +41,7 @@ class Registering:
         """Offers an object's services to the whole system.
 
         Args:
-            provider: an object whose class, bases or interfaces have ``@service`` methods.
+            provider: an object whose class, bases or interfaces have ``@service`` methods, or a ``@service`` function.
             groups: dotted labels such as ``"rosie.head"``.
             implements: interfaces (protocols) that the object fits without inheriting from them.
             meta: numbers, texts and booleans by name, for all its services; they override the services' own metadata.
@@ -53,6 +54,7 @@ class Registering:
                 already.
             AccessDenied: the policy does not let this container offer it in one of these groups.
         """
+        provider = provider_of(provider)
         try:
             keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
@@ -77,6 +79,7 @@ class Registering:
         Raises:
             ConfigurationError: it is not registered here.
         """
+        provider = provider_of(provider)
         if not self._withdrawn.forget(provider):
             for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
                 _logger.error("a provider was withdrawn but could not be stopped: %s", problem)
@@ -128,6 +131,6 @@ class Registering:
 
     def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
         try:
-            self._providers.alter(provider, change, reread=reread)
+            self._providers.alter(provider_of(provider), change, reread=reread)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self._lookup.home.address) from None

@@ -4,13 +4,15 @@ import contextlib
 import logging
 import math
 import time
-from typing import Final
+from collections.abc import Callable
+from typing import Final, cast
 
 from trade._calls.handle import Handle
 from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
 from trade._notifications.triggers import Action, Target, What, target_of
-from trade._registry.constraints import Constraint
+from trade._protocol.samples import Value
+from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade._streams.source import LEAST_HZ, MOST_HZ, check_sampled
 from trade._streams.stream import If, Stream
 from trade._streams.subscriptions import Subscriptions
@@ -33,21 +35,22 @@ class Streaming:
 
     def stream(
         self,
-        target: Handle | Constraint,
+        target: Callable[..., Value] | Constraint | str,
         *,
         hz: float = 10.0,
         on_change: bool = False,
         if_: If | None = None,
         call: What | None = None,
         keep: int = 16,
-    ) -> Stream:
+    ) -> "Stream[Value]":
         """Samples a service while the stream is open: ``with container.stream(state, hz=20) as samples:``.
 
         Its own container calls it, once for all subscribers, at the highest of their rates; without subscribers it is
         not called at all. The stream ends with `Stream.close`, the session that opened it, or this container.
 
         Args:
-            target: a service that only reads and needs no arguments, or a constraint that one such service matches.
+            target: a service that only reads and needs no arguments, as a handle, as text by its group and name, or as
+                a constraint that only it matches. Type checkers know the values of ``stream(arm.state)``.
             hz: the most samples per second, from 0.001 to 1000.
             on_change: only samples that differ from the one before.
             if_: only samples for whose value this returns True; a function of this process.
@@ -63,14 +66,12 @@ class Streaming:
         """
         _check("hz", hz, LEAST_HZ, MOST_HZ)
         _check("keep", keep, 1, _MOST_KEPT)
-        if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
-            problem = f"target must be a handle or where(...), not {target!r}"
-            raise ConfigurationError(where="trade.stream", problem=problem)
+        which = _which(target)
         if if_ is not None and (isinstance(if_, Handle) or not callable(if_)):
             problem = f"if_ must be a function of the value, not {if_!r}"
             raise ConfigurationError(where="trade.stream", problem=problem)
         pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
-        source = target if isinstance(target, Handle) else self._lookup.find(target)
+        source = which if isinstance(which, Handle) else self._lookup.find(which)
         check_sampled(source)
         client = speaking.get()
         opened_by = client if client is not None and client.owner == self._lookup.home.address else None
@@ -125,6 +126,12 @@ class _Push:
             hint = _AGAIN if isinstance(error, SourceLost | ServiceGone) else ""
             _logger.warning("a sample of %r was not passed on: %s: %s%s", self._stream, kind, error, hint)
         self._problem = kind
+
+
+def _which(target: object) -> Handle | Constraint:
+    if isinstance(target, Handle):
+        return cast("Handle", target)
+    return as_constraint(target, "trade.stream", service_at)
 
 
 def _check(name: str, value: float, least: float, most: float) -> None:

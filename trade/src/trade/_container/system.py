@@ -4,17 +4,20 @@ import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from trade._calls.handle import Handle
 from trade._discovery.dialer import Dialer
+from trade._migration.delivered_code import CodeStore, pack
+from trade._notifications.events import EventLog
 from trade._protocol.container_info import ContainerInfo
-from trade._protocol.keys import CLOCK, DOMAIN, Address, ServiceKey
+from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
 from trade._remote.ssh import start
 from trade._services.decorator import service
 from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
+from trade._table import Table
 from trade._telemetry.load import LoadInfo, LoadMeter
 from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
@@ -26,6 +29,8 @@ class _Withdrawn(Protocol):
 
 
 class _Making(Protocol):
+    @property
+    def code(self) -> CodeStore: ...
     def find(self, class_path: str) -> type: ...
     def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object: ...
     def offer(
@@ -48,6 +53,7 @@ class _Member(Protocol):
     """The container that is controlled."""
 
     address: Final[Address]
+    events: Final[EventLog]
     meter: LoadMeter
 
     @property
@@ -62,9 +68,9 @@ class _Member(Protocol):
     def terminating(self) -> _Terminating: ...
     @property
     def settings(self) -> Settings: ...
-    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
     def handle(self, key: ServiceKey) -> Handle: ...
-    def containers(self) -> list[ContainerInfo]: ...
+    def containers(self) -> Table[ContainerInfo]: ...
     def load_policy(self, path: str) -> None: ...
 
 
@@ -82,11 +88,23 @@ class System:
 
         It searches where the container listens: on this host, or on its networks.
         """
-        self._member().reach.set_discovery(on)
+        member = self._member()
+        was = member.reach.discovers
+        member.reach.set_discovery(on)
+        self._note_switched("discovery", was=was, on=on)
 
     def set_broadcast(self, on: bool) -> None:
         """Switches broadcasting: answers the discovery of other containers of this system."""
-        self._member().reach.set_broadcast(on)
+        member = self._member()
+        was = member.reach.broadcasts
+        member.reach.set_broadcast(on)
+        self._note_switched("broadcast", was=was, on=on)
+
+    def _note_switched(self, what: Literal["discovery", "broadcast"], *, was: bool, on: bool) -> None:
+        if was is not on:
+            member = self._member()
+            clock = member.handle(ServiceKey(member.address, DOMAIN, PROVIDER, CLOCK)).record
+            member.events.note(what, member.address.container, "on" if on else "off", clock)
 
     def connect(self, endpoint: str) -> None:
         """Links to the container at an endpoint, and again whenever the link is lost.
@@ -113,7 +131,7 @@ class System:
             raise LinkStays(to=endpoint)
         self._member().reach.disconnect(endpoint)
 
-    def containers(self) -> list[ContainerInfo]:
+    def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
         return self._member().containers()
 
@@ -187,6 +205,43 @@ class System:
         if state is not None:
             return tuple(member.handle(key) for key in member.arriving.bring_back(class_path, args, named, state))
         return making.offer(making.make(making.find(class_path), args), named, args)
+
+    def add_code(self, archive: bytes) -> str:
+        """Keeps an archive of modules in this container, which imports from it now and after a restart.
+
+        What is installed comes first, so an archive replaces nothing. Code that was imported stays as it is: a new
+        version needs a new container.
+
+        Args:
+            archive: the bytes of a wheel or a zip file without compiled modules, at most 32 MiB.
+
+        Returns:
+            Its SHA-256.
+
+        Raises:
+            CodeRefused: ``Settings.code`` does not list the hash, or it cannot be kept; nothing was imported.
+        """
+        return self._member().making.code.add(archive)
+
+    def send_code(self, container: str, path: Path, *, deadline_s: float = 60.0) -> str:
+        """Brings a wheel or a folder of modules to another container, which must list its hash: `trade code PATH`.
+
+        Args:
+            container: the name of the container.
+            path: a wheel, a zip file or a folder.
+            deadline_s: how long it may take, in seconds.
+
+        Returns:
+            The SHA-256 of the archive.
+
+        Raises:
+            CodeRefused: the container does not take it.
+            ConfigurationError: it cannot be read, has no modules, has compiled ones, or is too large.
+        """
+        archive = pack(path)
+        taking = self._member().find(where(name="add_code", group=DOMAIN, container=container))
+        sha256: str = taking.with_(deadline_s=deadline_s)(archive)
+        return sha256
 
     def start_container(
         self,

@@ -10,7 +10,7 @@ from typing import Any, Final
 from msgspec import Raw
 
 from trade._context.sessions import within
-from trade._protocol.messages import Call, Status, encode_message
+from trade._protocol.messages import Call, LargeBytes, Status, encode_message
 from trade._protocol.remote_errors import pack_error
 from trade.errors import Cancelled, OutcomeUnknown
 
@@ -22,7 +22,7 @@ MOST_BYTES: Final = 64 << 20
 MOST_CALLS: Final = 65_536
 _MOST_CALLERS: Final = 1024
 
-Answer = tuple[int, Raw]
+Answer = tuple[int, Raw | LargeBytes]
 Key = tuple[str, int]
 """Who called, and the call's id."""
 
@@ -149,7 +149,7 @@ class CallDeduplicator:
             key = (ongoing.caller, call.id)
             if keep:
                 now = time.monotonic_ns()
-                self._keep_body(key, ongoing, len(memoryview(answer[1])), call.service)
+                self._keep_body(key, ongoing, len(answer[1]), call.service)
                 heappush(self._until, ((call.expires_ns or now) + GRACE_NS, key))
                 self._evict(now)
             else:

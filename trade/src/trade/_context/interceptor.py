@@ -43,6 +43,14 @@ class ServedCall(NamedTuple):
     context: CallContext
 
 
+class CallGuard(Protocol):
+    """Code that may refuse a call once it is admitted, before the service runs."""
+
+    def require(self, call: ServedCall) -> None:
+        """Raises CallRefused, or the reason why the call must no longer run."""
+        ...
+
+
 class Interceptor(ABC):
     """Code that runs in place of a service, and calls it with ``proceed()``."""
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable
 from contextvars import ContextVar
 from typing import Final
 
-from trade._protocol.keys import Address
+from trade._protocol.keys import Address, as_chunk
 from trade._transport.base import Presence
 from trade.errors import SessionEnded
 
@@ -57,6 +57,11 @@ def foreign(session: str) -> str:
     identity, *chunks = session.split("/")
     system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
     return f"{system}/{client.rpartition('.')[0]} via {identity}" if crossed else ""
+
+
+def client_name(client: str) -> str:
+    """A client's name as it is part of the name of its session."""
+    return as_chunk(client)[:40]
 
 
 def client_of(session: str) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._transport.endpoints import Endpoint, accepts
-from trade._transport.zenoh_links import Beacon, Links
+from trade._transport.zenoh_links import WITHOUT_HUB, Beacon, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
 
 _logger = logging.getLogger("trade")
@@ -36,9 +36,11 @@ class Dialer:
         self._discovering = False
         self._kept: dict[str, str] = {}
         """From each endpoint to the id of the session found there."""
-        self.configured: Final = tuple(configured)
-        """The endpoints to dial that its settings name."""
-        self._unsure = list(configured)
+        self.configured: Final = (links.hub,) if links.hub else tuple(configured)
+        """The endpoints to dial that its settings name, or that of the hub of this host."""
+        self.source: Final = "the hub of this host" if links.hub else "TRADE_CONNECT"
+        """Where these are from."""
+        self._unsure = list(self.configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
         self._thread: threading.Thread | None = None
@@ -57,7 +59,7 @@ class Dialer:
 
     def set_broadcast(self, on: bool) -> None:
         with self._lock:
-            self._check_open()
+            self._check_dials(on)
             if on and self._beacon is None:
                 self._beacon = self._links.beacon()
             elif not on:
@@ -70,7 +72,7 @@ class Dialer:
 
     def set_discovery(self, on: bool) -> None:
         with self._lock:
-            self._check_open()
+            self._check_dials(on)
             self._discovering = on
             self._refused.clear()
             self._ensure_thread()
@@ -79,6 +81,8 @@ class Dialer:
     def connect(self, endpoint: str) -> None:
         self._check_open()
         self._may_dial(endpoint)
+        if self._links.hub:
+            raise CannotConnect(endpoint=endpoint, reason=_ATTACHED.format(hub=self._links.hub))
         there = self._dial(endpoint)
         if not there:
             raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links))
@@ -101,6 +105,12 @@ class Dialer:
         found = asked.resolved() if asked.protocol in ("tcp", "udp") and not asked.rest else [endpoint]
         return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
 
+    def dialled(self) -> dict[str, bool]:
+        """The endpoints that it dials, and whether a link leads to each."""
+        with self._lock:
+            endpoints = dict.fromkeys((*self._links.connect, *self._kept))
+        return {endpoint: self._links.linked_at(endpoint) for endpoint in endpoints}
+
     def unlinked(self) -> list[str]:
         """The configured endpoints that no link leads to."""
         return [endpoint for endpoint in self.configured if not self._links.linked_at(endpoint)]
@@ -117,7 +127,7 @@ class Dialer:
             The reason; empty if a link exists.
         """
         why = _why(endpoint, self._links)
-        if certain or not accepts(endpoint):
+        if certain or self._links.hub or not accepts(endpoint):
             return why
         return "" if self._dial(endpoint) else why
 
@@ -178,6 +188,11 @@ class Dialer:
     def _ended(self) -> bool:
         return self._closed
 
+    def _check_dials(self, on: bool) -> None:
+        self._check_open()
+        if on and self._links.hub:
+            raise ConfigurationError(where="discovery", problem=_ATTACHED.format(hub=self._links.hub))
+
     def _check_open(self) -> None:
         if self._closed:
             raise ConfigurationError(problem="the container is closed")
@@ -201,11 +216,17 @@ _REFUSED: Final = {
     ),
 }
 """By whether this container has a certificate."""
+_ATTACHED: Final = (
+    "this container is attached to the hub of its host at {hub}, which links it to others: let the hub link to them "
+    "(TRADE_CONNECT where it runs), or set TRADE_HUB=off for this container"
+)
 _BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
 
 
 def _why(endpoint: str, links: Links) -> str:
     if not accepts(endpoint):
+        if links.hub:
+            return WITHOUT_HUB
         return "nothing accepts connections there. Is it up, and is the address right?"
     refused = _REFUSED[links.certified]
     return refused + _BRIDGES if links.bridges else refused

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from trade._atomic_file import replace
 from trade._paths import runtime_folder
 from trade._transport.endpoints import accepts, free_endpoint
 
@@ -36,13 +37,11 @@ class HostFolder:
         A container that cannot write, as on a full disk, still dials the others: it may be there to stop them.
         """
         name = endpoint.replace("/", "_").replace(":", "_")
-        own, fresh = self._folder / name, self._folder / f".{name}.{os.getpid()}"
+        own = self._folder / name
         try:
-            fresh.write_text(f"{endpoint}\n{os.getpid()}\n{time.monotonic()}\n", encoding="ascii")
-            self._own = fresh.replace(own)
+            replace(own, f"{endpoint}\n{os.getpid()}\n{time.monotonic()}\n".encode("ascii"))
+            self._own = own
         except OSError as bad:
-            with contextlib.suppress(OSError):
-                fresh.unlink()
             _logger.warning("%s cannot be written: %s. Later containers on this host may not find this one", own, bad)
         return self._others()
 

@@ -146,7 +146,7 @@ class RegistryListener:
         self._returned(session)
         if not client:
             self._lost(address, back=True)
-            if self._registry.appear(address) or was_away:
+            if self._registry.appear(address) or (was_away and self._registry.reopen(address)):
                 self._asker.request(address, appeared=True)
 
     def _gone(self, session: str) -> None:
@@ -187,6 +187,8 @@ class RegistryListener:
         for other_message, other in others:
             self._of_another_version(other_message, other)
         state = meant.get(speakers.pop()) if speakers else None
+        if state is not None:
+            state.transport = answer.who
         if state is not None and revision is not None:
             self._registry.settle(state, revision, offered)  # the tally comes last; without it the reply is incomplete
         elif state is not None and others and others[-1][0].key == tally_key(state.address):

@@ -207,9 +207,14 @@ class EstopController:
         pieces = [tuple(ids[first : first + MOST_CLEARED]) for first in range(0, len(ids), MOST_CLEARED)]
         orders = [EstopOrder(PROTOCOL, secrets.token_hex(4), None, piece) for piece in pieces]
 
+        def knowing() -> set[Address]:
+            reporting = (r for r in self._own_records() if any(estop.id in ids for estop in r.estops))
+            return {record.key.address for record in reporting}
+
+        before = knowing()  # a container that clears them at once does not report them any more
+
         def expected() -> set[Address]:
-            knowing = (r.key.address for r in self._own_records() if any(estop.id in ids for estop in r.estops))
-            return {*self._with_stops(), *self._unread(), *knowing}
+            return {*self._with_stops(), *self._unread(), *before, *knowing()}
 
         report = self._line.ask(orders, expected, limit_s, lambda: False)
         self._registry.wait_for(lambda: not self._still_reported(ids, report.confirmed), _ENTRY_LAG_S)

@@ -1,12 +1,12 @@
 """Open e-stops on disk: a folder for each container with a file for each e-stop, read at the next start."""
 
 import os
-import secrets
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
+from trade._atomic_file import replace
 from trade._protocol.keys import Address, is_chunk
 from trade._protocol.messages import UNREADABLE, Estop
 
@@ -40,15 +40,7 @@ class EstopStore:
             return
         for folder in (self._shared, self._own.parent, self._own):
             folder.mkdir(mode=_PRIVATE, parents=True, exist_ok=True)
-        fresh = self._own / f".{estop.id}.{secrets.token_hex(4)}"  # a program that runs twice writes it twice
-        try:
-            with fresh.open("wb") as file:
-                file.write(msgspec.json.encode(estop))
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self._own / f"{estop.id}.json")
-        finally:
-            fresh.unlink(missing_ok=True)
+        replace(self._own / f"{estop.id}.json", msgspec.json.encode(estop))
 
     def remove(self, estop_id: str) -> None:
         """Removes an e-stop, if it has a file. Raises OSError."""

@@ -21,15 +21,14 @@ from trade._registry.constraints import Constraint
 from trade._registry.registry import Change, Record
 from trade._services.local_service import LocalService
 from trade._telemetry.spans import SpanRecorder, Spans, traceable
+from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
 
 _logger = logging.getLogger("trade")
 
-ONE_S: Final = 0.1
-"""How long a hook may take."""
-ALL_S: Final = 0.25
-"""How long all hooks of one side of a call may take together."""
+_TOGETHER: Final = 2.5
+"""How long all hooks of one side of a call may take together, in limits of one."""
 _TRIES: Final = 3
 """A hook is suspended after this many failures in a row."""
 _MOST: Final = 1000
@@ -132,19 +131,18 @@ class AttachedHook:
             return self.target.key == record.key
         return self.target.matches(record)
 
-    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
-        """Call the hook within its time limit. Whatever its outcome, the watched call continues."""
-        if self.call.label in chain or left_s <= 0:
+    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], allowed_s: float) -> None:
+        """Call the hook within this time. Whatever its outcome, the watched call continues."""
+        if self.call.label in chain or allowed_s <= 0:
             self.skipped += 1
             return
         try:
             home.require_call(self.identity, self.call)
-            allowed_s = min(ONE_S, left_s)
             self.call.with_(deadline_s=allowed_s).start(called).result(allowed_s)
             self.fired += 1
             self._in_a_row = 0
         except TimeoutError:
-            self._failed(f"cut off: it took longer than its {ONE_S:g} s, or all hooks took too long together")
+            self._failed(f"cut off: it took longer than the {allowed_s:.3g} s that it had")
         except BaseException as error:  # noqa: BLE001 - an error of a hook never reaches the caller
             self._failed(f"{type(error).__name__}: {error}")
 
@@ -158,16 +156,49 @@ class AttachedHook:
             self._tell_suspended(self)
 
 
+class CallCopies:
+    """Makes the copies of calls that hooks and guards get: they see the values, and cannot change them."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._encode = codec.encode
+        self._decode = codec.decoder(Any)
+
+    def event(self, call: ServedCall, handle: Handle) -> HookEvent:
+        """The call of a service as it is before it runs."""
+        context, named = call.context, call.service.signature.named(call.args, call.kwargs)
+        return HookEvent(
+            service=handle,
+            args={name: self.plain(value) for name, value in named.items()},
+            caller=context.caller,
+            session=context.session,
+            call_id=context.id,
+            chain=context.chain,
+        )
+
+    def plain(self, value: Any) -> Any:
+        """A copy that can be sent."""
+        try:
+            return self._decode(self._encode(value))
+        except Exception:  # noqa: BLE001 - only a local call without strict can carry such a value
+            return repr(value)
+
+
 class HookInterceptor(Interceptor):
     """The hooks of one service in this container."""
 
     def __init__(
-        self, home: HookHost, codec: Codec, scheduler: Scheduler, handle: Handle, hooks: Sequence[AttachedHook]
+        self,
+        home: HookHost,
+        copies: CallCopies,
+        scheduler: Scheduler,
+        limit_s: float,
+        handle: Handle,
+        hooks: Sequence[AttachedHook],
     ) -> None:
         self._home = home
-        self._encode = codec.encode
-        self._decode = codec.decoder(Any)
+        self._copies = copies
         self._scheduler = scheduler
+        self._limit_s = limit_s
         self._handle = handle
         self._before = [hook for hook in hooks if hook.side == "before"]
         self._after = [hook for hook in hooks if hook.side == "after"]
@@ -176,7 +207,7 @@ class HookInterceptor(Interceptor):
         """Call the service with its hooks around it. Its own errors pass through."""
         began_ns = time.monotonic_ns()
         service, _, _, context = call
-        called = self._called(call)
+        called = self._copies.event(call, self._handle)
         if self._before and service.effect != "stop":
             self._call(self._before, called, context)
             if service.too_late(context.expires_ns):
@@ -191,7 +222,7 @@ class HookInterceptor(Interceptor):
             if self._after:
                 took_s = (time.monotonic_ns() - began_ns) / 1e9
                 ended = msgspec.structs.replace(
-                    called, ended=True, result=self._plain(result), error=error, took_s=took_s
+                    called, ended=True, result=self._copies.plain(result), error=error, took_s=took_s
                 )
                 if service.effect == "stop":  # nothing holds up the answer to a stop
                     self._scheduler.begin(lambda: self._call(self._after, ended, context), time.monotonic_ns())
@@ -201,29 +232,12 @@ class HookInterceptor(Interceptor):
 
     def _call(self, hooks: Sequence[AttachedHook], called: HookEvent, context: CallContext) -> None:
         chain = (*context.chain, context.service)
-        until_ns = time.monotonic_ns() + int(ALL_S * 1e9)
-        with _as_the_container(context):
+        until_ns = time.monotonic_ns() + int(_TOGETHER * self._limit_s * 1e9)
+        with as_the_container(context, context.service, context.chain, context.expires_ns):
             for hook in hooks:
                 if not hook.suspended:
-                    hook.tell(self._home, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
-
-    def _called(self, call: ServedCall) -> HookEvent:
-        context, named = call.context, call.service.signature.named(call.args, call.kwargs)
-        return HookEvent(
-            service=self._handle,
-            args={name: self._plain(value) for name, value in named.items()},
-            caller=context.caller,
-            session=context.session,
-            call_id=context.id,
-            chain=context.chain,
-        )
-
-    def _plain(self, value: Any) -> Any:
-        """A copy that can be sent: hooks see the values, and cannot change them."""
-        try:
-            return self._decode(self._encode(value))
-        except Exception:  # noqa: BLE001 - only a local call without strict can carry such a value
-            return repr(value)
+                    left_s = (until_ns - time.monotonic_ns()) / 1e9
+                    hook.tell(self._home, called, chain, min(self._limit_s, left_s))
 
 
 def _error_text(service: ServedService, error: BaseException) -> str:
@@ -233,9 +247,16 @@ def _error_text(service: ServedService, error: BaseException) -> str:
 
 
 @contextmanager
-def _as_the_container(context: CallContext):
-    """Runs hook calls within the watched call's chain and session, but without its locks."""
-    bare = CallContext(context.id, context.service, context.caller, context.session, context.expires_ns, context.chain)
+def as_the_container(context: CallContext, what: str, chain: tuple[str, ...], expires_ns: int | None):
+    """Runs calls of hooks and guards within the session of the call that they see, but without its locks.
+
+    Args:
+        context: that call.
+        what: what makes them, as the chain of the calls shows it.
+        chain: what led there, outermost first.
+        expires_ns: their deadline.
+    """
+    bare = CallContext(context.id, what, context.caller, context.session, expires_ns, chain)
     tokens = running.set(bare), holding.set(()), speaking.set(None)
     try:
         yield
@@ -251,15 +272,17 @@ class Hooks:
     def __init__(
         self,
         home: HookHost,
-        codec: Codec,
+        copies: CallCopies,
         scheduler: Scheduler,
+        limit_s: float,
         services: Callable[[ServiceKey], LocalService | None],
         records: Callable[[], list[Record]],
         denied: Denied,
     ) -> None:
         self._home = home
-        self._codec = codec
+        self._copies = copies
         self._scheduler = scheduler
+        self._limit_s = limit_s
         self._services = services
         self._records = records
         self._denied = denied
@@ -268,8 +291,8 @@ class Hooks:
         """By session and name."""
         self._spans: Spans | None = None
         """The spans of this container while it is traced."""
-        self.suspended: Callable[[AttachedHook], None] = lambda _: None
-        """Called for each hook that is suspended."""
+        self.suspended: Final = Event[AttachedHook]()
+        """Emitted with each hook that is suspended."""
 
     def attach(
         self, name: str, side: Side, target: Handle | Constraint, call: Handle, owner: str, identity: str
@@ -280,7 +303,7 @@ class Hooks:
             AccessDenied: its owner may instrument none of the services here.
             ConfigurationError: the hook is to run before a stop service, or there are too many hooks.
         """
-        hook = AttachedHook(name, side, target, call, owner, identity, self.suspended_now)
+        hook = AttachedHook(name, side, target, call, owner, identity, self.suspended.emit)
         with self._lock:
             if (owner, name) not in self._attached and len(self._attached) >= _MOST:
                 raise ConfigurationError(where=self._home.name, problem=f"{_MOST} hooks are attached here already")
@@ -295,9 +318,6 @@ class Hooks:
             known = self._attached.setdefault((owner, name), hook)
             self._refresh()
             return sorted(known.services.values())
-
-    def suspended_now(self, hook: AttachedHook) -> None:
-        self.suspended(hook)
 
     def detach(self, owner: str, name: str) -> bool:
         """Detach a hook; returns whether it existed."""
@@ -359,7 +379,7 @@ class Hooks:
             yield SpanRecorder(self._spans)
         if hooks:
             handle = self._home.handle(record.key)
-            yield HookInterceptor(self._home, self._codec, self._scheduler, handle, hooks)
+            yield HookInterceptor(self._home, self._copies, self._scheduler, self._limit_s, handle, hooks)
 
     def _concerns(self, hook: AttachedHook, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None

@@ -9,6 +9,7 @@ from trade._hooks.hook import AttachedHook, HookInfo, Hooks, Side
 from trade._notifications.services import NotificationServicesHost
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint
+from trade._registry.registry import Registry
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, ConfigurationError
@@ -19,11 +20,12 @@ _logger = logging.getLogger("trade")
 class HookServices:
     """The wire side of `Hooks`."""
 
-    def __init__(self, hooks: Hooks, home: NotificationServicesHost, access: Authorizer) -> None:
+    def __init__(self, hooks: Hooks, registry: Registry, home: NotificationServicesHost, access: Authorizer) -> None:
         self._hooks = hooks
+        self._known = registry
         self._watched = home
         self._hook_access = access
-        hooks.suspended = self._notify_hook_owner
+        hooks.suspended.subscribe(self._notify_hook_owner)
 
     @service
     def attach_hook(
@@ -33,6 +35,7 @@ class HookServices:
         asked, target = served_call(), constraint if handle is None else handle
         if target is None:
             raise ConfigurationError(where="attach_hook", problem="it needs a handle or a constraint")
+        self._known.wait_until_known([call.key])  # calls under way do not wait for it
         return self._hooks.attach(name, side, target, call, asked.session, asked.caller)
 
     @service

@@ -11,9 +11,11 @@ from trade._context.outgoing import Claim
 from trade._locks.lease_client import LeaseClient
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
-from trade._registry.constraints import Constraint, Term, under
+from trade._registry.constraints import Constraint, Term, as_constraint, group_at, under
 from trade._resources.grants import LockInfo, LockRequest
 from trade._security.authorizer import Authorizer
+from trade._table import Table
+from trade._transport.wait_clock import WaitClock
 from trade.errors import (
     Busy,
     ConfigurationError,
@@ -31,6 +33,13 @@ LEASE_S: Final = 2.0
 """The default lease of a lock, which is also the time limit of the deadman (S12)."""
 RESUME_WAIT_S: Final = 2.0
 _SETTLE_S: Final = 1.0
+_COLUMNS: Final = {
+    "LOCKED": "resources",
+    "OWNER": "holder.owner",
+    "PURPOSE": "holder.purpose",
+    "LEFT (s)": "left_s",
+    "WAITING": "waiting",
+}
 _ANSWER_S: Final = 2.0
 """How long a container may take to list its locks."""
 
@@ -55,7 +64,7 @@ class LockHost(Protocol):
     @property
     def address(self) -> Address: ...
     def handle(self, key: ServiceKey) -> Handle: ...
-    def services(self, constraint: Constraint | None = None) -> list[Handle]: ...
+    def services(self, constraint: Constraint | None = None, /) -> list[Handle]: ...
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None: ...
     def addresses(self) -> list[Address]: ...
 
@@ -63,13 +72,13 @@ class LockHost(Protocol):
 class LockApi:
     """The lock methods of one container; ``container.locking``."""
 
-    def __init__(self, home: LockHost) -> None:
+    def __init__(self, home: LockHost, clock: WaitClock) -> None:
         self._home = home
-        self.lease_client: Final = LeaseClient(home)
+        self.lease_client: Final = LeaseClient(home, clock)
 
     def lock(
         self,
-        which: Constraint | Iterable[Handle],
+        which: Constraint | str | Iterable[Handle],
         *,
         purpose: str = "",
         wait_s: float = 10.0,
@@ -85,10 +94,10 @@ class LockApi:
         It acquires nothing before the context is entered or `Lock.acquire` is called.
 
         Args:
-            which: handles, or a constraint, for the actuating services that match when the lock is acquired. If nothing
-                matches yet, the lock waits for a match, and then for the whole of a robot's group. Of ``A | B`` it
-                takes a part of each, or nothing. Under the lock, a service that such a constraint selects but the lock
-                does not hold cannot be commanded.
+            which: handles; or a constraint or a group as text, for the actuating services that match when the lock is
+                acquired. If nothing matches yet, the lock waits for a match, and then for the whole of a robot's group.
+                Of ``A | B`` it takes a part of each, or nothing. Under the lock, a service that such a constraint
+                selects but the lock does not hold cannot be commanded.
             purpose: the reason, as other clients see it.
             wait_s: how long to wait for other clients and missing services, in seconds; 0 does not wait. Inside a call
                 the wait ends before that call's deadline.
@@ -116,13 +125,15 @@ class LockApi:
             purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates)
         )
 
-        def wanted() -> Selection:
-            handles = self._there(which, wait_s, partial=partial)
-            self._require("lock", handles, which)
-            return Selection(resources_of(handles), tuple(absent(which, handles)))
+        meant = _meant(which, "lock")
 
-        claim = Claim(which if isinstance(which, Constraint) else None)
-        return Lock(self.lease_client, terms, wanted, on_lost, on_request, claim)
+        def wanted() -> Selection:
+            handles = self._there(meant, wait_s, partial=partial)
+            self._require("lock", handles, meant)
+            return Selection(resources_of(handles), tuple(absent(meant, handles)))
+
+        claim = Claim(meant if isinstance(meant, Constraint) else None)
+        return Lock(self.lease_client, terms, wanted, on_lost, on_request, claim, _text(meant))
 
     def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
         """The services to lock. If nothing matches yet, it waits until the whole selection exists.
@@ -162,7 +173,7 @@ class LockApi:
             return look()  # a part of it exists, and the error names the missing ones
         return found
 
-    def locks(self) -> list[LockInfo]:
+    def locks(self) -> Table[LockInfo]:
         """Every lock in the system, with its resources, owner, purpose, start and waiters.
 
         Containers that do not answer within 2 s are omitted, and named in the log.
@@ -171,7 +182,7 @@ class LockApi:
         if known.silent:
             who = ", ".join(address.who for address in known.silent)
             _logger.warning("the locks in %s are not known: no answer within %g s", who, _ANSWER_S)
-        return known.locks
+        return Table(known.locks, _COLUMNS)
 
     def known(self) -> LockOverview:
         """The known locks of the system, and the containers that did not answer."""
@@ -189,19 +200,19 @@ class LockApi:
                 continue
         return LockOverview(sorted(found, key=lambda info: (info.resources, info.container)), silent)
 
-    def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
+    def request_release(self, which: Constraint | str | Iterable[Handle], reason: str) -> list[str]:
         """Asks the owners of locks on these services to release them; they learn which client asks, and why.
 
         Returns:
             The owners.
         """
-        return self._everywhere("request_release", which, reason)
+        return self._everywhere("request_release", _meant(which, "request_release"), reason)
 
-    def resume(self, which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
+    def resume(self, which: Constraint | str | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
         """Lets services move again after a stop by another client.
 
         Args:
-            which: handles, or a constraint: the actuating services that match.
+            which: handles, or a constraint or a group as text: the actuating services that match.
             wait_s: how long to wait for services that match the constraint, in seconds.
 
         Returns:
@@ -214,9 +225,10 @@ class LockApi:
         """
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="resume", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
-        if isinstance(which, Constraint):
-            self._await_some(which, wait_s)
-        return self._everywhere("resume", which)
+        meant = _meant(which, "resume")
+        if isinstance(meant, Constraint):
+            self._await_some(meant, wait_s)
+        return self._everywhere("resume", meant)
 
     def _await_some(self, which: Constraint, wait_s: float) -> None:
         """Waits until a service can be resumed, and a moment for the others; later ones are omitted.
@@ -243,7 +255,7 @@ class LockApi:
         with contextlib.suppress(NoSuchService):
             self._home.await_services(which, whole, min(wait_s, _SETTLE_S))
 
-    def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
+    def break_lock(self, which: Constraint | str | Iterable[Handle], reason: str) -> list[LockInfo]:
         """Takes the locks on these services away from their owners; motion under them stops.
 
         Returns:
@@ -252,8 +264,9 @@ class LockApi:
         Raises:
             AccessDenied: the policy does not let this container administer one of them.
         """
-        handles = selected(which, self._home.services)
-        self._require("administer", handles, which)
+        meant = _meant(which, "break_lock")
+        handles = selected(meant, self._home.services)
+        self._require("administer", handles, meant)
         wanted = resources_of(handles)
         broken: list[LockInfo] = []
         for address, names in wanted.items():
@@ -278,6 +291,28 @@ class LockApi:
         return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
 
 
+def _meant(which: Constraint | str | Iterable[Handle], function: str) -> Constraint | list[Handle]:
+    """The selection of a caller: a group as text is a constraint. Raises ConfigurationError for anything else."""
+    if isinstance(which, Handle):
+        problem = f"is one service; give a list, {function}([handle]), or its group, {function}({which.key.domain!r})"
+        raise ConfigurationError(where=which.label, problem=problem)
+    if isinstance(which, Constraint | str) or not isinstance(which, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
+        return as_constraint(which, f"trade.{function}", group_at)
+    handles = list(which)
+    if wrong := next((one for one in handles if not isinstance(one, Handle)), None):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ConfigurationError(where=f"trade.{function}", problem=f"the list must have handles only, not {wrong!r}")
+    return handles
+
+
+def _text(which: Constraint | list[Handle]) -> str:
+    """A selection in the words of a caller."""
+    if isinstance(which, Constraint):
+        text = str(which)
+        group = text.removeprefix("group='").removesuffix("'")
+        return group if text == f"group={group!r}" else text
+    return ", ".join(handle.label for handle in which)
+
+
 def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
     """The resources to lock for services, by the container that grants their locks."""
     wanted: dict[Address, dict[str, None]] = {}
@@ -292,11 +327,8 @@ def selected(
     """The services to lock or resume: those given, or the actuating ones that match.
 
     Raises:
-        ConfigurationError: there are none, a stop is among them, or it is one handle instead of a list.
+        ConfigurationError: there are none, or a stop is among them.
     """
-    if isinstance(which, Handle):
-        problem = f"is one service; give a list, {verb}([handle]), or a constraint, {verb}(where(...))"
-        raise ConfigurationError(where=which.label, problem=problem)
     if isinstance(which, Constraint):
         found = [handle for handle in select(which) if handle.effect == "actuate"]
         if not found:

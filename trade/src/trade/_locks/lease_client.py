@@ -16,6 +16,7 @@ from trade._locks.lock import Lock, apart
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._resources.grants import LockRequest
+from trade._transport.wait_clock import WaitClock
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0
@@ -36,8 +37,9 @@ class LeaseHost(Protocol):
 class LeaseClient:
     """All locks of a container, and the thread that renews them."""
 
-    def __init__(self, home: LeaseHost) -> None:
+    def __init__(self, home: LeaseHost, clock: WaitClock) -> None:
         self._home = home
+        self.clock: Final = clock
         self._locks: list[Lock] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -62,14 +64,14 @@ class LeaseClient:
             LockedByOther, NotStopped, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
             LockLost: one part was lost while it waited for the others; nothing is held.
         """
-        until = time.monotonic() + terms.wait_s
+        until = self.clock.now() + terms.wait_s
         self._keep(lock)
         try:
             try:
                 self._try_all(lock, wanted, structs.replace(terms, wait_s=0.0))
             except (LockedByOther, Busy):
                 self._give_back(lock)
-                if time.monotonic() >= until:
+                if self.clock.now() >= until:
                     raise
                 self._wait_in_order(lock, wanted, terms, until)
             lock.check()
@@ -79,7 +81,7 @@ class LeaseClient:
         return lock
 
     def _try_all(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest) -> None:
-        asked_at = time.monotonic()
+        asked_at = self.clock.now()
         asks = [(address, self._ask(address, names, terms)) for address, names in wanted.items()]
         refused: TradeError | None = None
         for address, result in _at_once(asks):
@@ -93,14 +95,14 @@ class LeaseClient:
     def _wait_in_order(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest, until: float) -> None:
         for address in sorted(wanted, key=str):
             while True:
-                asked_at = time.monotonic()
+                asked_at = self.clock.now()
                 try:
                     ask = self._ask(address, wanted[address], structs.replace(terms, wait_s=max(0.0, until - asked_at)))
                     lock.add(address, ask(), asked_at)
                     lock.check()
                     break
                 except Busy:  # its queue is full
-                    if time.monotonic() + _AGAIN_S >= until:
+                    if self.clock.now() + _AGAIN_S >= until:
                         raise
                     time.sleep(_AGAIN_S)
 
@@ -144,23 +146,25 @@ class LeaseClient:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="trade-locks", daemon=True)
                 self._thread.start()
-            if time.monotonic() + lock.lease_s / _BEATS < self._due:
+            if self.clock.now() + lock.lease_s / _BEATS < self._due:
+                self.clock.expect(self._changed)
                 self._changed.notify_all()
 
     def _run(self) -> None:
-        renewed = time.monotonic()
+        renewed = self.clock.now()
         while True:
             with self._changed:
                 while not self._closed:
                     self._due = renewed + min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
-                    left_s = self._due - time.monotonic()
+                    left_s = self._due - self.clock.now()
                     if left_s <= 0:
                         break
-                    self._changed.wait(None if left_s == math.inf else left_s)
+                    self.clock.wait(self._changed, None if left_s == math.inf else left_s)
                 if self._closed:
+                    self.clock.arrived()
                     return
                 locks = list(self._locks)
-            renewed = time.monotonic()
+            renewed = self.clock.now()
             self._renew(locks)
 
     def _renew(self, locks: Sequence[Lock]) -> None:
@@ -171,14 +175,15 @@ class LeaseClient:
                 for address, token in lock.granted.items():
                     parts.setdefault(address, []).append((lock, token.number))
         for address, held in parts.items():
-            asked_at = time.monotonic()
+            asked_at = self.clock.now()
             numbers = [number for _, number in held]
             try:
                 run = self._service(address, "renew").with_(deadline_s=_ANSWER_S).start(numbers)
             except TradeError as error:
                 self._not_renewed(address, held, error)
             else:
-                run.when_done(partial(self._renewed, address, held, asked_at))
+                self.clock.expect(run)
+                run.add_done_callback(partial(self._renewed, address, held, asked_at))
 
     def _renewed(self, address: Address, held: list[tuple[Lock, int]], asked_at: float, run: Run) -> None:
         try:
@@ -186,6 +191,8 @@ class LeaseClient:
         except (TradeError, TimeoutError) as error:
             self._not_renewed(address, held, error)
             return
+        finally:
+            self.clock.arrived(run)
         for lock, number in held:
             if number not in over:
                 lock.confirm(address, number, asked_at)

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import logging
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable
 from contextvars import Token as Reset
 from types import TracebackType
@@ -57,10 +56,12 @@ class Lock:
         on_lost: OnLost | None,
         on_request: OnRequest | None,
         claim: Claim,
+        selection: str = "",
     ) -> None:
         self._lease_client = keeper
         self._terms = terms
         self._wanted = wanted
+        self._selection = selection
         self._on_lost = on_lost
         self.on_request = on_request
         """Called, on another thread, when a client requests its release."""
@@ -98,9 +99,9 @@ class Lock:
                 problem = "a lock is taken once; create another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
             self._taken = True
-        until = time.monotonic() + patience_s(self._terms.wait_s)
+        until = self._lease_client.clock.now() + patience_s(self._terms.wait_s)
         wanted, self.missing = self._wanted()
-        left_s = max(0.0, until - time.monotonic())
+        left_s = max(0.0, until - self._lease_client.clock.now())
         for address, names in wanted.items():
             self.claim = self.claim.with_held(address, names)
         self._lease_client.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
@@ -190,9 +191,10 @@ class Lock:
             raise _again(self._lost)
 
     def __repr__(self) -> str:
-        state = "not taken" if not self._taken else "lost" if self._lost else "released" if self._ended else "held"
+        kept = "not held" if not self._whole else "released" if self._ended else "held"
+        state = "lost" if self._lost else kept
         missing = f", without {', '.join(self.missing)}" if self.missing else ""
-        return f"<Lock of {', '.join(self.resources)}, {state}{missing}>"
+        return f"<Lock of {', '.join(self.resources) or self._selection}, {state}{missing}>"
 
     # --- being kept
 
@@ -246,7 +248,7 @@ class Lock:
     def _look(self) -> None:
         """Loses the lock, before any other action, if a part was not renewed within its lease (S12)."""
         oldest = min(self._confirmed.values(), default=None)
-        if oldest is not None and time.monotonic() - oldest >= self.lease_s:
+        if oldest is not None and self._lease_client.clock.now() - oldest >= self.lease_s:
             self.lose(f"it could not be renewed within its lease of {self.lease_s:g} s")
 
     def lose(self, reason: str) -> None:

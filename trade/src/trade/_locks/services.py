@@ -12,7 +12,7 @@ from trade._context.sessions import foreign
 from trade._locks.remote_locks import RemoteLocks
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.grants import Granted, LockInfo, LockRequest
+from trade._resources.grants import Granted, LockInfo, LockRequest, StopInfo
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource
 from trade._security.authorizer import Authorizer
@@ -112,6 +112,11 @@ class LockServices:
     def locks(self) -> list[LockInfo]:
         """The locks of this container's resources, with owners and waiters; also what could not be stopped."""
         return self._table.infos() + self._table.withheld()
+
+    @service(effect="read")
+    def stops(self) -> list[StopInfo]:
+        """The stops that hold this container's resources: which client stopped each, and why."""
+        return self._table.stops()
 
     @service(effect="stop")
     def break_lock(self, grant: int, reason: str) -> bool:

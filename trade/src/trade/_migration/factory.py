@@ -9,6 +9,7 @@ from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
 
 from trade._calls.handle import Handle
+from trade._migration.delivered_code import CodeStore
 from trade._protocol.keys import Address
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
@@ -37,7 +38,15 @@ class FactoryHost(Protocol):
 class ProviderFactory:
     """Owns the objects created here: each is closed when a client terminates it, or with the container."""
 
-    def __init__(self, home: FactoryHost, providers: Providers, withdrawn: Withdrawn, allowed: Sequence[str]) -> None:
+    def __init__(
+        self,
+        home: FactoryHost,
+        providers: Providers,
+        withdrawn: Withdrawn,
+        allowed: Sequence[str],
+        code: CodeStore,
+    ) -> None:
+        self.code: Final = code
         self._home = home
         self._providers = providers
         self._withdrawn = withdrawn

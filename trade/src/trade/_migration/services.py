@@ -17,7 +17,18 @@ class Maker(Protocol):
         self, class_path: str, args: tuple[Any, ...] | dict[str, Any], groups: tuple[str, ...], state: Any
     ) -> tuple[Handle, ...]: ...
 
-    def start_container(self, host: str, name: str, *, allow: tuple[str, ...]) -> ContainerInfo: ...
+    def start_container(
+        self,
+        host: str,
+        name: str,
+        *,
+        allow: tuple[str, ...],
+        connect: tuple[str, ...],
+        command: tuple[str, ...],
+        environment: dict[str, str],
+    ) -> ContainerInfo: ...
+
+    def add_code(self, archive: bytes) -> str: ...
 
     def terminate(self, service: Handle) -> None: ...
 
@@ -42,9 +53,24 @@ class FactoryServices:
         return self._of_here.instantiate(class_path, args, groups, state)
 
     @service
-    def start_container(self, host: str, name: str, allow: tuple[str, ...] = ()) -> ContainerInfo:
+    def start_container(
+        self,
+        host: str,
+        name: str,
+        allow: tuple[str, ...] = (),
+        connect: tuple[str, ...] = (),
+        command: tuple[str, ...] = ("trade",),
+        environment: dict[str, str] = {},  # noqa: B006 - never changed
+    ) -> ContainerInfo:
         """Start an empty container on another host through the ssh program of this one, with its user's keys."""
-        return self._of_here.start_container(host, name, allow=allow)
+        return self._of_here.start_container(
+            host, name, allow=allow, connect=connect, command=command, environment=environment
+        )
+
+    @service
+    def add_code(self, archive: bytes) -> str:
+        """Keep an archive of modules whose hash this container allows, and import from it; returns the hash."""
+        return self._of_here.add_code(archive)
 
     @service
     def terminate(self, service: Handle) -> None:

@@ -22,7 +22,7 @@ from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._services.registration import Offer
 from trade._services.withdrawn import Withdrawn
-from trade._telemetry.load import LoadInfo
+from trade._telemetry.load import busyness
 from trade.errors import (
     CannotMigrate,
     ConfigurationError,
@@ -49,8 +49,8 @@ class MigrationHost(Protocol):
     def address(self) -> Address: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def has(self, key: ServiceKey) -> bool: ...
-    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
-    def services(self, constraint: Constraint | None = ...) -> list[Handle]: ...
+    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
+    def services(self, constraint: Constraint | None = ..., /) -> list[Handle]: ...
 
 
 class MigrationSource:
@@ -232,11 +232,6 @@ class MigrationSource:
 
     def _ask(self, there: Address, name: str, deadline_s: float, *args: object) -> Any:
         return self._home.handle(ServiceKey(there, DOMAIN, PROVIDER, name)).with_(deadline_s=deadline_s)(*args)
-
-
-def busyness(load: LoadInfo) -> tuple[float, float]:
-    """The measure of load: the CPU of a container's host, then its calls a second."""
-    return load.host_cpu_percent or load.cpu_percent, load.calls_per_s
 
 
 def _require_time(service: Handle, there: Handle) -> None:

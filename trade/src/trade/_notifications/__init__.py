@@ -1,1 +1,1 @@
-"""Notifications: triggers, their actions, and the services that manage them."""
+"""Notifications: triggers, their actions, events of a container's states, and the services for all of these."""

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -13,10 +12,12 @@ from msgspec import Struct
 
 from trade._calls.handle import Handle
 from trade._context.sessions import Session
+from trade._notifications.events import StateEvent
 from trade._notifications.triggers import Action, Target, TriggerSpec, text_of
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade._threads.scheduler import Scheduler
+from trade._transport.wait_clock import WaitClock
 from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
@@ -99,7 +100,7 @@ class NotificationHost(Protocol):
 
     @property
     def name(self) -> str: ...
-    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
     def require_call(self, who: str, handle: Handle) -> None: ...
 
 
@@ -143,19 +144,21 @@ class ActiveNotification(Notification):
         """The next time of ``after`` and ``every``."""
         self._held = False
         """Whether the condition held at the last tick."""
-        self._concerned: deque[Handle] = deque()
-        """Services that came, went or changed since the last call."""
+        self._concerned: deque[Handle | StateEvent] = deque()
+        """Services that came, went or changed since the last call, or events since then."""
         self._fired = self._failures = self._merged = 0
         self._last_error = ""
         self._said: set[tuple[str, str]] = set()
         """Failures already reported: the part that failed, and its error."""
         self._cancel_due: Callable[[], None] = lambda: None
+        self._clock = WaitClock()
 
     # --- life cycle
 
     def begin(self, scheduler: Scheduler) -> Callable[[int], None]:
         """Start it; returns the function that schedules it again."""
-        due = scheduler.begin(self._act, time.monotonic_ns())
+        self._clock = scheduler.clock
+        due = scheduler.begin(self._act, self._clock.now_ns())
         self._cancel_due = due.cancel
         return due.at
 
@@ -205,12 +208,12 @@ class ActiveNotification(Notification):
         assert self.terms.constraint is not None  # noqa: S101
         return self.terms.constraint.matches(record)
 
-    def add(self, handle: Handle) -> None:
-        """Include a service in the report of the next run."""
-        self._concerned.append(handle)
+    def add(self, about: Handle | StateEvent) -> None:
+        """Include a service or an event in the report of the next run."""
+        self._concerned.append(about)
 
     def _act(self) -> int | None:
-        now = time.monotonic_ns()
+        now = self._clock.now_ns()
         if self._state is State.WAITING:
             if not self._asked(self._when):
                 return now + int(self.terms.poll_s * 1e9)
@@ -220,12 +223,12 @@ class ActiveNotification(Notification):
         if self._state is not State.STANDING:
             return None
         match self.terms.occasion:
-            case "joined" | "left" | "changed":
+            case "joined" | "left" | "changed" | "occurred":
                 return self._report()
             case "every":
                 return self._tick(now)
             case "at":
-                left_ns = int((self.terms.at - time.time()) * 1e9)
+                left_ns = int((self.terms.at - self._clock.time()) * 1e9)
                 return now + min(left_ns, _LOOK_NS) if left_ns > 0 else self._once()
             case "after":
                 self._due_ns = self._due_ns or now + int(self.terms.s * 1e9)
@@ -245,7 +248,7 @@ class ActiveNotification(Notification):
         if self._due_ns <= now:
             self._fire()
             self._due_ns += period
-            missed = max(0, (time.monotonic_ns() - self._due_ns) // period)
+            missed = max(0, (self._clock.now_ns() - self._due_ns) // period)
             self._merged += missed
             self._due_ns += missed * period
         return self._due_ns
@@ -254,7 +257,7 @@ class ActiveNotification(Notification):
         while self._concerned and self._state is State.STANDING:
             self._fire(self._concerned.popleft())
 
-    def _fire(self, *given: Handle) -> None:
+    def _fire(self, *given: Handle | StateEvent) -> None:
         if self._if is not None:
             held, before = self._asked(self._if), self._held
             self._held = held
@@ -281,7 +284,7 @@ class ActiveNotification(Notification):
             return False
         return held
 
-    def _do(self, target: Target, *given: Handle) -> Any:
+    def _do(self, target: Target, *given: Handle | StateEvent) -> Any:
         acts_as = self.owner.acts_as
         with contextlib.nullcontext() if acts_as is None else acts_as.use():
             if not isinstance(target, Action):

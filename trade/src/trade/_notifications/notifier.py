@@ -1,13 +1,13 @@
 """The notifications of one container, for itself and for others."""
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Final
 
 from trade._calls.handle import Handle
+from trade._notifications.events import StateEvent
 from trade._notifications.notification import ActiveNotification, NotificationHost, NotificationInfo, Owner
-from trade._notifications.triggers import OF_SERVICES, Target, TriggerSpec
+from trade._notifications.triggers import OF_CHANGES, Target, TriggerSpec
 from trade._registry.registry import Change, Record
 from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
@@ -28,7 +28,7 @@ class Notifier:
         self._handle = handle
         self._lock = threading.Lock()
         self._notifications: dict[str, ActiveNotification] = {}
-        self._of_services: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
+        self._of_changes: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
         self._count = 0
         self.failed: Callable[[ActiveNotification, str], None] = lambda _notification, _error: None
         """Called for each failure of a notification of another container."""
@@ -63,8 +63,8 @@ class Notifier:
             for record in existing:
                 notification.add(self._handle(record))
             again = notification.begin(self._scheduler)
-            if terms.occasion in OF_SERVICES:
-                self._of_services[name] = (notification, again)
+            if terms.occasion in OF_CHANGES:
+                self._of_changes[name] = (notification, again)
         return notification
 
     def _failed(self, notification: ActiveNotification, error: str) -> None:
@@ -74,7 +74,7 @@ class Notifier:
     def _forget(self, notification: ActiveNotification) -> None:
         with self._lock:
             self._notifications.pop(notification.id, None)
-            self._of_services.pop(notification.id, None)
+            self._of_changes.pop(notification.id, None)
         if notification.owner.identity:
             self.tidy(notification.owner.session)
 
@@ -88,13 +88,24 @@ class Notifier:
     def changed(self, change: Change) -> None:
         """Called by the registry."""
         with self._lock:
-            active = list(self._of_services.values())
-        now = time.monotonic_ns()
+            active = list(self._of_changes.values())
+        now = self._scheduler.clock.now_ns()
         for notification, again in active:
             concerned = _concerned(notification, change)
             for record in concerned:
                 notification.add(self._handle(record))
             if concerned:
+                again(now)
+
+    def occurred(self, event: StateEvent, record: Record | None) -> None:
+        """A state of this container has changed; the record is the service that the event is about, if any."""
+        with self._lock:
+            active = [one for one in self._of_changes.values() if event.kind in one[0].terms.events]
+        now = self._scheduler.clock.now_ns()
+        for notification, again in active:
+            wanted = notification.terms.constraint
+            if wanted is None or (record is not None and wanted.matches(record)):
+                notification.add(event)
                 again(now)
 
     def session_ended(self, session: str) -> None:
@@ -128,6 +139,8 @@ def _concerned(notification: ActiveNotification, change: Change) -> list[Record]
             return [record for record in change.joined if notification.concerns(record)]
         case "left":
             return [record for record in change.left if notification.concerns(record)]
+        case "occurred":
+            return []
         case _:
             altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
             return [new for old, new in altered if notification.concerns(old) or notification.concerns(new)]

@@ -72,7 +72,8 @@ class NotificationServices:
     @service
     def notify(self, terms: TriggerSpec, call: Action, if_: Action | None = None, when: Action | None = None) -> str:
         """Make a call when an event occurs, for the caller, who must then have the right to make it; returns the id."""
-        asked = served_call()
+        asked, given = served_call(), (call, if_, when)
+        self._records.wait_until_known(one.handle.key for one in given if one is not None and one.handle is not None)
         owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
         try:
             return placed(self._notifier, self._records, terms, call, if_, when, owner).id

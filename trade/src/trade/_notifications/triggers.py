@@ -4,16 +4,19 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 from msgspec import Struct
 
 from trade._calls.handle import Bound, Handle
-from trade._registry.constraints import Constraint
+from trade._notifications.events import EVENT_KINDS
+from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade.errors import ConfigurationError
 
-Trigger = Literal["joined", "left", "changed", "once", "after", "at", "every"]
+Trigger = Literal["joined", "left", "changed", "once", "after", "at", "every", "occurred"]
 OF_SERVICES: Final = frozenset({"joined", "left", "changed"})
+OF_CHANGES: Final = OF_SERVICES | {"occurred"}
+"""The events that their calls get as an argument: the service, or the event."""
 
 SHORTEST_S: Final = 0.001
 _YEAR_10000_S: Final = 253_402_300_800
@@ -36,8 +39,8 @@ class Action(Struct, frozen=True):
         return f"the service with {self.constraint}"
 
 
-What = Callable[..., Any] | Handle | Bound | Constraint
-"""The target of a call: a service, a bound call, a constraint with one match, or a function of this process."""
+What = Callable[..., Any] | Handle | Bound | Constraint | str
+"""The target of a call: a handle, a bound call, a service by a constraint or as text, or a function of this process."""
 Target = Action | Callable[..., Any]
 
 
@@ -46,7 +49,9 @@ class TriggerSpec(Struct, frozen=True, kw_only=True):
 
     occasion: Trigger
     constraint: Constraint | None = None
-    """The services of joined, left and changed."""
+    """The services of joined, left and changed; those that an event is about."""
+    events: tuple[str, ...] = ()
+    """The kinds of events of occurred."""
     existing: bool = False
     s: float = 0.0
     at: float = 0.0
@@ -59,6 +64,9 @@ class TriggerSpec(Struct, frozen=True, kw_only=True):
         """Raises ConfigurationError: an invalid time."""
         if self.occasion in OF_SERVICES and self.constraint is None:
             raise ConfigurationError(where=f"trade.{self.occasion}", problem="say which services, with where(...)")
+        if self.occasion == "occurred" and (not self.events or not EVENT_KINDS.issuperset(self.events)):
+            problem = f"{', '.join(self.events) or 'no event'} is not among {', '.join(sorted(EVENT_KINDS))}"
+            raise ConfigurationError(where="trade.occurred", problem=problem)
         if self.occasion == "every":
             _check_s(self.occasion, "s", self.s, SHORTEST_S)
         elif self.occasion == "after":
@@ -75,6 +83,8 @@ class TriggerSpec(Struct, frozen=True, kw_only=True):
                 return f"at {datetime.fromtimestamp(self.at, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
             case "once":
                 return "once"
+            case "occurred":
+                return f"{', '.join(self.events)}{'' if self.constraint is None else f' of {self.constraint}'}"
             case _:
                 return f"{self.occasion} {self.constraint}"
 
@@ -116,15 +126,16 @@ def target_of(what: What, where: str, argument: str, given: int) -> Target:
         ConfigurationError: it cannot be called, or not with this number of values.
     """
     if isinstance(what, Handle):
-        return Action(handle=what)
+        return Action(handle=cast("Handle", what))
     if isinstance(what, Bound):
         return Action(handle=what.handle, args=what.args, kwargs=dict(what.kwargs))
-    if isinstance(what, Constraint):
-        return Action(constraint=what)
+    if isinstance(what, Constraint | str):
+        return Action(constraint=as_constraint(what, where, service_at))
     if callable(what):
         _check_takes(what, where, argument, given)
         return what
-    problem = f"{argument} must be a handle, a bound call, where(...), or a function, not {what!r}"
+    problem = f"{argument} must be a handle, a bound call, where(...), a function, or a text such as 'rosie.head.stop'"
+    problem += f", not {what!r}"
     raise ConfigurationError(where=where, problem=problem)
 
 

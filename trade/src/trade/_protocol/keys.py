@@ -85,6 +85,9 @@ def estop_confirmed_key(address: Address) -> str:
     return f"estop/{address}"
 
 
+LOCAL: Final = "-local-"
+"""Within the channel of a reply key: the answer goes to a connection of the local path."""
+
 ESTOPS: Final = "estop/**"
 
 

@@ -121,6 +121,7 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref
     doc: str = ""
     effect: str = "actuate"
     cancel: str | None = None
+    needs: tuple[str, ...] = ()
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
@@ -130,6 +131,12 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref
     types: dict[str, str] = {}
     """Schema definition -> ``module:qualified name``, so that a process that has the type uses it."""
     meta: dict[str, Scalar] = {}
+
+    @property
+    def conditions(self) -> str:
+        """Its pre-conditions and post-conditions, for people; empty if it has none."""
+        known = (("needs", self.needs), ("achieves", self.achieves))
+        return "; ".join(f"{word} {', '.join(texts)}" for word, texts in known if texts)
 
 
 class Estop(Struct, frozen=True, array_like=True, gc=False):
@@ -232,10 +239,27 @@ class CancelArguments(Struct, array_like=True, gc=False):
 MOST_BYTES: Final = 64 << 20
 """The largest arguments and the largest result, encoded."""
 
+LARGE: Final = 64 << 10
+"""From this size on, bytes are worth a way on which they are copied less often."""
+
 _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)  # what is larger is not even decoded
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
+
+
+class LargeBytes:
+    """A value of large bytes, in encoded form but not copied."""
+
+    __slots__ = ("head", "value")
+
+    def __init__(self, value: bytes) -> None:
+        self.head: Final = b"\xc6" + len(value).to_bytes(4, "big")
+        self.value: Final = value
+
+    def __len__(self) -> int:
+        return len(self.head) + len(self.value)
+
 
 _Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder)
 _Value = TypeVar("_Value")

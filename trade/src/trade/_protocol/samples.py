@@ -1,6 +1,6 @@
 """One sample of a stream: in its wire form, and as a listener gets it."""
 
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic
 
 import msgspec
 from msgspec import Meta, Raw, Struct
@@ -25,10 +25,20 @@ STEPS_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 
-class Sample(Struct, frozen=True, kw_only=True):
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar  # every type checker has it
+
+    Value = TypeVar("Value", default=Any)
+else:
+    from typing import TypeVar
+
+    Value = TypeVar("Value")
+
+
+class Sample(Struct, Generic[Value], frozen=True, kw_only=True):
     """The result of a service at one moment."""
 
-    value: Any
+    value: Value
     at: float
     """``time.time()`` of the source when the service was called."""
     at_ns: int

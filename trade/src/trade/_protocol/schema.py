@@ -138,19 +138,20 @@ def read_json(text: str, kind: Any) -> Any:
 
 def readable(text: str) -> str:
     """Such a text in the notation of a person."""
-    return f"[{', '.join(map(_name, read_types(text)[0]))}]"
+    return f"[{', '.join(map(schema_name, read_types(text)[0]))}]"
 
 
-def _name(schema: _Schema) -> str:
+def schema_name(schema: _Schema) -> str:
+    """A type in the notation of a person, by its JSON Schema."""
     if "$ref" in schema:
         return str(schema["$ref"]).rsplit("/", 1)[-1]
     if "anyOf" in schema:
-        return " | ".join(map(_name, schema["anyOf"]))
+        return " | ".join(map(schema_name, schema["anyOf"]))
     if "enum" in schema:
         return f"Literal[{', '.join(map(repr, schema['enum']))}]"
     kind = schema.get("type")
     if kind == "array":
-        return f"list[{_name(schema['items'])}]" if schema.get("items") else "list"
+        return f"list[{schema_name(schema['items'])}]" if schema.get("items") else "list"
     if kind == "object":
         return str(schema.get("title", "dict"))
     return str(schema.get("format") or ("bytes" if "contentEncoding" in schema else _NAMES.get(str(kind), "Any")))

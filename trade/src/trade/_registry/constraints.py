@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import Any, Final, Literal, Protocol
@@ -13,7 +13,7 @@ from msgspec import Struct
 from trade._protocol.keys import GROUP
 from trade._protocol.messages import Scalar, ServiceInfo
 from trade._protocol.schema import fits, known_schema, read_json, read_types, readable, types_text
-from trade._registry.predicates import achieves_all, parse_predicates
+from trade._registry.predicates import fits_all, parse_predicates
 from trade.errors import ConfigurationError
 
 __all__ = ["Candidate", "Constraint", "where"]
@@ -22,7 +22,19 @@ __all__ = ["Candidate", "Constraint", "where"]
 _MOST_CLAUSES: Final = 1000
 _GLOB: Final = frozenset("*?[")
 _Field = Literal[
-    "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
+    "name",
+    "group",
+    "host",
+    "container",
+    "local",
+    "args",
+    "returns",
+    "needs",
+    "achieves",
+    "uses",
+    "kind",
+    "meta",
+    "healthy",
 ]
 
 
@@ -66,7 +78,7 @@ class Term(Struct, frozen=True, array_like=True, order=True):
                 schemas, _ = read_types(self.pattern)
                 if self.field == "returns" and len(schemas) != 1:
                     raise ValueError("a service returns one result")
-            case "achieves":
+            case "needs" | "achieves":
                 parse_predicates(self.pattern)
             case "meta":
                 _key_and_value(self.pattern)
@@ -97,8 +109,8 @@ class Term(Struct, frozen=True, array_like=True, order=True):
                 return _takes(candidate.info, self.pattern)
             case "returns":
                 return _returns(candidate.info, self.pattern)
-            case "achieves":
-                return achieves_all(candidate.info.achieves, parse_predicates(self.pattern))
+            case "needs" | "achieves":
+                return fits_all(getattr(candidate.info, self.field), parse_predicates(self.pattern))
             case "meta":
                 key, value = _key_and_value(self.pattern)
                 return key in candidate.meta and _same(candidate.meta[key], value)
@@ -241,6 +253,7 @@ class _Where:
         local: bool | None = None,
         args: Sequence[Any] | None = None,
         returns: Any = msgspec.UNSET,
+        needs: str | Sequence[str] | None = None,
         achieves: str | Sequence[str] | None = None,
         uses: str | None = None,
         kind: str | None = None,
@@ -258,8 +271,9 @@ class _Where:
             args: types of positional arguments that it accepts; ``[]`` is a call without arguments. ``int`` fits
                 ``float``, and a struct fits one with a subset of its required fields; ``Any`` fits every type.
             returns: the type of its result, or one that fits it; ``None`` is a service without a result.
-            achieves: a predicate that one of its post-conditions must fit; ``?x`` is a variable. Of several, each must
+            needs: a predicate that one of its pre-conditions must fit; ``?x`` is a variable. Of several, each must
                 fit one, and a variable has one meaning in all of them.
+            achieves: the same, for its post-conditions.
             uses: a physical resource; includes everything beneath it.
             kind: name of its provider's class, or of a base or interface of it; ``*`` and ``?`` allowed.
             meta: keys and values of its metadata.
@@ -279,8 +293,8 @@ class _Where:
             terms.append(Term("args", types_text(_checked_types(args))))
         if returns is not msgspec.UNSET:
             terms.append(Term("returns", types_text([returns])))
-        if achieves is not None:
-            terms.append(Term("achieves", _predicates(achieves)))
+        conditions: tuple[tuple[_Field, str | Sequence[str] | None], ...] = (("needs", needs), ("achieves", achieves))
+        terms += [Term(field, _predicates(field, texts)) for field, texts in conditions if texts is not None]
         for key, value in (meta or {}).items():
             terms.append(Term("meta", _meta_text(key, value)))
         return Constraint((frozenset(terms),))
@@ -292,9 +306,9 @@ def _checked_types(args: Any) -> Sequence[Any]:
     return args  # pyright: ignore[reportUnknownVariableType]
 
 
-def _predicates(achieves: str | Sequence[str]) -> str:
-    several = [achieves] if isinstance(achieves, str) else achieves
-    text = ", ".join(_pattern("achieves", pattern) for pattern in several)
+def _predicates(field: str, texts: str | Sequence[str]) -> str:
+    several = [texts] if isinstance(texts, str) else texts
+    text = ", ".join(_pattern(field, pattern) for pattern in several)
     return ", ".join(map(str, parse_predicates(text)))
 
 
@@ -325,3 +339,41 @@ def _pattern(field: str, pattern: str) -> str:
 
 where: Final = _Where()
 """``where(name=..., group=...) & ~where.local``: a condition on services."""
+
+
+def service_at(text: str) -> Constraint:
+    """One service by its group and name, ``rosie.head.move_to``; groups beneath the group count, too."""
+    group, _, name = text.rpartition(".")
+    return where(name=name, group=group or None)
+
+
+def services_at(text: str) -> Constraint:
+    """A group and everything beneath it, or one service by its group and name."""
+    return where(group=text) | service_at(text)
+
+
+def group_at(text: str) -> Constraint:
+    """A group and everything beneath it."""
+    return where(group=text)
+
+
+def as_constraint(which: object, function: str, read: Callable[[str], Constraint]) -> Constraint:
+    """A constraint as it is, and a text as ``read`` understands it.
+
+    Args:
+        which: what a caller has given.
+        function: its name, for the error.
+        read: `service_at`, `services_at` or `group_at`.
+
+    Raises:
+        ConfigurationError: it is neither, or a malformed text.
+    """
+    if isinstance(which, Constraint):
+        return which
+    if not isinstance(which, str):
+        problem = f"say which services by where(...) or as a text such as 'rosie.head', not by {which!r}"
+        raise ConfigurationError(where=function, problem=problem)
+    try:
+        return read(which)
+    except ConfigurationError as bad:
+        raise ConfigurationError(where=f"{function} {which!r}", problem=bad.problem) from None

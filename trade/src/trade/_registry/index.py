@@ -1,11 +1,12 @@
 """An index of services by the fields that constraints use most, so that a lookup need not test them all."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 from trade._protocol.keys import ServiceKey
 from trade._registry.constraints import Candidate, Constraint, Term, is_exact
-from trade._registry.predicates import parse_predicates, read_achieved
+from trade._registry.predicates import parse_predicates, read_condition
 
 _Slot = tuple[str, str]
 """A field and one value of it."""
@@ -33,18 +34,18 @@ class Index(Generic[_Entry]):
         """Add an entry, or replace the one with the same key."""
         old = self._all.get(entry.key)
         self._all[entry.key] = entry
-        slots = set(_slots_of(entry))
+        slots = _slots_of(entry)
         for slot in slots:
             self._slots.setdefault(slot, {})[entry.key] = entry
         if old is not None:
-            self._clear(old.key, set(_slots_of(old)) - slots)
+            self._clear(old.key, _slots_of(old) - slots)
 
     def remove(self, key: ServiceKey) -> None:
         old = self._all.pop(key, None)
         if old is not None:
-            self._clear(key, set(_slots_of(old)))
+            self._clear(key, _slots_of(old))
 
-    def _clear(self, key: ServiceKey, slots: set[_Slot]) -> None:
+    def _clear(self, key: ServiceKey, slots: frozenset[_Slot]) -> None:
         for slot in slots:
             bucket = self._slots.get(slot, {})
             bucket.pop(key, None)
@@ -72,20 +73,35 @@ class Index(Generic[_Entry]):
         return entries
 
 
-def _slots_of(entry: Candidate) -> Iterator[_Slot]:
-    yield "name", entry.name
-    yield "container", entry.container
-    for field, values in (("group", entry.groups), ("uses", entry.info.uses)):
-        for value in values:
-            for end, sign in enumerate(value):
-                if sign == ".":
-                    yield field, value[:end]
-            yield field, value
-    for kind in entry.kinds:
-        yield "kind", kind
-    for fact in map(read_achieved, entry.info.achieves):
-        if fact is not None:
-            yield "achieves", fact.functor
+def _slots_of(entry: Candidate) -> frozenset[_Slot]:
+    info = entry.info
+    shared = _slots_of_provider(entry.container, tuple(entry.groups), tuple(entry.kinds))
+    return shared | _slots_of_service(entry.name, info.uses, info.needs, info.achieves)
+
+
+@lru_cache(maxsize=1024)
+def _slots_of_provider(container: str, groups: tuple[str, ...], kinds: tuple[str, ...]) -> frozenset[_Slot]:
+    """Those of all services of a provider: many follow each other when a container joins."""
+    return frozenset((("container", container), *_prefixes("group", groups), *(("kind", kind) for kind in kinds)))
+
+
+@lru_cache(maxsize=4096)
+def _slots_of_service(
+    name: str, uses: tuple[str, ...], needs: tuple[str, ...], achieves: tuple[str, ...]
+) -> frozenset[_Slot]:
+    """Those of a service: most containers offer the same ones."""
+    slots: set[_Slot] = {("name", name), *_prefixes("uses", uses)}
+    for field, conditions in (("needs", needs), ("achieves", achieves)):
+        slots.update((field, fact.functor) for fact in map(read_condition, conditions) if fact is not None)
+    return frozenset(slots)
+
+
+def _prefixes(field: str, values: tuple[str, ...]) -> Iterator[_Slot]:
+    for value in values:
+        for end, sign in enumerate(value):
+            if sign == ".":
+                yield field, value[:end]
+        yield field, value
 
 
 def _slots_asked(term: Term) -> Iterator[_Slot]:
@@ -95,9 +111,9 @@ def _slots_asked(term: Term) -> Iterator[_Slot]:
             yield term.field, term.pattern
         case "name" | "container" | "kind" if is_exact(term.pattern):
             yield term.field, term.pattern
-        case "achieves":
+        case "needs" | "achieves":
             for predicate in parse_predicates(term.pattern):
                 if not predicate.is_variable:
-                    yield "achieves", predicate.functor
+                    yield term.field, predicate.functor
         case _:
             pass

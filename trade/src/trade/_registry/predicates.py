@@ -1,4 +1,4 @@
-"""Predicates such as ``on(cup, table)``: post-conditions of services, and patterns with variables that match them."""
+"""Predicates such as ``on(cup, table)``: conditions of services, and patterns with variables that match them."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,19 +38,27 @@ def parse_predicates(text: str) -> tuple[Predicate, ...]:
     return _Parser(text).read()
 
 
-def parse_achieved(text: str) -> Predicate:
-    """A post-condition of a service: one predicate, and not only a variable. Raises ConfigurationError."""
-    several = parse_predicates(text)
+def parse_condition(text: str, kind: str = "condition") -> Predicate:
+    """A condition of a service: one predicate, and not only a variable.
+
+    Args:
+        text: the predicate.
+        kind: ``pre-condition`` or ``post-condition``, for the error.
+
+    Raises:
+        ConfigurationError: it is anything else.
+    """
+    several = parse_predicates(text) if isinstance(text, str) else ()  # pyright: ignore[reportUnnecessaryIsInstance]
     if len(several) != 1 or several[0].is_variable:
-        raise ConfigurationError(problem=f"{text!r} is no post-condition; write one predicate, such as open(gripper)")
+        raise ConfigurationError(problem=f"{text!r} is no {kind}; write one predicate, such as open(gripper)")
     return several[0]
 
 
 @lru_cache(4096)
-def read_achieved(text: str) -> Predicate | None:
-    """A post-condition from another container; None for an invalid one."""
+def read_condition(text: str) -> Predicate | None:
+    """A condition from another container; None for an invalid one."""
     try:
-        return _renamed(parse_achieved(text))
+        return _renamed(parse_condition(text))
     except ConfigurationError:
         return None
 
@@ -121,12 +129,12 @@ def _renamed(predicate: Predicate) -> Predicate:
     return Predicate(predicate.functor, tuple(map(_renamed, predicate.arguments)))
 
 
-def achieves_all(achieved: Sequence[str], patterns: Sequence[Predicate]) -> bool:
-    """Whether every pattern fits one of the post-conditions, where a variable has one meaning throughout.
+def fits_all(conditions: Sequence[str], patterns: Sequence[Predicate]) -> bool:
+    """Whether every pattern fits one of the conditions, where a variable has one meaning throughout.
 
     A search that takes too long counts as no match.
     """
-    facts = [fact for fact in map(read_achieved, achieved) if fact is not None]
+    facts = [fact for fact in map(read_condition, conditions) if fact is not None]
     try:
         return any(True for _ in _solutions(facts, patterns, {}, iter(range(_MOST_STEPS))))
     except _TooLong:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from msgspec import Struct
+
 from trade._protocol.keys import Address, ServiceKey
 from trade._protocol.messages import HEALTHY, PROTOCOL, Estop, ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import Constraint
@@ -17,9 +19,10 @@ from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]
 
+_KNOWN_WITHIN_S: Final = 1.0
 
-@dataclass(frozen=True, slots=True)
-class Record:
+
+class Record(Struct, frozen=True):
     """One service in the registry."""
 
     key: ServiceKey
@@ -85,7 +88,11 @@ class ContainerState:
     """By name."""
     removed: dict[str, str] = field(default_factory=dict)
     """Deregistered providers in order, with their new places if they moved: no name is used twice in one boot."""
+    unlisted: set[str] = field(default_factory=set[str])
+    """Those of `removed` that a reply no longer listed: a gateway may export them again."""
     heard: RevisionTracker = field(default_factory=RevisionTracker)
+    transport: str = ""
+    """The id of its transport, from its reply; empty before that."""
     protocol: int = 0
     """Its protocol version; 0 before its first message. If it differs from ours, it has no providers here."""
     estops: dict[str, tuple[Estop, ...]] = field(default_factory=dict)
@@ -210,6 +217,9 @@ class Registry:
                     return
                 known = state.providers.items()
                 gone = [name for name, entry in known if name not in offered and entry.info.revision <= revision]
+                for name in state.unlisted.intersection(offered):
+                    state.removed.pop(name, None)
+                state.unlisted = (state.unlisted | set(gone)).difference(offered)
                 state.protocol = PROTOCOL
                 state.heard.replied(revision)
                 change = self._change(state, offered, gone)
@@ -224,6 +234,17 @@ class Registry:
             self._containers[address] = ContainerState(address)
             self._changed.notify_all()
             return True
+
+    def reopen(self, address: Address) -> bool:
+        """A container is back behind a bridge that may let other services cross. Returns whether it is registered.
+
+        What is known of it stays until its next reply.
+        """
+        with self._lock:
+            state = self._containers.get(address)
+            if state is not None:
+                state.heard.reopen()
+            return state is not None
 
     def _has_room_for(self, address: Address) -> bool:
         if self._may_offer_anything(address.identity):
@@ -284,23 +305,7 @@ class Registry:
     def _make(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> list[Record]:
         if not self._may_offer(address.identity, domain, provider, info.groups):
             return []
-        return [
-            Record(
-                key=ServiceKey(address, domain, provider, service.name),
-                info=service,
-                groups=info.groups,
-                kind=info.kind,
-                host=info.host,
-                pid=info.pid,
-                local=address == self._own,
-                kinds=info.kinds,
-                meta={**service.meta, **info.meta} if service.meta and info.meta else service.meta or info.meta,
-                health=info.health,
-                members=info.members,
-                estops=info.estops,
-            )
-            for service in info.services
-        ]
+        return records_of(address, domain, provider, info, local=address == self._own)
 
     def _swap(self, before: Iterable[Record], after: Iterable[Record]) -> Change:
         """Replace records in the index, under the lock. A service that keeps its key neither joins nor leaves."""
@@ -344,6 +349,11 @@ class Registry:
 
         return self._changed.wait_for(holds, timeout_s)
 
+    def wait_until_known(self, keys: Iterable[ServiceKey]) -> None:
+        """Wait, for a second at most, for the announcements of services that another container knows already."""
+        wanted = [key for key in keys if not self.removed(key)]
+        self.wait_for(lambda: all(self.get(key) is not None for key in wanted), _KNOWN_WITHIN_S)
+
     def is_alive(self, address: Address) -> bool:
         return address in self._containers
 
@@ -366,6 +376,27 @@ class Registry:
         """The new place of a provider that moved: ``identity/container/epoch/domain/provider``."""
         state = self._containers.get(key.address)
         return "" if state is None else state.removed.get(key.provider, "")
+
+
+def records_of(address: Address, domain: str, provider: str, info: ProviderInfo, *, local: bool) -> list[Record]:
+    """The entries of a provider's services."""
+    return [
+        Record(
+            key=ServiceKey(address, domain, provider, service.name),
+            info=service,
+            groups=info.groups,
+            kind=info.kind,
+            host=info.host,
+            pid=info.pid,
+            local=local,
+            kinds=info.kinds,
+            meta={**service.meta, **info.meta} if service.meta and info.meta else service.meta or info.meta,
+            health=info.health,
+            members=info.members,
+            estops=info.estops,
+        )
+        for service in info.services
+    ]
 
 
 def gone_to(label: str, moved_to: str) -> ServiceGone:

@@ -22,6 +22,10 @@ class RevisionTracker:
         """Whether everything is known up to the highest revision heard of."""
         return self.answered >= self._first - 1
 
+    def reopen(self) -> None:
+        """Nothing counts as known completely until the next reply."""
+        self.answered = -1
+
     def announced(self, revision: int) -> None:
         """An announcement of a revision has arrived."""
         if revision > self._last + 1:

@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from trade._context.call_context import patience_s
+from trade._remote.error_output import as_text
 from trade.errors import CannotStart, ConfigurationError, StartFailure
 
 CONNECT_S: Final = 10
@@ -198,4 +199,4 @@ def _refusal(
 
 
 def _complaint(ended: "subprocess.CompletedProcess[str]") -> str:
-    return " ".join(ended.stderr.split())[-500:]
+    return " ".join(as_text(ended.stderr).split())[-500:]

@@ -48,6 +48,18 @@ class LockInfo(Struct, frozen=True):
     """The clients that wait for any of it, next first."""
 
 
+class StopInfo(Struct, frozen=True):
+    """A stop that holds a resource: nothing moves it before the e-stop is cleared, or the resource is resumed."""
+
+    container: str
+    resource: str
+    by: str
+    """The client that stopped it."""
+    reason: str
+    estop: bool = False
+    """Whether an e-stop is open."""
+
+
 class Waiter(Struct, eq=False):
     """A client that waits for resources."""
 

@@ -15,9 +15,10 @@ from msgspec import structs
 from trade._audit.events import Audit
 from trade._context.sessions import EndedSessions, foreign, within
 from trade._protocol.messages import Token
-from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, Waiter, withheld
-from trade._resources.leases import Leases
+from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, StopInfo, Waiter, withheld
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
+from trade._threads.alarm import Alarm
+from trade._transport.wait_clock import WaitClock
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
@@ -37,7 +38,7 @@ class LockTable:
         self,
         epoch: str,
         container: str,
-        clock: Callable[[], float] = time.monotonic,
+        clock: WaitClock | None = None,
         audit: Audit | None = None,
     ) -> None:
         self._audit = audit or Audit()
@@ -45,7 +46,8 @@ class LockTable:
         self._container = container
         self._stop: Stop = _leave_it
         self._on_loss: Callable[[int, str], None] = lambda _number, _reason: None
-        self._clock = clock
+        self._wait_clock = clock or WaitClock()
+        self._clock = self._wait_clock.now
         self._resources: dict[str, tuple[Resource, int]] = {}
         """Resources by name, with the number of services that use them."""
         self._grants: dict[int, Grant] = {}
@@ -58,7 +60,7 @@ class LockTable:
         """Requests that wait for their turn, or for running calls and motion."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
-        self._leases = Leases(self.expire, clock)
+        self._leases = Alarm("trade-leases", lambda: self.expire() * 1e9, self._wait_clock)
         self._closed = False
         self._estop: Latch | None = None
 
@@ -231,7 +233,7 @@ class LockTable:
         left = until - self._clock()
         if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, NotStopped):
             raise obstacle
-        self._changed.wait(left)
+        self._wait_clock.wait(self._changed, left, again=False)
 
     def _running(self, waiter: Waiter) -> Resource | None:
         """One of them that calls outside the requesting chain still use."""
@@ -252,7 +254,7 @@ class LockTable:
         for resource in waiter.resources:
             resource.holder, resource.live = holder, number
             resource.uses, resource.used_at = 0, 0.0
-        self._leases.look_by(grant.until)
+        self._leases.by(grant.until * 1e9)
         self._note("locked", grant, holder.purpose and f"for {holder.purpose}")
         return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
 
@@ -362,6 +364,11 @@ class LockTable:
     def withheld(self) -> list[LockInfo]:
         """Resources that could not be stopped, which no client gets before they are resumed (S14), with number 0."""
         return [withheld(one, self._epoch, self._container) for one in self.resources() if one.unsafe]
+
+    def stops(self) -> list[StopInfo]:
+        """The stops that hold resources now (S08, S09)."""
+        found = [(one.name, one.estop or one.latch, one.estop is not None) for one in self.resources()]
+        return [StopInfo(self._container, name, latch.by, latch.reason, estop) for name, latch, estop in found if latch]
 
     # --- its end
 

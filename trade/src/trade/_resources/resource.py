@@ -153,8 +153,12 @@ class Resource:
 
     @property
     def sessions(self) -> frozenset[str]:
-        """The sessions that move it: of its running calls, and of the last admitted one."""
-        return frozenset(self.movers).union(*(permit.sessions for permit in list(self.calls.values())))
+        """The sessions that move it: of its running calls, and while it moves of the last admitted one.
+
+        While a call is admitted, its resources do not all name its sessions yet; those at rest name an earlier mover.
+        """
+        still = self.movers if self._moving else ()
+        return frozenset(still).union(*(permit.sessions for permit in list(self.calls.values())))
 
     @property
     def busy(self) -> bool:

@@ -20,6 +20,7 @@ FUNCTIONS: Final = {
     "load": _ALL,
     "withdrawn": _ALL,
     "locks": _ALL,
+    "stops": _ALL,
     "renew": _ALL,  # own ones only
     "release": _ALL,  # own ones only
     "request_release": _ALL,
@@ -37,6 +38,11 @@ FUNCTIONS: Final = {
     "hook_suspended": _ALL,
     "set_tracing": "instrument",
     "spans": "read",
+    "network": "read",
+    "stream_listeners": "read",
+    "state_events": "read",
+    "call_profile": "read",
+    "watch_calls": "instrument",
     "log_lines": "read",
     "listen": _ALL,  # checks read itself over the service
     "unlisten": _ALL,  # own ones only
@@ -52,6 +58,7 @@ FUNCTIONS: Final = {
     "deregister": "administer",
     "register": "administer",
     "instantiate": "administer",
+    "add_code": "administer",
     "start_container": "administer",
     "terminate": "administer",
     "terminate_container": "administer",
@@ -66,14 +73,19 @@ FUNCTIONS: Final = {
 
 SOME_HAVE: Final = {
     "children": "read",
+    "child_tables": "administer",
     "restart_child": "administer",
+    "stop_child": "administer",
     "hand_back_child": "administer",
     "lease_child": _ALL,  # checks itself for the gateway that it replaces
     "keep_child": _ALL,  # likewise
+    "rule_file": "read",
+    "try_rules": "administer",  # its conditions are called with the rights of the container
+    "save_rules": "administer",
 }
-"""Likewise, for functions of containers that supervise others."""
+"""Likewise, for functions of containers that supervise others, or run rules."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
-_OPEN_TO_ALL: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor")
+_OPEN_TO_ALL: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor", "rule_file")
 """The providers of these functions: offering them needs no right, as each of their callers is checked."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}

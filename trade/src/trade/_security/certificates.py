@@ -12,6 +12,7 @@ import os
 import ssl
 import stat
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -194,8 +195,10 @@ _LOOK_S: Final = 600.0
 class ExpiryWatch:
     """Warns before the certificate expires, until it is closed."""
 
-    def __init__(self, certificate: Certificate) -> None:
+    def __init__(self, certificate: Certificate, warned: Callable[[str], None] = lambda _: None) -> None:
+        """Warn now if it is due; ``warned`` is called with the time of the end."""
         self._certificate = certificate
+        self._tell_warned = warned
         self._warned = 0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trade-certificate", daemon=True)
@@ -223,6 +226,7 @@ class ExpiryWatch:
                 "that, or all its links end then (`trade gateway` loads the new one by itself)",
                 *(who, until, who),
             )
+            self._tell_warned(until)
 
     def close(self) -> None:
         """End the thread. Idempotent."""

@@ -27,13 +27,17 @@ _EXAMPLES: Final = {
 _Table = Mapping[str, object]
 
 
-def read_policy(path: Path) -> Policy:
+def read_policy(path: Path, text: str | None = None) -> Policy:
     """Read a policy, and the file of revoked identities that it names.
+
+    Args:
+        path: the file.
+        text: contents to check in its place, before they are written.
 
     Raises:
         ConfigurationError: names the file, the key and the right form.
     """
-    raw = _load(path)
+    raw = _load(path, text)
     where = str(path)
     _only_known(raw, _KEYS, where)
     roles = _roles(raw, where)
@@ -77,9 +81,9 @@ def _stamp(file: Path) -> tuple[int, int, int, int] | None:
     return found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
 
 
-def _load(path: Path) -> _Table:
+def _load(path: Path, text: str | None = None) -> _Table:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8") if text is None else text
     except (OSError, ValueError) as bad:
         reason = bad.strerror if isinstance(bad, OSError) and bad.strerror else str(bad)
         raise _wrong(str(path), f"the policy cannot be read: {reason}. Write the file, or name another one") from None

@@ -2,6 +2,7 @@
 
 # pyright: reportUnknownArgumentType=false
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from typing import Any, Literal, TypeVar, overload
 
 from trade._protocol.messages import Scalar
 from trade._registry.constraints import checked_meta
-from trade._registry.predicates import parse_achieved
+from trade._registry.predicates import parse_condition
 from trade.errors import ConfigurationError
 
 __all__ = ["Effect", "ServiceMark", "effect_of", "marked_methods", "service"]
@@ -18,6 +19,7 @@ Effect = Literal["read", "note", "actuate", "stop"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _MARK = "__trade_service__"
+_PROVIDER = "__trade_provider__"
 _EFFECTS = ("read", "note", "actuate", "stop")
 
 
@@ -27,11 +29,13 @@ class ServiceMark:
 
     effect: Effect = "actuate"
     cancel: str | None = None
+    needs: tuple[str, ...] = ()
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     meta: Mapping[str, Scalar] = field(default_factory=dict[str, Scalar])
     serial: bool = False
     strict: bool = True
+    guard: Callable[..., str | None] | None = None
 
 
 @overload
@@ -41,11 +45,13 @@ def service(
     *,
     effect: Effect = "actuate",
     cancel: str | None = None,
+    needs: Sequence[str] = (),
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
     meta: Mapping[str, Scalar] | None = None,
     serial: bool = False,
     strict: bool = True,
+    guard: Callable[..., str | None] | None = None,
 ) -> Callable[[_Function], _Function]: ...
 def service(
     function: Callable[..., Any] | None = None,
@@ -53,28 +59,33 @@ def service(
     *,
     effect: Effect = "actuate",
     cancel: str | None = None,
+    needs: Sequence[str] = (),
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
     meta: Mapping[str, Scalar] | None = None,
     serial: bool = False,
     strict: bool = True,
+    guard: Callable[..., str | None] | None = None,
 ) -> Any:
-    """Mark a method as a service, in a class or in an interface whose implementations then have it.
+    """Mark a method as a service, in a class or in an interface whose implementations then have it; or a function.
 
     Args:
         effect: ``"read"`` changes nothing; ``"note"`` only records something, so that no lock takes or delays it;
             ``"actuate"`` (default) may move something or change state; ``"stop"`` ends motion: it overtakes everything
             and ignores deadlines.
         cancel: name of the service of the same provider that ends this one early.
+        needs: pre-conditions, predicates such as ``"see(?object)"``. They describe the service, and refuse no call.
         achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
         uses: physical resources that it needs exclusively.
         meta: numbers, texts and booleans by name, for queries: ``{"payload_kg": 2}``.
         serial: it never runs at the same time as another serial service of the object; calls queue in order of arrival.
         strict: a local call behaves like a remote one, with validated arguments and copies. False: it passes arguments
             by reference, neither checked nor copied; a service that needs physical resources is always strict.
+        guard: a function that may refuse a call before it runs, as for `trade.guard`. It gets the object first, as the
+            method does, and then the call, a `HookEvent`. It has one second.
 
     Raises:
-        ConfigurationError: the effect is unknown, the options contradict each other, a post-condition is malformed, or
+        ConfigurationError: the effect is unknown, the options contradict each other, a condition is malformed, or
             metadata is not a plain value.
     """
     if effect not in _EFFECTS:
@@ -83,10 +94,20 @@ def service(
         raise ConfigurationError(problem="a stop cannot be serial, because a stop never waits")
     if uses and effect == "note":
         raise ConfigurationError(problem='a note uses no resources; leave out uses, or write effect="actuate"')
-    for condition in _several(achieves):
-        parse_achieved(condition)
+    if guard is not None:
+        require_check("@service", guard)
+        if effect == "stop":
+            raise ConfigurationError(problem="a stop cannot have a guard, because nothing may refuse it")
     mark = ServiceMark(
-        effect, cancel, _several(achieves), _several(uses), checked_meta(meta or {}), serial=serial, strict=strict
+        effect,
+        cancel,
+        _conditions(needs, "pre-condition"),
+        _conditions(achieves, "post-condition"),
+        _several(uses),
+        checked_meta(meta or {}),
+        serial=serial,
+        strict=strict,
+        guard=guard,
     )
 
     def note(target: _Function) -> _Function:
@@ -99,8 +120,29 @@ def service(
     return note if function is None else note(function)
 
 
+def require_check(where: str, check: object) -> None:
+    """Raises ConfigurationError for what cannot be a guard's check."""
+    if not callable(check) or inspect.iscoroutinefunction(check):
+        problem = f"a guard is a plain function that returns why a call is refused, or None; not {check!r}"
+        raise ConfigurationError(where=where, problem=problem)
+
+
+def check_of(provider: object, name: str, mark: ServiceMark) -> Callable[[Any], Any] | None:
+    """The check of a service's mark, bound to its provider as the service is."""
+    if mark.guard is None or isinstance(inspect.getattr_static(type(provider), name), staticmethod):
+        return mark.guard
+    return functools.wraps(mark.guard)(functools.partial(mark.guard, provider))
+
+
 def _several(texts: str | Sequence[str]) -> tuple[str, ...]:
     return (texts,) if isinstance(texts, str) else tuple(texts)
+
+
+def _conditions(texts: str | Sequence[str], kind: str) -> tuple[str, ...]:
+    several = _several(texts)
+    for text in several:
+        parse_condition(text, kind)
+    return several
 
 
 def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tuple[ServiceMark, Callable[..., Any]]]:
@@ -124,6 +166,15 @@ def effect_of(function: Callable[..., Any]) -> Effect | None:
     """The effect of a method, by its mark; None: it is not a service."""
     mark = getattr(function, _MARK, None)
     return mark.effect if isinstance(mark, ServiceMark) else None
+
+
+def provider_of(given: object) -> object:
+    """The provider of a function that is a service, one for each function; any other object is its own provider."""
+    if not inspect.isfunction(given) or effect_of(given) is None:
+        return given
+    if _PROVIDER not in vars(given):
+        setattr(given, _PROVIDER, type(given.__name__, (), {given.__name__: staticmethod(given)})())
+    return vars(given)[_PROVIDER]
 
 
 def kinds_of(cls: type, interfaces: Sequence[type] = ()) -> tuple[str, ...]:

@@ -58,6 +58,7 @@ def describe(
         doc=inspect.getdoc(function) or "",
         effect=mark.effect,
         cancel=mark.cancel,
+        needs=mark.needs,
         achieves=mark.achieves,
         uses=mark.uses,
         meta=dict(mark.meta),

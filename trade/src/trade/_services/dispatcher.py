@@ -7,9 +7,9 @@ that takes a call starts another; at the limit it answers Busy, so that the chan
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import msgspec
 from msgspec import Raw, Struct
@@ -26,14 +26,16 @@ from trade._context.active_calls import (
 )
 from trade._context.call_context import CallContext, outer_of
 from trade._context.sessions import foreign
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, calls_to, is_chunk, reply_key
+from trade._protocol.keys import DOMAIN, LOCAL, PROVIDER, Address, calls_to, is_chunk, reply_key
 from trade._protocol.messages import (
     CANCEL,
     EMPTY,
+    LARGE,
     PROTOCOL,
     UNREADABLE,
     Call,
     CancelArguments,
+    LargeBytes,
     Malformed,
     Reply,
     Status,
@@ -74,6 +76,9 @@ _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
+HandOver = Callable[[Callable[[], None]], None]
+
+
 class IncomingCall(Struct, frozen=True, gc=False):
     """A call that came in, and the contents of its key."""
 
@@ -84,6 +89,30 @@ class IncomingCall(Struct, frozen=True, gc=False):
     """Where to answer."""
     place: str = ""
     """The ``domain/provider`` that it calls; empty once only the answer remains to be sent."""
+
+
+class _Nowhere(Publisher):
+    """Takes the answers of connections that have ended."""
+
+    def put(self, payload: bytes) -> None: ...
+    def close(self) -> None: ...
+
+
+_NOWHERE: Final = _Nowhere()
+
+
+class CallPool(Protocol):
+    """Threads that take calls: of a channel, or of the local path."""
+
+    taken: int
+    """The number of calls that it has begun to process, without refused ones."""
+
+    @property
+    def draining(self) -> bool: ...
+    @property
+    def working(self) -> int: ...
+    def close(self) -> None: ...
+    def wait(self, most_s: float) -> None: ...
 
 
 class Dispatcher:
@@ -106,6 +135,8 @@ class Dispatcher:
         self._here = f"{own}/"
         self._providers = providers
         self._repliers: dict[str, Publisher] = {}
+        self._local_repliers: dict[str, Publisher] = {}
+        """Those on connections of the local path."""
         self._lock = threading.Lock()
         self._leaving = False
         self._closed = False
@@ -114,7 +145,8 @@ class Dispatcher:
         self.malformed = 0
         self.callers = set[str]()
         """Identities with channels of their own; empty: all share the same channels."""
-        self._worker_pools: list[WorkerPool] = []
+        self.pools: Final[list[CallPool]] = []
+        """The threads that take calls."""
         if callers := access.callers():
             self.hear(callers)
         else:
@@ -134,17 +166,23 @@ class Dispatcher:
         An identified caller loses the calls that it sends faster than they are taken: a caller made to wait would delay
         all others on the same link.
         """
-        for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
+        for name, stop, refuse in (("trade-call", False, self.busy), ("trade-stop", True, self.serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
             channel = self._transport.subscribe(pattern, newest=0 if caller == ANYBODY else _MOST_WAITING)
-            self._worker_pools.append(WorkerPool(name, channel, self._serve, refuse))
+            self.pools.append(WorkerPool(name, channel, self.serve, refuse))
 
     @property
     def draining(self) -> bool:
         """Whether a thread is ready to take the next call."""
-        return all(pool.draining for pool in self._worker_pools)
+        return all(pool.draining for pool in self.pools)
 
-    def _serve(self, message: Message) -> None:
+    def serve(self, message: Message, hand_over: HandOver | None = None) -> None:
+        """Runs the call of a message, and answers it.
+
+        Args:
+            message: the call.
+            hand_over: runs on another thread what is left to do when it has its answer; none: this thread does.
+        """
         incoming = self._take(message)
         if incoming is None:
             return
@@ -165,9 +203,9 @@ class Dispatcher:
         elif urgent:
             self._answer(incoming, *_run(incoming, service, None))
         else:
-            self._begin(incoming, service)
+            self._begin(incoming, service, hand_over)
 
-    def _begin(self, incoming: IncomingCall, service: LocalService) -> None:
+    def _begin(self, incoming: IncomingCall, service: LocalService, hand_over: HandOver | None) -> None:
         ongoing = ActiveCall(incoming.caller, incoming.call, partial(self._report, service))
         first = self._deduplicator.begin(incoming.call, ongoing)
         if first is not ongoing or ongoing.answer is not None:
@@ -175,7 +213,7 @@ class Dispatcher:
         elif service.serial is None:
             self._perform(ongoing, service, incoming)
         else:
-            self._queue(service.serial, ongoing, service, incoming)
+            self._queue(service.serial, ongoing, service, incoming, hand_over)
 
     def _denied(self, incoming: IncomingCall, service: LocalService) -> AccessDenied | None:
         """Why a caller may not call a service; decided once for each policy."""
@@ -208,7 +246,14 @@ class Dispatcher:
         for again in also or ():
             self._answer(self._to_answer(incoming.caller, again), *answer)
 
-    def _queue(self, serial: SerialQueue, ongoing: ActiveCall, service: LocalService, incoming: IncomingCall) -> None:
+    def _queue(
+        self,
+        serial: SerialQueue,
+        ongoing: ActiveCall,
+        service: LocalService,
+        incoming: IncomingCall,
+        hand_over: HandOver | None,
+    ) -> None:
         def begin() -> None:
             if not self._leaving:
                 with serial.held():
@@ -220,7 +265,7 @@ class Dispatcher:
 
         ongoing.on_cancel(drop)
         ongoing.queued_ns = time.monotonic_ns()
-        if not serial.submit(begin):
+        if not serial.submit(begin, hand_over):
             self._note(service.label, self._too_much(service.label), incoming)
             self._end(ongoing, service, incoming, (Status.BUSY, EMPTY))
 
@@ -232,7 +277,7 @@ class Dispatcher:
         if answer is not None:
             self._answer(incoming, *answer)
 
-    def _refuse(self, incoming: IncomingCall, status: int, body: Raw = EMPTY) -> None:
+    def _refuse(self, incoming: IncomingCall, status: int, body: Raw | LargeBytes = EMPTY) -> None:
         """Answer without running the call; the call may have run before."""
         first = self._deduplicator.find(incoming.caller, incoming.call)
         if first is not None:
@@ -260,7 +305,8 @@ class Dispatcher:
         except ChannelClosed:
             _logger.debug("the progress of %s is not sent: the container is closing", call.service)
 
-    def _busy(self, message: Message) -> None:
+    def busy(self, message: Message) -> None:
+        """Answers the call of a message that there are too many calls."""
         incoming = self._take(message)
         if incoming is not None:
             label = f"{incoming.place.partition('/')[0]}.{incoming.call.service}"
@@ -287,41 +333,64 @@ class Dispatcher:
                 raise Malformed(f"session {call.session!r} is not one of {caller}")
             replier = self._replier(caller, call.reply)
         except (Malformed, ValueError) as bad:
-            self.malformed += 1
-            self._audit.refused(message.key, str(bad), who=message.key.split("/", 2)[1])
-            if self.malformed == 1:
-                _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", message.key, bad)
+            self.drop(message.key, message.key.split("/", 2)[1], bad)
             return None
         return IncomingCall(call, caller, replier, place[len(self._here) :])
 
-    def _answer(self, incoming: IncomingCall, status: int, body: Raw) -> None:
+    def drop(self, where: str, who: str, bad: Exception) -> None:
+        """Records that something came in that is no call."""
+        self.malformed += 1
+        self._audit.refused(where, str(bad), who=who)
+        if self.malformed == 1:
+            _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", where, bad)
+
+    def _answer(self, incoming: IncomingCall, status: int, body: Raw | LargeBytes) -> None:
         if self._closed:
             return
-        data = encode_message(Reply(PROTOCOL, incoming.call.id, status, time.monotonic_ns(), body))
         try:
-            incoming.replier.put(data)
+            _send(incoming.replier, incoming.call.id, status, body)
         except ChannelClosed:  # the publisher was closed meanwhile
             if not self._closed:
-                self._replier(incoming.caller, incoming.call.reply).put(data)
+                _send(self._replier(incoming.caller, incoming.call.reply), incoming.call.id, status, body)
 
     def _to_answer(self, caller: str, call: Call) -> IncomingCall:
         return IncomingCall(call, caller, self._replier(caller, call.reply))
 
     def _replier(self, caller: str, reply: str) -> Publisher:
         key = f"{caller}/{reply}"
-        found = self._repliers.get(key)
+        found = self._local_repliers.get(key) or self._repliers.get(key)
         return found if found is not None else self._new_replier(key, caller, reply)
 
     def _new_replier(self, key: str, caller: str, reply: str) -> Publisher:
         container, _, channel = reply.partition("/")
         if not (is_chunk(caller) and is_chunk(container) and is_chunk(channel)):  # a wildcard would answer all callers
             raise Malformed(f"{key!r} is not a valid reply key")
+        if LOCAL in channel:  # its connection has ended, and no channel of the transport has this key
+            return _NOWHERE
         with self._lock:
             if key not in self._repliers:
                 if len(self._repliers) >= _MOST_REPLY_KEYS:
                     self._repliers.pop(next(iter(self._repliers))).close()
                 self._repliers[key] = self._transport.publish(reply_key(self._own.identity, caller, container, channel))
             return self._repliers[key]
+
+    def answer_on(self, caller: str, reply: str, replier: Publisher) -> None:
+        """Answers the calls of an identity with this reply key on a connection of their own, until `answer_no_more`."""
+        self._local_repliers[f"{caller}/{reply}"] = replier
+
+    def answer_no_more(self, caller: str, reply: str, replier: Publisher) -> None:
+        """The connection has ended."""
+        with self._lock:
+            if self._local_repliers.get(f"{caller}/{reply}") is replier:
+                del self._local_repliers[f"{caller}/{reply}"]
+
+    def hang_up(self, caller: Address) -> None:
+        """End the connections of a container: what it still reads there counts for nothing."""
+        local = f"{caller.who}/{caller.epoch}{LOCAL}"
+        with self._lock:
+            gone = [one for key, one in list(self._local_repliers.items()) if key.startswith(local)]
+        for replier in gone:
+            replier.close()
 
     def forget(self, caller: Address) -> None:
         """A container is gone: release its reply keys. A new container of its name gets new ones."""
@@ -344,16 +413,28 @@ class Dispatcher:
         self.leave()
         with self._lock:
             self._closed = True
-        for pool in self._worker_pools:
+        for pool in list(self.pools):
             pool.close()
-        for pool in self._worker_pools:
+        for pool in list(self.pools):
             pool.wait(_PARTING_S)
         self._loop.close()  # threads that still wait for a coroutine end with it
-        for pool in self._worker_pools:
+        for pool in list(self.pools):
             pool.wait(_PARTING_S)
         self._progress_reporter.close()
         for replier in list(self._repliers.values()):
             replier.close()
+
+
+def _send(replier: Publisher, call_id: int, status: int, body: Raw | LargeBytes) -> None:
+    if isinstance(body, Raw) and len(body) < LARGE:
+        replier.put(encode_message(Reply(PROTOCOL, call_id, status, time.monotonic_ns(), body)))
+    else:  # the body is the last part of a message
+        empty = encode_message(Reply(PROTOCOL, call_id, status, time.monotonic_ns(), EMPTY))
+        head = empty[: -len(EMPTY)]
+        if isinstance(body, Raw):
+            replier.put_parts(head, body)
+        else:
+            replier.put_parts(head + body.head, body.value)
 
 
 def _run(incoming: IncomingCall, service: LocalService, ongoing: ActiveCall | None) -> Answer:
@@ -361,7 +442,7 @@ def _run(incoming: IncomingCall, service: LocalService, ongoing: ActiveCall | No
     expires = None if service.effect == "stop" else call.expires_ns
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:
-        return Status.OK, Raw(service.signature.encode_result(service.label, service.run(call.args, context)))
+        return Status.OK, service.signature.encode_body(service.label, service.run(call.args, context))
     except BaseException as error:  # noqa: BLE001 - every error of a provider goes to the caller
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):

@@ -10,7 +10,7 @@ from typing import Any, Final
 from msgspec import Raw, structs
 
 from trade._context.call_context import CallContext, running
-from trade._context.interceptor import Interceptor, ServedCall
+from trade._context.interceptor import CallGuard, Interceptor, ServedCall
 from trade._context.sessions import foreign
 from trade._protocol.messages import ErrorInfo, ServiceInfo
 from trade._protocol.remote_errors import pack_error, unpack_error
@@ -20,7 +20,7 @@ from trade._services.decorator import ServiceMark
 from trade._services.event_loop import AsyncLoop
 from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
-from trade.errors import TradeError
+from trade.errors import DeadlineExceeded, TradeError
 
 __all__ = ["LocalService"]
 
@@ -34,7 +34,9 @@ class LocalService:
     __slots__ = (
         "_loop",
         "admitted",
+        "check",
         "effect",
+        "guards",
         "info",
         "interceptors",
         "label",
@@ -67,6 +69,10 @@ class LocalService:
         """Resources that it needs exclusively, or stops."""
         self.interceptors: tuple[Interceptor, ...] = ()
         """The interceptors called around it, the outermost first."""
+        self.check: Callable[[Any], Any] | None = None
+        """The check of ``@service(guard=...)``, bound to the provider."""
+        self.guards: tuple[CallGuard, ...] = ()
+        """What may refuse its calls; the innermost, so that a stop meanwhile ends them."""
         self.admitted: dict[str, Policy] = {}
         """The identities that may call it, each with the policy that allowed it."""
         self._loop = loop
@@ -95,13 +101,26 @@ class LocalService:
             return interceptors[0].run(ServedCall(self, args, kwargs, context), proceed)
         if not self.resources or self.effect != "actuate":
             self._look(context)
+            if self.guards:
+                self._require_passed(args, kwargs, context)
             return self.run_admitted(args, kwargs, context)
         permit = admitted(self.resources, context)
         try:
+            if self.guards:
+                self._require_passed(args, kwargs, context)
+                permit.gate()
             return self.run_admitted(args, kwargs, context)
         finally:
             permit.close()
             structs.force_setattr(context, "permit", None)
+
+    def _require_passed(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> None:
+        """Raises what its guards raise, or why the call may not begin any more after they took their time."""
+        began_ns = time.monotonic_ns()
+        for guard in self.guards:
+            guard.require(ServedCall(self, args, kwargs, context))
+        if self.too_late(context.expires_ns):
+            raise DeadlineExceeded(service=self.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
 
     def _look(self, context: CallContext) -> None:
         """Stop first, if it stops; check the lock that a reading service may have under its own handle."""

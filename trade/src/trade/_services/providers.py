@@ -1,5 +1,6 @@
 """The providers of a container: reads objects into services, announces and withdraws them."""
 
+import inspect
 import os
 import socket
 import threading
@@ -15,11 +16,11 @@ from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, Address, ServiceKey, as_chunk, domain_of
 from trade._protocol.messages import ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import checked_meta
-from trade._registry.registry import Registry, gone_to
+from trade._registry.registry import Record, Registry, gone_to, records_of
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade._security.authorizer import Authorizer
-from trade._services.decorator import ServiceMark, kinds_of, marked_methods
+from trade._services.decorator import ServiceMark, check_of, kinds_of, marked_methods
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
 from trade._services.registration import Built, Offer, Registered, require_stop
@@ -63,6 +64,8 @@ class Providers:
         self._moved: dict[str, str] = {}
         """By place, where the providers went that moved away last."""
         self._counter = 0
+        self.prepare: Callable[[Sequence[Record], Mapping[str, LocalService]], None] = _nothing
+        """Called for the services of a provider, by name, before they are offered or change."""
         self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
         """Signatures that objects of one class share while one of them is hosted."""
 
@@ -159,6 +162,7 @@ class Providers:
     def _host(self, place: str, registered: Registered) -> None:
         with self._announcing:
             self._watch(place, registered.services)
+            self._prepare(place, registered.services, registered.info)
             with self._lock:
                 self._require_new(registered.provider)
                 self._names[id(registered.provider)] = place
@@ -168,6 +172,16 @@ class Providers:
     def _watch(self, place: str, services: Mapping[str, LocalService]) -> None:
         for service in services.values():
             self._audit.watch(place.partition("/")[0], service)
+
+    def _prepare(self, place: str, services: Mapping[str, LocalService], info: ProviderInfo) -> None:
+        domain, _, chunk = place.partition("/")
+        self.prepare(records_of(self._own, domain, chunk, info, local=True), services)
+
+    def prepare_again(self) -> None:
+        """Prepare all services once more: what `prepare` depends on has changed."""
+        with self._announcing:
+            for place, registered in list(self._hosted.items()):
+                self._prepare(place, registered.services, registered.info)
 
     def _require_new(self, provider: object) -> None:
         if id(provider) in self._names:
@@ -200,6 +214,7 @@ class Providers:
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
             if not reread and info == known.info:
                 return
+            self._prepare(place, services, info)
             with self._lock:
                 self._hosted[place] = structs.replace(known, services=services, info=info)
             if reread:
@@ -331,6 +346,8 @@ class Providers:
             problem = "it has no services; mark methods of its class with @trade.service"
             if isinstance(provider, type):
                 kind, problem = provider.__qualname__, "it is a class; register an object of it"
+            elif inspect.isfunction(provider):
+                kind, problem = provider.__qualname__, "it is no service; mark it with @trade.service"
             raise ConfigurationError(where=kind, problem=problem)
         resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
         require_stop(kind, resources, [mark for mark, _ in marked.values()])
@@ -346,7 +363,7 @@ class Providers:
             if resources and mark.effect not in {"read", "note"}:
                 names = [one if isinstance(one, str) else one.name for one in resources]
                 info = structs.replace(info, uses=tuple(dict.fromkeys((*mark.uses, *names))))
-            services[name] = LocalService(
+            services[name] = made = LocalService(
                 label,
                 info,
                 signature,
@@ -356,6 +373,7 @@ class Providers:
                 serial if mark.serial else None,
                 self._adopt(mark, (*resources, *mark.uses), f"{place}/{name}"),
             )
+            made.check = check_of(provider, name, mark)
         return services
 
     def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
@@ -390,3 +408,7 @@ def _not_registered(provider: object) -> ConfigurationError:
 def _own_meta(provider: object) -> dict[str, Scalar]:
     """What others need to know of its class: that it can move to another host although it drives something (S20)."""
     return {"relocatable": True} if getattr(provider, "relocatable", False) is True else {}
+
+
+def _nothing(records: Sequence[Record], services: Mapping[str, LocalService]) -> None:
+    """Leaves services as they are."""

@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator
 from contextvars import ContextVar
+from functools import partial
 from typing import Final
 
 _logger = logging.getLogger("trade")
@@ -28,11 +29,15 @@ class Turn:
 _held: "ContextVar[tuple[SerialQueue, ...]]" = ContextVar("trade_serial", default=())
 
 
+def _at_once(work: Job) -> None:
+    work()
+
+
 class SerialQueue:
     """The serial services of one provider, in order of arrival.
 
-    The thread that finds the queue free runs its own call and then the calls queued meanwhile. Calls from this process
-    run on their callers' threads.
+    The thread that finds the queue free runs its own call and then the calls queued meanwhile, unless it hands those
+    over. Calls from this process run on their callers' threads.
     """
 
     def __init__(self) -> None:
@@ -59,8 +64,13 @@ class SerialQueue:
         finally:
             _held.reset(token)
 
-    def submit(self, job: Job) -> bool:
-        """Run a job now if the queue is free, else later on another thread. False: the queue is full."""
+    def submit(self, job: Job, hand_over: "Callable[[Job], None] | None" = None) -> bool:
+        """Runs a job now if the queue is free, else later on another thread. False: the queue is full.
+
+        Args:
+            job: the job.
+            hand_over: runs the jobs that were queued meanwhile on another thread; none: this thread runs them.
+        """
         with self._lock:
             if self._taken:
                 if len(self._queue) >= MOST_WAITING:
@@ -68,7 +78,12 @@ class SerialQueue:
                 self._queue.append(job)
                 return True
             self._taken = True
-        self._drain(job)
+        try:
+            self._run(job)
+        finally:
+            following = self._next()
+            if following is not None:
+                (hand_over or _at_once)(partial(self._drain, following))
         return True
 
     def withdraw(self, waiting: Job | Turn) -> bool:
@@ -102,16 +117,24 @@ class SerialQueue:
     def leave(self) -> None:
         """Pass the turn to the next in the queue."""
         job = self._next()
-        if job is not None:
+        if job is None:
+            return
+        try:
             threading.Thread(target=self._drain, args=(job,), name="trade-serial", daemon=True).start()
+        except RuntimeError:  # the process may have no more threads
+            self._drain(job)
 
     def _drain(self, job: Job | None) -> None:
         while job is not None:
-            try:
-                job()
-            except Exception:
-                _logger.exception("a call that had waited for its turn could not be answered")
+            self._run(job)
             job = self._next()
+
+    @staticmethod
+    def _run(job: Job) -> None:
+        try:
+            job()
+        except Exception:
+            _logger.exception("a call of a serial service could not be answered")
 
     def _next(self) -> Job | None:
         """The next job; None if the queue is empty, or if the next is a waiting thread, which then has the turn."""

@@ -15,7 +15,7 @@ from msgspec import UNSET, Raw
 from msgspec.structs import astuple
 
 from trade._protocol.codec import Codec
-from trade._protocol.messages import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
+from trade._protocol.messages import LARGE, MOST_BYTES, UNREADABLE, ErrorInfo, LargeBytes, ServiceInfo
 from trade._protocol.schema import NOT_FINITE, problem_text, value_at
 from trade._services.decorator import ServiceMark
 from trade._services.description import describe, described, field_of
@@ -132,6 +132,12 @@ class Signature:
         if len(data) > MOST_BYTES:
             raise TooLarge(service=service, what="a result", size_bytes=len(data), limit_bytes=MOST_BYTES)
         return data
+
+    def encode_body(self, service: str, value: Any) -> Raw | LargeBytes:
+        """The same for an answer, in which large bytes are not copied."""
+        if type(value) is bytes and LARGE <= len(value) < MOST_BYTES - 8 and self._result_is_plain in (bytes, Any):
+            return LargeBytes(value)
+        return Raw(self.encode_result(service, value))
 
     def copy_result(self, service: str, value: Any) -> Any:
         """The result as a remote caller would get it."""

@@ -17,7 +17,7 @@ from typing import Final
 
 from trade._security.certificates import common_name
 from trade._stop_line.messages import MOST_BYTES
-from trade._stop_line.places import is_own_user
+from trade._transport.host_socket import is_own_user
 
 _logger = logging.getLogger("trade")
 

@@ -7,7 +7,7 @@ from msgspec import Meta
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._services.decorator import service
-from trade._streams.source import LEAST_HZ, MOST_HZ, RateRequest, Streams
+from trade._streams.source import LEAST_HZ, MOST_HZ, ListenerInfo, RateRequest, Streams
 
 Hz = Annotated[float, Meta(ge=LEAST_HZ, le=MOST_HZ)]
 
@@ -26,6 +26,11 @@ class StreamServices:
         """
         asked = served_call()
         self._streams.listen(service, (asked.session, name), RateRequest(asked.caller, hz, on_change))
+
+    @service(effect="read")
+    def stream_listeners(self) -> list[ListenerInfo]:
+        """The listeners of this container's services."""
+        return self._streams.listeners()
 
     @service(effect="read")
     def unlisten(self, name: str) -> None:

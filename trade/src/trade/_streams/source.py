@@ -8,40 +8,22 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
-from msgspec import Raw, Struct, structs
+from msgspec import Struct, structs
 
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext
 from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, encode_message
-from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
+from trade._protocol.messages import EMPTY_ARGUMENTS, encode_message
+from trade._protocol.samples import STEPS_HZ, stream_key
 from trade._registry.registry import Change
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import Turn
+from trade._streams.rate import ActiveRate, Rate, period_ns
 from trade._threads.scheduler import Scheduler
-from trade._transport.base import ChannelClosed, Publisher, Transport
+from trade._transport.base import ChannelClosed, Transport
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
-
-
-class Pace:
-    """A rate limit, by the source's clock."""
-
-    def __init__(self, hz: float) -> None:
-        self._period_ns = int(1e9 / hz)
-        self._slack_ns = self._period_ns // 2
-        """A source is never exactly on time: a sample this much too early counts as on time."""
-        self._due_ns: int | None = None
-
-    def takes(self, at_ns: int) -> bool:
-        """Whether a sample of that time is within the rate."""
-        due_ns = at_ns if self._due_ns is None else self._due_ns
-        if at_ns + self._slack_ns < due_ns:
-            return False
-        self._due_ns = max(due_ns, at_ns - self._period_ns) + self._period_ns
-        return True
-
 
 _logger = logging.getLogger("trade")
 
@@ -49,8 +31,6 @@ LEAST_HZ: Final = 0.001
 MOST_HZ: Final = 1000.0
 LEASE_S: Final = 10.0
 """A listener that has not renewed its request for this long counts as gone."""
-SIGN_S: Final = 1.0
-"""An unchanged value is still published this often."""
 _PATIENCE_S: Final = 10.0
 """How long a sample may take."""
 _MOST: Final = 10_000
@@ -73,6 +53,24 @@ class StreamHost(Protocol):
     def require_call(self, who: str, handle: Handle) -> None: ...
 
 
+class ListenerInfo(Struct, frozen=True, kw_only=True):
+    """One listener of a stream."""
+
+    container: str
+    """The container of the service."""
+    service: str
+    """Group and name: ``rosie.head.state``."""
+    session: str
+    """The session of the listener."""
+    identity: str
+    hz: float
+    """The highest rate that it takes, in samples per second."""
+    on_change: bool
+    """Whether it takes only samples that differ from the one before."""
+    left_s: float
+    """The time until it counts as gone, unless it renews its request."""
+
+
 class RateRequest(Struct, frozen=True):
     """The request of one listener."""
 
@@ -81,55 +79,6 @@ class RateRequest(Struct, frozen=True):
     on_change: bool
     until_ns: int = 0
     """The end of its lease."""
-
-
-class ActiveRate(NamedTuple):
-    """The combined requests for one rate."""
-
-    always: bool
-    """Some listener wants more than changes."""
-    newly: bool
-    """Some listener wants a sample now."""
-
-
-def period_ns(hz: float) -> int:
-    """The period of a rate."""
-    return int(1e9 / hz)
-
-
-class _Rate:
-    """The publication of samples at one rate. Used by the scheduler only."""
-
-    def __init__(self, hz: float, publisher: Publisher) -> None:
-        self._pace = Pace(hz)
-        self._publisher = publisher
-        self._period_ns = period_ns(hz)
-        self._number = 0
-        self._put: tuple[bool, bytes] | None = None
-        self._put_ns = 0
-
-    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: ActiveRate, every_ns: int) -> None:
-        """Publish a sample, unless it is too soon, or unchanged for listeners of changes only.
-
-        Args:
-            answer: whether the service failed, and its result.
-            at: ``time.time()`` of the call.
-            at_ns: the monotonic clock at that moment.
-            wished: the requests for this rate.
-            every_ns: the period of sampling.
-        """
-        stale = at_ns - self._put_ns >= SIGN_S * 1e9
-        if not (wished.newly or stale or wished.always or answer != self._put):
-            return
-        on_time = every_ns >= self._period_ns or self._pace.takes(at_ns)
-        if not (wished.newly or on_time):
-            return
-        self._number += 1
-        self._publisher.put(encode_message(StreamSample(PROTOCOL, self._number, at, at_ns, answer[0], Raw(answer[1]))))
-        self._put, self._put_ns = answer, at_ns
-
-    def close(self) -> None:
-        self._publisher.close()
 
 
 class Source:
@@ -141,17 +90,20 @@ class Source:
         services: Callable[[ServiceKey], LocalService | None],
         transport: Transport,
         new_id: Callable[[], int],
+        tell: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None,
     ) -> None:
         self._key = key
         self._services = services
         self._transport = transport
         self._new_id = new_id
+        self._tell = tell
+        """Called with each listener that comes (True) or goes."""
         self._shown = ExitStack()
         self._lock = threading.Lock()
         self._wishes: dict[Listener, RateRequest] = {}
         self._new: set[float] = set()
         """Rates at which a listener wants a sample at once."""
-        self._rates: dict[float, _Rate] = {}
+        self._rates: dict[float, Rate] = {}
         self._next_ns = 0
         self._problem = ""
 
@@ -179,12 +131,23 @@ class Source:
             new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
             if new:
                 self._new.add(wish.hz)
-            return new
+        if before is None:
+            self._tell(self._key, listener, True)
+        return new
 
     def drop(self, which: Callable[[Listener, RateRequest], bool]) -> None:
         """Remove listeners."""
         with self._lock:
-            self._wishes = {who: wish for who, wish in self._wishes.items() if not which(who, wish)}
+            gone = [who for who, wish in self._wishes.items() if which(who, wish)]
+            for who in gone:
+                del self._wishes[who]
+        for who in gone:
+            self._tell(self._key, who, False)
+
+    def wishes(self) -> dict[Listener, RateRequest]:
+        """The requests by listener."""
+        with self._lock:
+            return dict(self._wishes)
 
     def identities(self) -> set[str]:
         """The identities of the listeners."""
@@ -223,7 +186,7 @@ class Source:
             self._rates.pop(hz).close()
         for hz in wished:
             if hz not in self._rates:
-                self._rates[hz] = _Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
+                self._rates[hz] = Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
 
     def _after(self, now: int, period_ns: int) -> int:
         """The time of the next tick; missed ones are left out, and an extra tick shifts no others."""
@@ -285,6 +248,8 @@ class Streams:
         self._new_id = new_id
         self._lock = threading.Lock()
         self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
+        self.notify: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None
+        """Called with each listener that comes (True) or goes."""
 
     def listen(self, handle: Handle, listener: Listener, wish: RateRequest) -> None:
         """Sample a service of this container for a listener, for as long as the lease.
@@ -312,7 +277,7 @@ class Streams:
         known = self._sources.get(key)
         if known is not None:
             return known
-        made = Source(key, self._services, self._transport, self._new_id)
+        made = Source(key, self._services, self._transport, self._new_id, self.notify)
         with self._lock:
             known = self._sources.get(key)
             if known is None:
@@ -321,6 +286,25 @@ class Streams:
         if known[0] is made:
             made.show()
         return known
+
+    def listeners(self) -> list[ListenerInfo]:
+        """The listeners of this container's services."""
+        with self._lock:
+            sources = list(self._sources.items())
+        now_ns = time.monotonic_ns()
+        return [
+            ListenerInfo(
+                container=self._home.name,
+                service=self._home.handle(key).label,
+                session=session,
+                identity=wish.identity,
+                hz=wish.hz,
+                on_change=wish.on_change,
+                left_s=max(0.0, (wish.until_ns - now_ns) / 1e9),
+            )
+            for key, (source, _) in sources
+            for (session, _), wish in source.wishes().items()
+        ]
 
     def unlisten(self, listener: Listener) -> None:
         """Remove a listener."""

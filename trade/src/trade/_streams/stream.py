@@ -5,7 +5,7 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Generic, NamedTuple
 
 import msgspec
 
@@ -13,7 +13,7 @@ from trade._calls.handle import Handle
 from trade._context.sessions import Session
 from trade._protocol.messages import UNREADABLE, ErrorInfo
 from trade._protocol.remote_errors import unpack_error
-from trade._protocol.samples import Sample, StreamSample
+from trade._protocol.samples import Sample, StreamSample, Value
 from trade._threads.condition import InterruptibleCondition
 from trade.errors import ConfigurationError, InvalidResult, SessionEnded
 
@@ -32,7 +32,7 @@ class _Heard(NamedTuple):
     """How many were lost in transit since the stream began."""
 
 
-class Stream:
+class Stream(Generic[Value]):
     """Samples of one service: iterate over it, in a thread or with ``async for``, or read `latest`.
 
     Made by `Container.stream`; a context manager, also of asyncio. A slow reader gets the newest samples, and each
@@ -79,7 +79,7 @@ class Stream:
 
     # --- taking
 
-    def next(self, timeout_s: float | None = None) -> Sample:
+    def next(self, timeout_s: float | None = None) -> Sample[Value]:
         """The oldest sample not taken yet; waits for one.
 
         Args:
@@ -94,7 +94,7 @@ class Stream:
             ConfigurationError: the stream was closed.
             Exception: the error of the service itself, for each sample that failed.
         """
-        taken: list[Sample] = []
+        taken: list[Sample[Value]] = []
 
         def came() -> bool:
             sample = self.take()
@@ -105,7 +105,7 @@ class Stream:
             raise TimeoutError(f"no sample of {self.source.label} came within {timeout_s} s")
         return taken[0]
 
-    async def anext(self) -> Sample:
+    async def anext(self) -> Sample[Value]:
         """`next` for asyncio, without a time limit of its own."""
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
@@ -126,7 +126,7 @@ class Stream:
         """Have a function called whenever there is more to take, or the stream ends; it must not block."""
         self._on_more.add(more)
 
-    def take(self) -> Sample | None:
+    def take(self) -> Sample[Value] | None:
         """The oldest sample not taken yet, None if there is none now. Raises like `next`."""
         with self._lock:
             if not self._waiting:
@@ -140,7 +140,7 @@ class Stream:
             self._reported, self._overflowed = heard.missed, 0
         return msgspec.structs.replace(heard.sample, dropped=dropped) if dropped else heard.sample
 
-    def latest(self) -> Sample | None:
+    def latest(self) -> Sample[Value] | None:
         """The newest sample, None before the first; neither takes nor waits.
 
         Raises:
@@ -151,18 +151,18 @@ class Stream:
             raise latest
         return latest
 
-    def __iter__(self) -> "Stream":
+    def __iter__(self) -> "Stream[Value]":
         return self
 
-    def __next__(self) -> Sample:
+    def __next__(self) -> Sample[Value]:
         if self._closed:
             raise StopIteration
         return self.next()
 
-    def __aiter__(self) -> "Stream":
+    def __aiter__(self) -> "Stream[Value]":
         return self
 
-    async def __anext__(self) -> Sample:
+    async def __anext__(self) -> Sample[Value]:
         if self._closed:
             raise StopAsyncIteration
         return await self.anext()
@@ -200,13 +200,13 @@ class Stream:
         if self.opened_by is not None and self.opened_by.name == session:
             self.end(SessionEnded(session=session, reason="it was closed"))
 
-    def __enter__(self) -> "Stream":
+    def __enter__(self) -> "Stream[Value]":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    async def __aenter__(self) -> "Stream":
+    async def __aenter__(self) -> "Stream[Value]":
         return self
 
     async def __aexit__(self, *_: object) -> None:

@@ -5,11 +5,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from msgspec import Struct
-
-from trade._threads.channel_workers import WorkerPool
 
 _WINDOW_S: Final = 1.0
 _STATUS: Final = Path("/proc/self/status")
@@ -44,6 +42,26 @@ class LoadInfo(Struct, frozen=True):
     threads: int
 
 
+def busyness(load: LoadInfo, under_way: int = 0) -> tuple[float, float]:
+    """How much a container has to do: calls under way and busy cores, for each core of its host; then calls a second.
+
+    Args:
+        load: its report.
+        under_way: calls that are known to be under way there; the report may be older than the last ones.
+    """
+    percent = load.cpu_percent if load.host_cpu_percent is None else load.host_cpu_percent * load.cores
+    return (max(load.in_flight + load.queued, under_way) + percent / 100) / load.cores, load.calls_per_s
+
+
+class Pool(Protocol):
+    """Threads that take calls."""
+
+    @property
+    def taken(self) -> int: ...
+    @property
+    def working(self) -> int: ...
+
+
 class _Sample(Struct, frozen=True):
     at_s: float
     process_s: float
@@ -59,12 +77,12 @@ class LoadMeter:
     def __init__(
         self,
         container: str,
-        worker_pools: Callable[[], Sequence[WorkerPool]],
+        pools: Callable[[], Sequence[Pool]],
         queued: Callable[[], int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._container = container
-        self._worker_pools = worker_pools
+        self._pools = pools
         self._queued = queued
         self._clock = clock
         self._lock = threading.Lock()
@@ -72,14 +90,12 @@ class LoadMeter:
 
     def _sample(self) -> _Sample:
         busy, ticks = _host_ticks()
-        return _Sample(
-            self._clock(), time.process_time(), busy, ticks, sum(pool.taken for pool in self._worker_pools())
-        )
+        return _Sample(self._clock(), time.process_time(), busy, ticks, sum(pool.taken for pool in self._pools()))
 
     @property
     def running(self) -> int:
         """Calls of other containers that have a thread now."""
-        return sum(pool.working for pool in self._worker_pools())
+        return sum(pool.working for pool in self._pools())
 
     def read(self) -> LoadInfo:
         """The current load."""

@@ -84,6 +84,8 @@ class Spans:
         """Describes the locks of tokens."""
         self._tell = tell
         """Called with each span."""
+        self.watch: Callable[[Span], None] | None = None
+        """Also called with each span, while calls are compared with usual ones."""
         self._lock = Lock()
         self._kept: deque[Span] = deque(maxlen=MOST)
         self._noted = 0
@@ -147,6 +149,8 @@ class Spans:
             self._kept.append(span)
         if self._tell is not None:
             self._tell(span)
+        if self.watch is not None:
+            self.watch(span)
 
     def kept(self, calls: Collection[int] | None = None, after: int = 0) -> list[Span]:
         """Spans with higher numbers, oldest first; of these calls and those that they led to, or of all."""

@@ -24,7 +24,7 @@ _MOMENT_S: Final = 0.005
 class WorkerPool:
     """The worker threads of one channel; at least one of them always waits for the next message.
 
-    A container's workers run calls with `Dispatcher._serve`; at the cap they refuse calls with `Dispatcher._busy`.
+    A container's workers run calls with `Dispatcher.serve`; at the cap they refuse calls with `Dispatcher.busy`.
     """
 
     def __init__(

@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from trade._transport.wait_clock import WaitClock
+
 _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 32
@@ -20,7 +22,7 @@ _IDLE_S: Final = 10.0
 _END_S: Final = 2.0
 
 Callback = Callable[[], "int | None"]
-"""Runs when it is due; returns when it is due again (``time.monotonic_ns()``), or None."""
+"""Runs when it is due; returns when it is due again, in nanoseconds of the clock, or None."""
 
 
 class ScheduledTask:
@@ -52,12 +54,12 @@ class Scheduler:
 
     Args:
         name: the name of its threads.
-        clock: ``time.monotonic_ns``, or the clock of a test.
+        clock: the clock of its due times.
     """
 
-    def __init__(self, name: str, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, name: str, clock: WaitClock | None = None) -> None:
         self._name = name
-        self._clock = clock
+        self.clock: Final = clock or WaitClock()
         self._numbers = itertools.count(1)
         self._queue: list[tuple[int, int, ScheduledTask]] = []
         self._lock = threading.Lock()
@@ -76,7 +78,7 @@ class Scheduler:
         return ScheduledTask(self, act)
 
     def begin(self, act: Callback, due_ns: int) -> ScheduledTask:
-        """Runs something at a time of ``time.monotonic_ns()``; a time in the past means now."""
+        """Runs something at a time of the clock, in nanoseconds; a time in the past means now."""
         due = self.due(act)
         due.at(due_ns)
         return due
@@ -97,6 +99,7 @@ class Scheduler:
         if not self._leading:
             self._call_a_leader()
         elif self._queue[0][2] is due:
+            self.clock.expect(self._sooner)
             self._sooner.notify()
 
     def _call_a_leader(self) -> None:
@@ -104,6 +107,7 @@ class Scheduler:
             return
         if self._following:
             self._called = True
+            self.clock.expect(self._sooner)
             self._followers.notify()
         elif len(self._threads) < MOST_THREADS:
             thread = threading.Thread(target=self._main, name=f"{self._name}-{len(self._threads)}", daemon=True)
@@ -113,19 +117,22 @@ class Scheduler:
                 _logger.exception("%s cannot have another thread", self._name)
             else:
                 self._called = True
+                self.clock.expect(self._sooner)
                 self._threads.add(thread)
 
     def _main(self) -> None:
         with self._lock:
+            self.clock.expect()
             self._called = False
             while (due := self._next()) is not None:
                 self._do(due)
             self._threads.discard(threading.current_thread())
+        self.clock.arrived()
 
     def _next(self) -> ScheduledTask | None:
         """The next task, once due; None if this thread is not needed. Requires the lock, and releases it to wait."""
         while not self._closed:
-            left_ns = self._queue[0][0] - self._clock() if self._queue else None
+            left_ns = self._queue[0][0] - self.clock.now_ns() if self._queue else None
             if left_ns is not None and left_ns <= 0:
                 _, turn, due = heapq.heappop(self._queue)
                 if due._turn == turn and not due.cancelled:  # pyright: ignore[reportPrivateUsage]
@@ -134,14 +141,14 @@ class Scheduler:
                     return due
             elif self._leading:
                 self._following += 1
-                called = self._followers.wait(_IDLE_S)
+                called = self.clock.wait(self._followers, _IDLE_S)
                 self._following -= 1
                 if not called and not self._called:  # it may have been called while its time expired
                     return None
                 self._called = False
             else:
                 self._leading = True
-                self._sooner.wait(_IDLE_S if left_ns is None else left_ns / 1e9)
+                self.clock.wait(self._sooner, _IDLE_S if left_ns is None else left_ns / 1e9)
                 self._leading = False
                 if left_ns is None and not self._queue:
                     return None

@@ -6,7 +6,9 @@ same on any implementation; ``zenoh`` is the real one.
 
 from abc import ABC, abstractmethod
 
-from msgspec import Struct
+from msgspec import Raw, Struct
+
+from trade._transport.wait_clock import WaitClock
 
 
 class ChannelClosed(Exception):
@@ -50,6 +52,10 @@ class Publisher(ABC):
 
         Raises ChannelClosed once closed.
         """
+
+    def put_parts(self, head: bytes, body: Raw | bytes) -> None:
+        """Send a message in two parts, of which the second one is large: without a copy, where that is possible."""
+        self.put(b"".join((head, body)))
 
     @abstractmethod
     def close(self) -> None:
@@ -101,6 +107,8 @@ class Transport(ABC):
     Once closed, every method but ``wake`` and ``close`` raises ChannelClosed.
     """
 
+    clock: WaitClock = WaitClock()
+    """The clock of long waits."""
     beat_s: float = 2.0
     """The interval at which a container announces its revision, and so the longest time a loss stays unnoticed."""
 

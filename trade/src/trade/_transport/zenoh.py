@@ -33,6 +33,9 @@ from trade.errors import ConfigurationError
 
 LEASE_MS: Final = 2000
 _COMING_IN_MS: Final = 4000
+_AGAIN_MS: Final = 200
+_AGAIN_AT_LAST_MS: Final = 1000
+_MOST_SESSIONS: Final = 10_000
 _CHANNEL_CAPACITY: Final = 4096
 _MOST_KNOWN_KEYS: Final = 1024
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
@@ -54,10 +57,13 @@ def configuration(
     credentials: tuple[str, str] | None = None,
     certificate: Certificate | None = None,
     bridge: Sequence[Sequence[str]] = (),
+    hub: str = "",
     rules: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """The settings of one session, in zenoh's names; ``bridge`` has the interfaces of each network that it joins.
+    """The settings of one session, in zenoh's names.
 
+    ``bridge`` has the interfaces of each network that it joins; an empty list of them stands for all. With ``hub``, its
+    endpoint, the only link of the session is that to the hub, which carries everything (`trade._discovery.hub_file`).
     Certificates, or else credentials, decide which peers may link; rules decide what those may send (see `zenoh_acl`).
     """
     entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
@@ -65,16 +71,21 @@ def configuration(
         entry["transport/auth/usrpwd/user"], entry["transport/auth/usrpwd/password"] = credentials
     return {
         "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
-        "mode": "router" if bridge else "peer",
+        "mode": "client" if hub else "router" if bridge else "peer",
         "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
         # A bridge's neighbours are on other hosts; sharing with those on its own host would take 16 MiB for each.
-        "transport/shared_memory/enabled": not bridge,
+        "transport/shared_memory/enabled": not (bridge or hub),
         "namespace": namespace,
         "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
-        "connect/timeout_ms": -1,  # 0 would be no retry; opening itself waits half a second at most
-        "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/endpoints": [hub] if hub else list(connect),
+        # Without a hub -1: 0 would be no retry, and opening waits half a second at most.
+        "connect/timeout_ms": _COMING_IN_MS if hub else -1,
+        "connect/exit_on_failure": bool(hub),
+        "connect/retry": {
+            "period_init_ms": _AGAIN_MS,
+            "period_max_ms": _AGAIN_MS if hub else _AGAIN_AT_LAST_MS,
+            "period_increase_factor": 2,
+        },
         "scouting/multicast/enabled": False,
         # Two peers that discover each other at once must not both dial: each would refuse the other's second link.
         # A bridge is not announced to its neighbours by gossip; it dials them.
@@ -88,6 +99,7 @@ def configuration(
         # The first message above it takes a pool of 16 MiB of locked memory that lives as long as the process.
         "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_FROM_BYTES,
         # A slow handshake takes one of 100 places; zenoh would leave it there for 10 s.
+        "transport/unicast/max_sessions": _MOST_SESSIONS,
         "transport/unicast/accept_timeout": _COMING_IN_MS,
         "transport/unicast/open_timeout": _COMING_IN_MS,
         "transport/link/tx/lease": LEASE_MS,
@@ -98,7 +110,8 @@ def configuration(
 
 def _region(interfaces: Sequence[str]) -> dict[str, Any]:
     """The peers on these interfaces form one network; routers do not belong to it, as they are other bridges."""
-    return {"filters": [{"modes": ["peer", "client"], "interfaces": list(interfaces)}]}
+    where = {"interfaces": list(interfaces)} if interfaces else {}
+    return {"filters": [{"modes": ["peer", "client"], **where}]}
 
 
 class ZenohChannel(Channel):
@@ -170,9 +183,9 @@ def _reader(subscriber: Any) -> Callable[[], zenoh.Sample]:
 
 
 class ZenohPublisher(Publisher):
-    def __init__(self, publisher: Any, forget_key: Callable[[], Any] | None = None) -> None:
+    def __init__(self, publisher: Any, forget: Callable[[], Any]) -> None:
         self._publisher = publisher
-        self._forget_key = forget_key
+        self._forget = forget
 
     def put(self, payload: bytes) -> None:
         try:
@@ -182,8 +195,7 @@ class ZenohPublisher(Publisher):
 
     def close(self) -> None:
         _quietly(self._publisher.undeclare)
-        if self._forget_key is not None:
-            _quietly(self._forget_key)
+        _quietly(self._forget)
 
 
 class ZenohQuestion(Question):
@@ -237,6 +249,7 @@ class ZenohTransport(Transport):
                 problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
         self.links: Final = Links(self._session, settings)
+        self._publishers: Final[set[zenoh.Publisher]] = set()
         self._passing: list[tuple[ZenohChannel, Callable[[], Any]]] = []
         """Channels with a temporary pattern, and how to subscribe with the final one once the container stays."""
 
@@ -248,7 +261,13 @@ class ZenohTransport(Transport):
             declared = self._session.declare_publisher(
                 known, congestion_control=_DROP if droppable else _BLOCK, express=not behind, priority=priority
             )
-        return ZenohPublisher(declared, lambda: self._session.undeclare(known))
+        self._publishers.add(declared)
+
+        def forget() -> None:
+            self._publishers.discard(declared)
+            self._session.undeclare(known)
+
+        return ZenohPublisher(declared, forget)
 
     def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
         def heard(pattern: str) -> Any:
@@ -302,7 +321,7 @@ class ZenohTransport(Transport):
         answers: dict[str, Answer] = {}
         for reply in replies:
             if reply.ok is not None:
-                who = str(reply.replier_id)
+                who = "" if reply.replier_id is None else str(reply.replier_id.zid)
                 answer = answers.setdefault(who, Answer(who, []))
                 answer.messages.append(Message(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
         return list(answers.values())
@@ -330,6 +349,8 @@ class ZenohTransport(Transport):
         _quietly(lambda: self._session.put(key, payload, allowed_destination=zenoh.Locality.SESSION_LOCAL))
 
     def close(self) -> None:
+        for publisher in list(self._publishers):  # zenoh 1.10 never frees a session that ends before its publishers
+            _quietly(publisher.undeclare)
         _quietly(self._session.close)
 
 

@@ -8,6 +8,7 @@ linked to two others introduces them to each other by gossip; the two link, and 
 import hashlib
 import hmac
 import json
+import logging
 import math
 import secrets
 import time
@@ -21,6 +22,12 @@ from trade._transport.credentials import dictionary_file
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface
 from trade.errors import ConfigurationError
 
+_logger = logging.getLogger("trade")
+
+WITHOUT_HUB: Final = (
+    "no container is visible from here until it is back; start it again with `trade hub`. Stops and e-stops of this "
+    "host work without it"
+)
 _NO_PEERS: Final[dict[str, Any]] = {"router": [], "peer": []}
 _DIGITS: Final = 32
 _TAG: Final = 16
@@ -80,6 +87,21 @@ class Found(NamedTuple):
     endpoints: tuple[str, ...]
 
 
+class Link(NamedTuple):
+    """One link of the main session."""
+
+    session: str
+    """The id of the session at its other end."""
+    here: str
+    """The endpoint of this end."""
+    there: str
+    """The endpoint of the other end."""
+    dialled: bool
+    """Whether this end dialled the other one."""
+    bridge: bool
+    """Whether the other end is a bridge."""
+
+
 class Links:
     """The links of the main session, and the way to add more."""
 
@@ -88,22 +110,29 @@ class Links:
         self._settings = settings
         self._own = str(session.zid())
         self.bridges: Final[bool] = settings["mode"] == "router"
+        self.hub: Final[str] = settings["connect/endpoints"][0] if settings["mode"] == "client" else ""
+        """The endpoint of the hub of this host, if the main session is linked to it only; it cannot be dialled then."""
         self.certified: Final = _TLS in settings
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
+        self.connect: Final[tuple[str, ...]] = tuple(settings["connect/endpoints"])
+        """The endpoints that the main session dials."""
         self._tag = _tag(settings)
-        self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
-        self._routers: set[str] = set()
+        self._reached_at = self.listen or [Endpoint.read(self.hub)]
+        self._shown = next((own for own in self._reached_at if not own.loopback), self._reached_at[0])
+        self._routers = _routers(session)
         self._router_lost_s = -math.inf
         self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
 
     def bridge_lost(self) -> bool:
         """Whether the main session lost its link to a bridge within the last second, as far as checks have seen."""
         try:
-            there = {str(router) for router in self._session.info.routers_zid()}
+            there = _routers(self._session)
         except zenoh.ZError:  # closed
             return False
         if self._routers - there:
             self._router_lost_s = time.monotonic()
+            if self.hub:
+                _logger.warning("lost the hub of this host at %s: %s", self.hub, WITHOUT_HUB)
         self._routers = there
         return time.monotonic() - self._router_lost_s < _MOMENT_S
 
@@ -114,9 +143,24 @@ class Links:
     def count(self) -> int:
         """The number of links of the main session."""
         try:
-            return len(_others(self._session))
+            return len(list(self._session.info.transports()))
         except zenoh.ZError:  # closed
             return 0
+
+    def current(self) -> list[Link] | None:
+        """The links of the main session, without those of its own beacon; None if it is closed."""
+        try:
+            info = self._session.info
+            bridges = {str(router) for router in info.routers_zid()}
+            found = [(str(link.zid), _plain(str(link.src)), _plain(str(link.dst))) for link in info.links()]
+        except zenoh.ZError:
+            return None
+        ports = tuple(f":{own.port}" for own in self.listen)
+        return [
+            Link(session, here, there, not here.endswith(ports), session in bridges)
+            for session, here, there in found
+            if session != self._beacon_id
+        ]
 
     def linked(self, session: str) -> bool:
         """Whether the main session is linked to one whose id begins with this text."""
@@ -183,8 +227,8 @@ class Links:
             helper.close()
 
     def _main_endpoint(self) -> str:
-        """The endpoint at which a session of this process reaches the main one."""
-        return dialled_from_here(self.listen[0])
+        """The endpoint at which a session of this process reaches the main one, or the hub that it is attached to."""
+        return dialled_from_here(self._reached_at[0])
 
     def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
         settings = {
@@ -221,6 +265,10 @@ class Links:
             problem = "no loopback interface was found, and this container may not be found from other hosts"
             raise ConfigurationError(where="discovery", problem=problem)
         return loopback
+
+
+def _routers(session: zenoh.Session) -> set[str]:
+    return {str(router) for router in session.info.routers_zid()}
 
 
 def _others(session: zenoh.Session) -> list[str]:

@@ -21,4 +21,4 @@ __all__ = [
     "rehearse",
 ]
 
-_publish(__name__, StepResult, Firing, RuleInfo)
+_publish(__name__, StepResult, Firing, RuleInfo, DryRun)

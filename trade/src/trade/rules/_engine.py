@@ -24,7 +24,7 @@ MOST: Final = 5
 """A rule that fires this often within `WITHIN_S` for one service is in a loop."""
 WITHIN_S: Final = 60.0
 LOOK_S: Final = 1.0
-"""How often to check whether a service is missing."""
+"""How often to check whether a service is missing or present."""
 _KEPT: Final = 200
 _LONGEST_HEALTH: Final = 500
 
@@ -88,6 +88,8 @@ class _ActiveRule:
                 self._notifications.append(container.left(constraint, self._happened))
             case "changed":
                 self._notifications.append(container.changed(constraint, self._altered))
+            case "present":
+                self._notifications.append(container.every(LOOK_S, self._look_at_each))
             case _:
                 self._notifications.append(container.joined(constraint, self._there))
                 self._notifications.append(container.every(LOOK_S, self._look))
@@ -135,6 +137,13 @@ class _ActiveRule:
             self._not_so()
         else:
             self._tick()
+
+    def _look_at_each(self) -> None:
+        selection = self.rule.when.selection
+        for about in self._engine.container.services(selection.constraint() if selection is not None else None):
+            now = time.monotonic_ns()
+            if not self.why and now >= self._resting.get(about.label, 0) and self._holds(about)[0]:
+                self._fire(about, self._way_to(about.label, now))
 
     def _tick(self) -> None:
         if time.monotonic_ns() < self._resting.get("", 0):
@@ -291,6 +300,11 @@ class Rules:
         line = msgspec.json.encode(firing).decode()
         _logger.log(logging.ERROR if firing.stopped else logging.INFO, "%s", line)
         self.container.note_change("rule stopped" if firing.stopped else "rule fired", firing.rule)
+        self.container.events.note(
+            "rule_stopped" if firing.stopped else "rule_fired",
+            firing.rule,
+            firing.stopped or "; ".join(f"{did.step}: {did.error or did.result}" for did in firing.steps),
+        )
         if self._audit is not None:
             try:
                 with self._audit.open("a", encoding="utf-8") as file:
@@ -341,10 +355,10 @@ def rehearse(container: Container, rules: dict[str, Rule]) -> list[DryRun]:
 
 def _rehearsed(container: Container, name: str, rule: Rule) -> DryRun:
     selection = rule.when.selection
-    found = container.services(selection.constraint()) if selection is not None else []
+    found: list[Handle] = container.services(selection.constraint()) if selection is not None else []
     about = found[0] if found and rule.when.of_services else None
     now = [f"{len(found)} match: {', '.join(handle.label for handle in found)}" if found else "nothing matches"]
-    fires = not rule.when.of_services and not found
+    fires = bool(found) if rule.when.present is not None else not rule.when.of_services and not found
     if selection is None:
         now = []
     if rule.if_ is not None:

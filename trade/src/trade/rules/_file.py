@@ -10,6 +10,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from trade._calls.handle import LONGEST_DEADLINE_S, Handle
+from trade._calls.picking import Pick
 from trade._notifications.triggers import LONGEST_S, SHORTEST_S
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import Scalar
@@ -40,6 +41,7 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     host: str | None = None
     container: str | None = None
     local: bool | None = None
+    needs: str | list[str] | None = None
     achieves: str | list[str] | None = None
     uses: str | None = None
     kind: str | None = None
@@ -55,6 +57,7 @@ class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             host=self.host,
             container=container,
             local=self.local,
+            needs=self.needs,
             achieves=self.achieves,
             uses=self.uses,
             kind=self.kind,
@@ -72,6 +75,8 @@ class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A service matches after a change of its groups, metadata, health or description."""
     missing: Selection | None = None
     """While no service matches."""
+    present: Selection | None = None
+    """While a service matches; for each one."""
     every_s: float | None = None
 
     @property
@@ -82,7 +87,7 @@ class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     @property
     def selection(self) -> Selection | None:
         """The services that the event is about."""
-        return self.joined or self.left or self.changed or self.missing
+        return self.joined or self.left or self.changed or self.missing or self.present
 
     @property
     def of_services(self) -> bool:
@@ -149,6 +154,8 @@ class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     args: list[Any] | dict[str, Any] = []
     """In order, or by name."""
     deadline_s: float = 10.0
+    pick: Pick | None = None
+    """Which one to call if several match."""
     wait_for: Selection | None = None
     s: float = 10.0
     """How long to wait."""
@@ -177,16 +184,19 @@ class RulesFile(Struct, frozen=True, forbid_unknown_fields=True):
     rule: dict[str, Any]
 
 
-def read_rules(path: Path) -> dict[str, Rule]:
+def read_rules(path: Path, text: str | None = None) -> dict[str, Rule]:
     """Read and check a rules file; the rules by name.
+
+    Args:
+        path: the file.
+        text: contents to check in its place, before they are written.
 
     Raises:
         ConfigurationError: names the file, the key and the right form.
     """
     file = str(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        raw = read_toml_text(text)
+        raw = read_toml_text(path.read_text(encoding="utf-8") if text is None else text)
     except OSError as bad:
         raise ConfigurationError(where=file, problem=f"cannot be read: {bad.strerror or bad}") from None
     except ValueError as bad:  # not TOML, or not UTF-8
@@ -241,7 +251,7 @@ class _Check:
             self._selection(rule.when.selection, f"when.{said[0]}", known=None)
         self._number("when.every_s", rule.when.every_s, SHORTEST_S, LONGEST_S)
         self._number("cooldown_s", rule.cooldown_s, 0.0, LONGEST_S)
-        if rule.when.missing is not None and rule.cooldown_s <= 0:
+        if (rule.when.missing or rule.when.present) is not None and rule.cooldown_s <= 0:
             self._wrong("cooldown_s", "missing; say how long to wait before the next try: cooldown_s = 60")
         if rule.if_ is not None:
             self._condition(rule.if_)
@@ -263,6 +273,8 @@ class _Check:
             self._wrong(at, "is one of call and wait_for")
         if step.wait_for is not None:
             self._selection(step.wait_for, f"{at}.wait_for")
+            if step.pick is not None:
+                self._wrong(f"{at}.pick", "is of call; a wait ends with the first service that matches")
         elif isinstance(step.call, Selection):
             self._selection(step.call, f"{at}.call")
         elif step.call == SERVICE:
@@ -293,7 +305,8 @@ class _Check:
             if text.startswith("$") and text not in (SERVICE, CONTAINER):
                 self._wrong(at, f"{text!r} is no placeholder; there is {SERVICE} and {CONTAINER}")
             if text in (SERVICE, CONTAINER) and not about:
-                problem = f"{text} is of rules with joined, left, changed or if; this one has {self._rule.when.kind}"
+                known_in = "joined, left, changed, present or if"
+                problem = f"{text} is of rules with {known_in}; this one has {self._rule.when.kind}"
                 self._wrong(at, problem)
 
     def _number(self, key: str, value: float | None, least: float, most: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from msgspec import Struct
 
 from trade._calls.handle import Handle
+from trade._calls.picking import Pick
 from trade._protocol.keys import Address
 from trade._registry.constraints import Constraint
 from trade.errors import ConfigurationError
@@ -85,8 +86,8 @@ class RuleHost(Protocol):
     def address(self) -> Address: ...
     @property
     def name(self) -> str: ...
-    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
-    def services(self, constraint: Constraint | None = ...) -> list[Handle]: ...
+    def find(self, constraint: Constraint, /, *, wait_s: float = ..., pick: Pick | None = ...) -> Handle: ...
+    def services(self, constraint: Constraint | None = ..., /) -> list[Handle]: ...
     def require_call(self, who: str, handle: Handle) -> None: ...
 
 
@@ -188,7 +189,7 @@ def _called(home: RuleHost, step: Step, about: Handle | None) -> Handle:
         assert about is not None  # noqa: S101 - checked with the file
         return about
     assert isinstance(step.call, Selection)  # noqa: S101
-    return home.find(step.call.constraint(about), wait_s=0)
+    return home.find(step.call.constraint(about), wait_s=0, pick=step.pick)
 
 
 def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None) -> Any:

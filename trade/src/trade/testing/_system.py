@@ -27,7 +27,8 @@ class MemorySystem:
 
     Messages arrive at other containers at once, unless ``delay`` or ``partition`` is set; the containers' threads
     handle them when they run, at the latest when ``settle`` returns. The network has its own clock, moved only by
-    ``advance`` and its like; deadlines of calls use the real one.
+    ``advance`` and its like. ``advance`` also moves notifications, lock waits and lock leases. Deadlines of calls use
+    the real clock.
     """
 
     def __init__(
@@ -113,8 +114,15 @@ class MemorySystem:
     # --- time
 
     def advance(self, duration_s: float) -> None:
-        """Advance the network's time: messages arrive, leases end; containers have handled them on return."""
-        self.clock.advance(duration_s)
+        """Advance the time of messages, deadlines, leases, lock waits and notifications, which are handled on return.
+
+        Args:
+            duration_s: by how much, in seconds.
+        """
+        self.network.waits.advance(duration_s, self._moved)
+
+    def _moved(self, step_s: float) -> None:
+        self.clock.advance(step_s)
         self._take_note()
 
     def settle(self) -> None:

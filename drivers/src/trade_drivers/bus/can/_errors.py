@@ -6,7 +6,7 @@ Source: Linux ``include/uapi/linux/can/error.h``: the class is in the identifier
 from enum import IntEnum
 from typing import Final
 
-from trade_drivers.bus.can._monitor import ErrorWord
+from trade_drivers.bus._can_monitor import ErrorWord
 
 __all__ = ["ErrorState", "error_state"]
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import can
 
 from trade.errors import ConfigurationError
+from trade_drivers.bus._can_monitor import CanBusState
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost, losing
 from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
 from trade_drivers.bus.can._errors import ErrorState, error_state
-from trade_drivers.bus.can._monitor import CanBusState
 from trade_drivers.bus.can._netlink import look_at
 from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.bus.can._socketcand import ServerBus

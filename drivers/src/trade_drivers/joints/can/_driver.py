@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers._validation import not_installed
+from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
-from trade_drivers.bus.can._monitor import CanMonitor
 from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
 from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver

@@ -1,9 +1,10 @@
 """Exchanges with one servo within a retry budget, as steps of jobs."""
 
 from collections.abc import Callable, Generator
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown, WrongDevice
+from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
@@ -13,7 +14,6 @@ __all__ = ["check_homing", "health_of", "still_homed", "tried", "written"]
 
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
-_ATTEMPTS: Final = 3
 AnyExchange = ServoExchange[Any, Any]
 
 
@@ -35,8 +35,8 @@ def health_of(bus: AnyExchange, axis: ServoAxis[_Health]) -> Generator[None, Non
 
 def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
     """Runs one exchange within the retry budget; a ping before each retry discards late answers."""
-    asked, waited_s = False, 0.0
-    for _ in range(_ATTEMPTS):
+    asked, began_ns = False, bus.clock()
+    for _ in attempts(bus.clock, bus.stale_after_ns):
         try:
             if asked:
                 bus.wire.ping(axis.id)
@@ -46,16 +46,15 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
             if asked:  # an earlier attempt was sent, and its outcome is unknown
                 raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
             raise
-        except NoAnswer as silent:
-            asked, waited_s = True, silent.waited_s
-            axis.doubted = True
+        except NoAnswer:
+            asked = axis.doubted = True
             yield
         except Refused as refused:
             raise axis.faulty(f"it refused a command: {refused}") from None
         else:
             yield
             return result
-    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s * _ATTEMPTS)
+    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9)
 
 
 def zero_moved(axis: ServoAxis[Any], found: int) -> str:

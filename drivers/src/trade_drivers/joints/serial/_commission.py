@@ -54,6 +54,9 @@ class ServoBench(Bench, Generic[_Wire]):
 
     def look(self, device_id: int) -> Found | None:
         found = self._look(device_id)
+        if found is not None and found.problem == _SHARED:
+            late = all(self._look(device_id) is None for _ in range(_LOOKS - 1))  # it was an answer of another id
+            return None if late else found
         for _ in range(_LOOKS - 1):
             if found is not None and found.problem == self.mute:  # one lost answer does not prove that
                 found = self._look(device_id)

@@ -163,8 +163,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         """Checks joints in doubt, and offline ones when they are due; the first failure ends the round."""
         now_ns = self.clock()
         for axis in self.devices:
-            due = axis.silent and now_ns >= axis.probe_at_ns
-            if not due and (axis.silent or not axis.doubted):
+            if not axis.in_doubt or now_ns < axis.probe_at_ns:
                 continue
             try:
                 self.readmit(axis)

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from math import tau
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from trade.errors import ConfigurationError, WrongDevice
+from trade_drivers.bus._attempts import ATTEMPTS, attempts
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Unfit, check_least, check_rate
 from trade_drivers.joints.serial._asking import check_homing
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
 
 __all__ = ["Kept", "check_cycle", "check_own_range", "check_ranges", "first_look"]
-
-_ATTEMPTS: Final = 3
 
 _Result = TypeVar("_Result")
 
@@ -64,42 +63,62 @@ def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> N
         raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
 
 
-def first_ping(wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], key: str, registers: Sequence[int]) -> int:
+def first_ping(
+    wire: "ServoWire",
+    bus: "SerialBus",
+    axis: ServoAxis[Any],
+    clock_ns: Callable[[], int],
+    key: str,
+    registers: Sequence[int],
+) -> int:
     """Returns the model number of a joint's device; raises ``ConfigurationError`` if it is absent or shares its id."""
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         f"cable, its id (register {registers[0]}) and its baud rate (register {registers[1]})"
     )
     twice = f"the answer of id {axis.id} is garbled or arrives twice: two devices may share this id, or there is noise"
-    for _ in range(_ATTEMPTS):
+    garbled = 0
+    for _ in attempts(clock_ns, int(bus.stale_after_s * 1e9)):
         try:
             number = wire.ping(axis.id)
         except BadAnswer:
-            problem = twice
+            garbled += 1
         except NoAnswer:
-            pass
+            continue
         else:
             if not wire.answers_twice():
                 return number
-            problem = twice
+            garbled += 1
+        problem = twice
+        if garbled == ATTEMPTS:  # with more of them, the answers of two devices might once look like one
+            break
     raise ConfigurationError(where=key, problem=problem)
 
 
-def again(wire: "ServoWire", axis: ServoAxis[Any], act: Callable[[], _Result]) -> _Result:
-    """Runs an exchange, with up to three attempts.
+def again(
+    wire: "ServoWire",
+    bus: "SerialBus",
+    axis: ServoAxis[Any],
+    clock_ns: Callable[[], int],
+    act: Callable[[], _Result],
+) -> _Result:
+    """Runs an exchange within the retry budget; a ping before each retry discards late answers.
 
     Raises:
         ConfigurationError: the device refused.
         NoAnswer: no answer arrived.
     """
-    for _ in range(_ATTEMPTS - 1):
+    silent = NoAnswer(axis.id, 0.0)
+    for attempt in attempts(clock_ns, int(bus.stale_after_s * 1e9)):
         try:
+            if attempt:
+                wire.ping(axis.id)
             return act()
         except Refused as refused:
             raise ConfigurationError(where=axis.name, problem=f"it refuses to be read: {refused}") from None
-        except NoAnswer:
-            wire.ping(axis.id)
-    return act()
+        except NoAnswer as missed:
+            silent = missed
+    raise silent
 
 
 def check_model(axis: ServoAxis[Any], number: int, name: str, key: str) -> None:
@@ -128,12 +147,12 @@ def first_look(
         ConfigurationError: the device is absent, another model, or shares its id.
         NoAnswer: the device answers a ping, but no read.
     """
-    number = first_ping(wire, bus, axis, key, kept.registers)
+    number = first_ping(wire, bus, axis, clock_ns, key, kept.registers)
     check_model(axis, number, kept.name_of(number, "a model this driver does not know"), key)
     asked_ns = clock_ns()
-    settings = again(wire, axis, lambda: wire.read(axis.id, 0, kept.size).data)
-    health = again(wire, axis, lambda: wire.read(axis.id, *axis.slow).data)
-    sample = again(wire, axis, lambda: wire.read(axis.id, *axis.cyclic).data)
+    settings = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, 0, kept.size).data)
+    health = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, *axis.slow).data)
+    sample = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, *axis.cyclic).data)
     check_firmware(axis, kept.firmware(settings), key)
     check_homing(axis, settings, key)
     axis.take_health(health, asked_ns)

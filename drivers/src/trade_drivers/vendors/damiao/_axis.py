@@ -59,7 +59,7 @@ class DamiaoAxis(MotorAxis):
         self.easing = 1.0
         """The share of its acceleration used for braking."""
         self.stepped_ns = 0
-        """When the last set-point was sent."""
+        """When the last set-point was sent, by the clock of interruptions."""
         self._celsius: float | None = None
 
     # --- received frames

@@ -46,7 +46,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def _there(self, axis: DamiaoAxis) -> Frame:
         """Returns the frame with the next set-point."""
-        return Frame(frames.POSITION_VELOCITY + axis.id, axis.step(self.clock(), self.period_ns / 1e9))
+        return Frame(frames.POSITION_VELOCITY + axis.id, axis.step(self.lasting_clock(), self.period_ns / 1e9))
 
     def refresh(self, axis: DamiaoAxis) -> Frame:
         """Returns a request without a command."""
@@ -54,10 +54,12 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def stand(self, axis: DamiaoAxis) -> None:
         """Starts set-points at the measured position."""
-        here = axis.fresh(self.clock(), self.stale_after_ns).position
+        axis.course = self._standing(axis, axis.fresh(self.clock(), self.stale_after_ns).position)
+        axis.stepped_ns = self.lasting_clock()
+
+    def _standing(self, axis: DamiaoAxis, position: int) -> Ramp:
         accel = float(axis.accel_counts)
-        axis.course = Ramp(here, fastest=axis.speed_counts, accel=accel, braking=accel)
-        axis.stepped_ns = self.clock()
+        return Ramp(position, fastest=axis.speed_counts, accel=accel, braking=accel)
 
     def enable(self, axis: DamiaoAxis) -> None:
         """Switches torque on between set-points at the measured position, so that it does not move to an old one."""
@@ -91,20 +93,25 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     def write_holds(self, positions: Mapping[DamiaoAxis, int]) -> None:
         """Brakes at the joint's maximum deceleration; a joint held off its course stays where it is.
 
-        Relaxes a motor whose torque this driver did not switch on, as its reaction to a position is unknown.
+        Relaxes a motor whose torque this driver did not switch on, as its reaction to a position is unknown. Sends
+        nothing after an interruption before a new measurement: the motor has stopped by itself, and where is unknown.
         """
         for axis, position in positions.items():
             if axis.course is None:
                 if axis.torque:
                     self.port.send(axis.id, frames.DISABLE)
                 continue
-            self._brake(axis, axis.course, position)
+            if not self.held_up(axis.stepped_ns):
+                self._brake(axis, axis.course, position)
+            elif axis.age_ns(self.clock()) <= self.watchdog_ns:
+                axis.course = self._standing(axis, position)
+            else:
+                continue
             self.port.send_all([self._there(axis)])
 
     def _brake(self, axis: DamiaoAxis, course: Ramp, position: int) -> None:
         if abs(course.position - position) > axis.grain.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
-            accel = float(axis.accel_counts)
-            axis.course = Ramp(position, fastest=axis.speed_counts, accel=accel, braking=accel)
+            axis.course = self._standing(axis, position)
             return
         course.accel = course.braking = axis.accel_counts
         rests = course.position + course.speed * abs(course.speed) / (2 * axis.accel_counts)
@@ -131,7 +138,10 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     # --- requests
 
     def question(self, axis: DamiaoAxis) -> Frame:
-        return self.refresh(axis) if axis.course is None else self._there(axis)
+        """Returns the next set-point; a request only after an interruption, as the motor has stopped by itself."""
+        if axis.course is None or self.held_up(axis.stepped_ns):
+            return self.refresh(axis)
+        return self._there(axis)
 
     def look_over(self, axis: DamiaoAxis) -> Steps:
         return look_over(self, axis)

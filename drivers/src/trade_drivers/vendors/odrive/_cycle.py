@@ -33,12 +33,11 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     The requests in each cycle feed the watchdogs of the axes.
     """
 
-    deaf_ns = _BEATS_MISSED_NS
-
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         super().__init__(port, bus, axes, clock)
+        self.deaf_ns = max(_BEATS_MISSED_NS, self.stale_after_ns)
         self.rival = False
         """True if another driver commands these axes."""
         for axis in axes:

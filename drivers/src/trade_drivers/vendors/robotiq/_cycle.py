@@ -124,7 +124,7 @@ class Exchange(BusCycle[Hand]):
     # --- parts of a cycle
 
     def _measure(self, hand: Hand) -> None:
-        if hand.silent and self.clock() < hand.probe_at_ns:
+        if (hand.silent or hand.doubted) and self.clock() < hand.probe_at_ns:
             return
         with suppress(NoAnswer):
             try:

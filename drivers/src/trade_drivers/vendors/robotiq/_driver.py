@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
 from trade_drivers._validation import not_installed
+from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.bus._thread import BusThread, opening, start_thread
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["RobotiqDriver"]
 
-_ATTEMPTS: Final = 3
 _BITS_A_READ: Final = (8 + 11) * 10 + 35
 """Request, answer, and the gap of three and a half characters before it."""
 
@@ -130,7 +130,7 @@ def _check(robot: Robot, bus: SerialBus) -> None:
 def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> None:
     """Takes a gripper's first measurements; writes nothing."""
     key = f'{where}: gripper."{hand.gripper.name}"'
-    for _ in range(_ATTEMPTS):
+    for _ in attempts(exchange.clock, exchange.stale_after_ns):
         try:
             exchange.probe(hand)
             exchange.read(hand)

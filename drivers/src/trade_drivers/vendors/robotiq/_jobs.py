@@ -4,6 +4,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
+from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._gate import Command, Terms
 from trade_drivers.bus._jobs import Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Activate", "ClearFault", "GripperCommand", "Motion", "Move"]
 
-_ATTEMPTS: Final = 3
 _RESET_NS: Final = 1_000_000_000
 _TAKEN_NS: Final = 500_000_000
 _STUCK_S: Final = 0.5
@@ -107,7 +107,7 @@ class Motion(GripperCommand):
             if self.arrived(sample):
                 self.exchange.release(self, None)
                 return
-            ending = self.stuck(sample, now_ns)
+            ending = self.stuck(sample)
         if ending is not None:
             self.exchange.release(self, ending)
 
@@ -115,10 +115,10 @@ class Motion(GripperCommand):
         """Returns whether it is over."""
         raise NotImplementedError
 
-    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
-        """Returns the error that prevents its end."""
-        elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
-        self._watched_ns = now_ns
+    def stuck(self, sample: Status) -> TradeError | None:
+        """Returns the error that prevents its end. Only time between measurements counts, as the rest is unknown."""
+        elapsed_s = min((sample.at_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
+        self._watched_ns = sample.at_ns
         self._waiting_s = self._waiting_s + elapsed_s if sample.position == self._position else 0.0
         self._position = sample.position
         self._patience_s -= elapsed_s
@@ -153,10 +153,10 @@ class Activate(Motion):
     def arrived(self, sample: Status) -> bool:
         return sample.activated and self.hand.still > 0
 
-    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
-        if sample.reset and now_ns - self._began_ns > _TAKEN_NS:
+    def stuck(self, sample: Status) -> TradeError | None:
+        if sample.reset and sample.at_ns - self._began_ns > _TAKEN_NS:
             return self.hand.inactive("it did not begin its activation, or lost its power in the middle of it")
-        problem = super().stuck(sample, now_ns)
+        problem = super().stuck(sample)
         if problem is not None:
             self.hand.fault = "its activation does not end: something may be in the way of its fingers"
             return self.hand.faulty()
@@ -189,12 +189,12 @@ class Move(Motion):
         short = abs(sample.position - self.hand.model.expected(self._goal))
         return sample.contact == Contact.ARRIVED and short > _NEAR_COUNTS
 
-    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
+    def stuck(self, sample: Status) -> TradeError | None:
         if not sample.activated:
             return self.hand.inactive("it has lost its activation; did its power fail?")
-        if (sample.echo != self._goal or not sample.going) and now_ns - self._began_ns > _TAKEN_NS:
+        if (sample.echo != self._goal or not sample.going) and sample.at_ns - self._began_ns > _TAKEN_NS:
             return self.hand.faulty("it does not take a command")
-        return super().stuck(sample, now_ns)
+        return super().stuck(sample)
 
 
 def _require_answering(job: GripperCommand) -> None:
@@ -204,23 +204,23 @@ def _require_answering(job: GripperCommand) -> None:
 
 def _try(job: GripperCommand, act: Callable[[], None]) -> Steps:
     """Runs one exchange within the retry budget; a probe before each retry discards late answers."""
-    waited_s = 0.0
-    for attempt in range(_ATTEMPTS):
+    exchange = job.exchange
+    began_ns = exchange.clock()
+    for attempt in attempts(exchange.clock, exchange.stale_after_ns):
         try:
             if attempt:
-                job.exchange.probe(job.hand)
+                exchange.probe(job.hand)
                 yield
             act()
         except DeadlineExceeded as late:
             if attempt:  # an earlier attempt was sent, and its outcome is unknown
                 raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
             raise
-        except NoAnswer as silent:
-            waited_s += silent.waited_s
+        except NoAnswer:
             yield
         except Refused as refused:
             raise job.hand.faulty(f"it is no 2F-85: {refused}") from None
         else:
             yield
             return
-    raise DeviceSilent(device=job.hand.name, bus=job.hand.bus, waited_s=waited_s)
+    raise DeviceSilent(device=job.hand.name, bus=job.hand.bus, waited_s=(exchange.clock() - began_ns) / 1e9)

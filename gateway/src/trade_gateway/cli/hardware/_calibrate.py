@@ -16,11 +16,11 @@ import typer
 from msgspec import Struct
 from rich.markup import escape
 
+from trade._atomic_file import replace
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._output import Output
-from trade_gateway.process._atomic_file import replace
 
 if TYPE_CHECKING:
     import tomlkit

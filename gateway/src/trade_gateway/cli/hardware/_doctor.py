@@ -32,7 +32,7 @@ def doctor(
 ) -> None:
     """Check this host and a robot for problems, and suggest fixes.
 
-    Host: rights and latency of serial ports, libraries, clock, certificates, visible containers.
+    Host: rights and latency of serial ports, libraries, clock, real time, certificates, visible containers.
     Robot file: errors that its drivers find, ports, CAN interfaces, devices and their setup, missing watchdogs.
     Nothing is changed. Lines in use by a driver are skipped. The exit code is 1 on errors.
 
@@ -60,6 +60,7 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
         yield from host.libraries(sorted(drivers()), needed=False)
     yield from host.clock()
     yield from host.waits()
+    yield from host.real_time()
     try:
         settings = choice_of(context).settings()
     except TradeError as bad:

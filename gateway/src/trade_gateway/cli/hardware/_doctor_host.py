@@ -2,6 +2,7 @@
 
 import grp
 import os
+import pwd
 import socket
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -12,14 +13,29 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from trade import Container
+from trade._discovery.hub_file import HubFile
 from trade_drivers import AnyDriver, load_driver
+from trade_gateway.process._real_time import PRIORITY, refusal
 
-__all__ = ["Finding", "certificate", "clock", "in_sight", "latencies", "libraries", "multicast", "ports", "waits"]
+__all__ = [
+    "Finding",
+    "certificate",
+    "clock",
+    "in_sight",
+    "latencies",
+    "libraries",
+    "multicast",
+    "ports",
+    "real_time",
+    "waits",
+]
 
 _LATENCIES: Final = Path("/sys/bus/usb-serial/devices")
 _LATEST_MS: Final = 2
 _CLOCK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")
 _MAPS: Final = Path("/proc/self/maps")
+_IN_CONTAINERS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
+"""Files that docker and podman put into each container."""
 _SOON: Final = timedelta(days=2)
 _PATIENCE_S: Final = 5.0
 _MULTICAST: Final = "239.255.71.68"
@@ -103,6 +119,27 @@ def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
         yield Finding(level="warning", about="clock", text=text, fix="compare `date -u` on all hosts")
 
 
+def real_time(in_containers: Sequence[Path] = _IN_CONTAINERS) -> Iterator[Finding]:
+    """Checks whether this user's drivers may run in real time."""
+    if why := refusal():
+        text = f"{why}; on a busy computer, bus cycles are late by milliseconds"
+        fix = _container_permission() if any(file.exists() for file in in_containers) else _user_permission()
+        yield Finding(level="warning", about="real time", text=text, fix=fix)
+        return
+    yield Finding(level="ok", about="real time", text="drivers may run before ordinary programs (SCHED_FIFO)")
+
+
+def _container_permission() -> str:
+    right = "--cap-add SYS_NICE" if os.getuid() == 0 else f"--ulimit rtprio={PRIORITY}"
+    return f"start the container with {right} --ulimit memlock=-1"
+
+
+def _user_permission() -> str:
+    user = pwd.getpwuid(os.getuid()).pw_name
+    lines = f'"{user} - rtprio {PRIORITY}" and "{user} - memlock unlimited"'
+    return f"put {lines} into /etc/security/limits.d/trade.conf, then log in again"
+
+
 def waits(maps: Path = _MAPS) -> Iterator[Finding]:
     """Checks whether the timeouts of this Python are independent of clock changes.
 
@@ -168,8 +205,10 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
     """Lists the containers of the system that are visible from here."""
     reachability = member.reachability(limit_s=_PATIENCE_S if member.settings.connect else 0)
     for endpoint, why in reachability.apart.items():
-        fix = "the text says what may be wrong; else correct TRADE_CONNECT"
-        yield Finding(level="error", about=endpoint, text=f"no container answers there (TRADE_CONNECT): {why}", fix=fix)
+        fix = f"the text says what may be wrong; else correct {reachability.source}"
+        text = f"no container answers there ({reachability.source}): {why}"
+        yield Finding(level="error", about=endpoint, text=text, fix=fix)
+    yield from _hub(HubFile(system))
     others = sorted(one.name for one in member.containers() if one.epoch != member.address.epoch)
     about = f"system {system}"
     if others:
@@ -179,3 +218,12 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
         return
     fix = "`trade up ROBOT.toml` starts one; another host needs the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
     yield Finding(level="ok", about=about, text="no container is visible", fix=fix)
+
+
+def _hub(file: HubFile) -> Iterator[Finding]:
+    """Checks whether the hub of this host runs, if there was one."""
+    if (hub := file.running()) is not None:
+        yield Finding(level="ok", about="hub", text=f"runs at {hub.endpoint}, as {hub.identity}")
+    elif file.last() is not None:
+        text = "has ended: the containers that were attached to it are not visible"
+        yield Finding(level="warning", about="hub", text=text, fix=f"trade hub; or remove {file.path} if there is none")

@@ -233,7 +233,9 @@ def _one(
     if len(found) > 1:
         rates = ", ".join(str(one.baud) for one in found)
         raise ConfigurationError(where=where, problem=f"devices answer at {rates} baud; choose one with --baud")
-    if model is not None and not found[0].problem and found[0].model != model:
+    if found[0].problem:  # also if it is gone at the next look: the model is not known then
+        raise ConfigurationError(where=where, problem=f"{found[0].problem}; nothing was changed")
+    if model is not None and found[0].model != model:
         raise ConfigurationError(where=where, problem=f"is {found[0].model}, not {model}; nothing was changed")
     return commissioners(found[0].driver)[found[0].driver], found[0]
 

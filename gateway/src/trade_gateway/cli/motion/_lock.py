@@ -16,6 +16,7 @@ from typer.core import TyperCommand
 from trade import Constraint
 from trade.errors import LockLost
 from trade_gateway._usage import UsageError, asked_for
+from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import SELECT, TIMING
 from trade_gateway.cli._system_choice import SystemChoice, choice_of, visitor_among_others
 
@@ -44,7 +45,9 @@ COMMAND: Final = {"cls": WithCommand}
 
 def lock(
     context: typer.Context,
-    group: Annotated[str | None, typer.Argument(help="Group to lock, with the groups beneath it: rosie.head.")] = None,
+    group: Annotated[
+        str | None, typer.Argument(autocompletion=groups, help="Group to lock, with the groups beneath it: rosie.head.")
+    ] = None,
     name: Annotated[
         list[str] | None,
         typer.Option(

@@ -1,6 +1,6 @@
 """``trade locks``, ``unlock`` and ``resume``: list locks, break them, and release groups after a stop."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
@@ -8,11 +8,14 @@ from rich.markup import escape
 from trade import Constraint, Container, LockInfo
 from trade._timestamps import clock
 from trade_gateway._usage import asked_for
+from trade_gateway.cli._completion import groups, locked_groups
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
 
-Group = Annotated[str, typer.Argument(help="A group, with the groups beneath it: rosie.head.")]
+_GROUP_HELP: Final = "A group, with the groups beneath it: rosie.head."
+Group = Annotated[str, typer.Argument(autocompletion=groups, help=_GROUP_HELP)]
+Locked = Annotated[str, typer.Argument(autocompletion=locked_groups, help=_GROUP_HELP)]
 
 
 def locks(context: typer.Context, as_json: Json = False) -> None:
@@ -65,7 +68,7 @@ def _row(info: LockInfo) -> tuple[str, ...]:
 
 def unlock(
     context: typer.Context,
-    group: Group,
+    group: Locked,
     reason: Annotated[str, typer.Option("--break", metavar="REASON", help="Reason, reported to the owner.")],
 ) -> None:
     """Break the locks of a group; motion under them is stopped.

@@ -7,6 +7,7 @@ from rich.markup import escape
 
 from trade import StopReport
 from trade._stop_line import StopLines
+from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
@@ -14,7 +15,9 @@ from trade_gateway.cli._system_choice import choice_of, visitor
 
 def stop(
     context: typer.Context,
-    group: Annotated[str, typer.Argument(metavar="GROUP", help="Group to stop, and the groups beneath it.")],
+    group: Annotated[
+        str, typer.Argument(autocompletion=groups, metavar="GROUP", help="Group to stop, and the groups beneath it.")
+    ],
     reason: Annotated[str, typer.Option(help="Reason, for the audit record.")] = "",
     limit: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="SECONDS", help="Time limit, in seconds.")] = 3.0,
     as_json: Json = False,

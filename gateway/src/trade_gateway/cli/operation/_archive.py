@@ -22,8 +22,8 @@ from typing import IO, Annotated, Final, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._atomic_file import fresh_beside
 from trade.errors import ConfigurationError
-from trade_gateway.process._atomic_file import fresh_beside
 
 __all__ = ["CONFIG", "SQLITE_BESIDE", "STATE", "Entry", "Manifest", "Source", "read_archive", "unpack", "write_archive"]
 

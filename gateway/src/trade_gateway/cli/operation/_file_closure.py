@@ -36,6 +36,7 @@ class Named(NamedTuple):
 class _Http(Struct):
     tokens: str = ""
     tls: str = ""
+    twin: str = ""
 
 
 class _Part(Struct, kw_only=True):
@@ -46,6 +47,7 @@ class _Part(Struct, kw_only=True):
     audit: str = ""
     robot: str = ""
     rules: str = ""
+    ros: str = ""
     http: _Http | None = None
     gateway: str = ""
     host: str = _LOCAL
@@ -53,7 +55,7 @@ class _Part(Struct, kw_only=True):
     def files(self, folder: Path) -> Iterator[Path]:
         """Returns the files of this host that it names directly."""
         http = self.http or _Http()
-        for name in (self.robot, self.rules, http.tokens):
+        for name in (self.robot, self.rules, self.ros, http.tokens, http.twin):
             if name:
                 yield folder / name
         for tls in (self.tls, http.tls):

@@ -9,6 +9,7 @@ from typing import Final
 from msgspec import Struct
 
 from trade_drivers import CanBus, Robot, SerialBus
+from trade_gateway.process._real_time import PRIORITY
 
 __all__ = ["UDEV_RULES", "Needs", "hidden_in", "needs_of", "program_folders", "unit_text"]
 
@@ -28,12 +29,15 @@ class Needs(Struct, frozen=True):
     """Devices as in DeviceAllow=."""
     can: bool = False
     """Whether they need CAN interfaces of the kernel."""
+    real_time: bool = False
+    """Whether drivers run in real time."""
 
 
 def needs_of(robots: Iterable[Robot]) -> Needs:
     """Returns the needs of robot files. Options of cameras and sensors that begin with ``/dev/`` are devices."""
-    ports, others, can = set[str](), set[str](), False
+    ports, others, can, drives = set[str](), set[str](), False, False
     for robot in robots:
+        drives |= bool(robot.buses)
         for bus in robot.buses:
             match bus:
                 case SerialBus():
@@ -51,7 +55,7 @@ def needs_of(robots: Iterable[Robot]) -> Needs:
     # An adapter may get another number when it is plugged in again, so its whole kind is allowed.
     kinds = ("char-ttyUSB", "char-ttyACM") if ports else ()
     fixed = {port for port in ports if not _COMES_AND_GOES.match(port)}
-    return Needs(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can)
+    return Needs(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can, real_time=drives)
 
 
 def program_folders() -> list[Path]:
@@ -96,6 +100,8 @@ def unit_text(
         "HOME": "\n".join([f"ProtectHome={'tmpfs' if homes else 'yes'}", *homes, *open_]),
         "DEVICES": _devices(needs),
         "FAMILIES": " ".join(families),
+        "REALTIME": _REAL_TIME if needs.real_time else "RestrictRealtime=yes",
+        "CALLS": "\nSystemCallFilter=sched_setscheduler" if needs.real_time else "",
     }
     return re.sub(r"@([A-Z]+)@", lambda found: parts[found.group(1)], _UNIT)
 
@@ -133,6 +139,11 @@ def _quoted(word: str) -> str:
 def _plain(text: str) -> str:
     return text.replace("%", "%%")
 
+
+_REAL_TIME: Final = f"""\
+# Drivers run in real time; other processes do not request it.
+LimitRTPRIO={PRIORITY}
+LimitMEMLOCK=infinity"""
 
 _UNIT: Final = """\
 [Unit]
@@ -182,14 +193,14 @@ ProtectKernelModules=yes
 ProtectKernelTunables=yes
 RestrictAddressFamilies=@FAMILIES@
 RestrictNamespaces=yes
-RestrictRealtime=yes
+@REALTIME@
 RestrictSUIDSGID=yes
 LockPersonality=yes
 MemoryDenyWriteExecute=yes
 RemoveIPC=yes
 SystemCallArchitectures=native
 SystemCallFilter=@system-service
-SystemCallFilter=~@privileged @resources
+SystemCallFilter=~@privileged @resources@CALLS@
 SystemCallErrorNumber=EPERM
 # Not restricted, and why:
 # PrivateNetwork, IPAddressDeny: it forwards calls between networks; its policy restricts them.

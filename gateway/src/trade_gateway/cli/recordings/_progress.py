@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError
 from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli.robots._detached import ready
 from trade_gateway.recording._fault_trigger import SavedAtFault
 from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._recorder import Recorder, Ring, about
@@ -83,7 +84,7 @@ class _Progress:
         """Prints the recorded services and the destination."""
         services = recorder.look()
         if self._out.as_json:
-            self._out.data({"recording": str(where), "services": services})
+            self._out.data({**ready(recorder.container), "recording": str(where), "services": services})
             return
         named = ", ".join(services) or "no service with joints or pictures yet"
         self._out.say(f"[bold]recording[/] to {escape(str(where))}: {escape(named)}; Ctrl-C ends")

@@ -1,5 +1,6 @@
 """``trade record``: records a system to an MCAP file, or keeps the last seconds to save them at a fault."""
 
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -9,7 +10,7 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import TIMING, Groups, Json, Readers
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.process._signals import leaving
+from trade_gateway.process._signals import leaving, refuse_twice
 from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
 
@@ -20,7 +21,10 @@ _RING: Final = "Last seconds before a fault"
 
 def record(
     context: typer.Context,
-    file: Annotated[Path | None, typer.Argument(metavar="OUT.mcap", help="The file to write.")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="OUT.mcap", help="The file to write; in a folder, a file named by the time."),
+    ] = None,
     group: Groups = None,
     services: Readers = None,
     hz: Annotated[
@@ -60,6 +64,7 @@ def record(
         Path | None, typer.Option(rich_help_panel=_RING, metavar="FOLDER", help="Folder for a file at each fault.")
     ] = None,
     most_mb: Annotated[int, typer.Option(rich_help_panel=_RING, min=1, help="Most memory, in MB.")] = 256,
+    name: Annotated[str | None, typer.Option(help="Name of the container. \\[env: TRADE_CONTAINER]")] = None,
     as_json: Json = False,
 ) -> None:
     """Record joints, cameras, calls, locks and faults to an MCAP file.
@@ -78,12 +83,21 @@ def record(
     from trade_gateway.cli.recordings import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
-    with leaving() as ending, visitor(context) as container, room.Recorder(container, wanted, ending) as recorder:
+    with leaving() as ending, visitor(context, name) as container, room.Recorder(container, wanted, ending) as recorder:
+        container.terminating.close = ending.set
+        if name is not None:
+            refuse_twice(container, "trade record")
         if file is not None:
-            room.to_file(file, out, recorder, room.about(container, wanted), attachments, seconds)
+            path = _fresh(file, container.name)
+            room.to_file(path, out, recorder, room.about(container, wanted), attachments, seconds)
         elif at_fault is not None and keep_last is not None:
             ring = room.Ring(keep_last, most_mb * MB)
             room.kept_for_faults(at_fault, ring, out, recorder, room.about(container, wanted), attachments, seconds)
+
+
+def _fresh(file: Path, name: str) -> Path:
+    """Returns the file to write: in a folder, one that no earlier start of the recorder has written."""
+    return file / f"{name}-{datetime.now(timezone.utc):%Y%m%dT%H%M%S.%fZ}.mcap" if file.is_dir() else file
 
 
 def _read(path: Path) -> tuple[str, bytes]:

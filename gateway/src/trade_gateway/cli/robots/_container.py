@@ -25,6 +25,12 @@ def container(
             help="Classes it may create: mypkg.vision:Camera, mypkg.*. Repeatable. \\[env: TRADE_INSTANTIABLE]"
         ),
     ] = None,
+    code: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SHA256", help="Code that it takes, by hash: see trade code. Repeatable. \\[env: TRADE_CODE]"
+        ),
+    ] = None,
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
@@ -38,6 +44,8 @@ def container(
         return
     if allow:
         settings = replace(settings, instantiable=tuple(allow))
+    if code:
+        settings = replace(settings, code=tuple(code))
     with leaving() as asked_to_leave, Container(settings) as running:
         running.terminating.close = asked_to_leave.set
         refuse_twice(running, "trade container")

@@ -16,6 +16,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, Settings
+from trade._remote.error_output import as_text
 from trade.errors import CannotStart
 from trade.starting import Started
 from trade_gateway.cli._output import Output
@@ -66,7 +67,7 @@ def detached(words: Sequence[str], settings: Settings, environment: Mapping[str,
         return msgspec.json.decode(_first_line(reported, process), type=Started)
     except msgspec.DecodeError:
         _end(process)
-        said = log.read_text(errors="replace").strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
+        said = as_text(log.read_text(errors="replace")).strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
         here, why = socket.gethostname(), "it did not come up"
         raise CannotStart(host=here, container=name, reason=why, said=said, remedy=f"its log is {log}") from None
     except BaseException:  # an interrupted start is ended, too

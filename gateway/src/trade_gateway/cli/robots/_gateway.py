@@ -15,8 +15,11 @@ from trade.policies import EVERYTHING
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
+from trade_gateway.cli.robots._child_news import say_news
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._hub import allow_many_links
 from trade_gateway.config._changes import Named, digest, named_by
+from trade_gateway.config._described import described
 from trade_gateway.config._gateway_file import Plan, read_gateway_file
 from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
@@ -57,9 +60,11 @@ def gateway(
     if detach:
         detach_now(out, plan.settings)
         return
+    if plan.file.hub:
+        allow_many_links()
     with leaving() as asked_to_leave, hangups() as hangup, notifier:
         seen = digest(file)
-        running = Gateway(plan, named_by(file, plan), asked_to_leave.set)
+        running = Gateway(file, plan, named_by(file, plan), asked_to_leave.set)
         try:
             settle()
             _say_ready(out, running, plan)
@@ -69,7 +74,7 @@ def gateway(
             while not asked_to_leave.wait(_LOOK_EVERY_S):
                 if running.healthy:
                     notifier.alive()
-                _say_news(out, running.news)
+                say_news(out, running.news)
                 now = digest(file)
                 if now != seen or hangup.is_set():
                     seen, reopen = now, hangup.is_set()
@@ -81,13 +86,14 @@ def gateway(
             notifier.leaving()
             out.say("leaving")
             running.close()
-            _say_news(out, running.news)
+            say_news(out, running.news)
 
 
 class Gateway:
     """The gateway's container, its guests in other systems and its children, as the file says now."""
 
-    def __init__(self, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
+    def __init__(self, file: Path, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
+        self._file = file
         self._plan = plan
         self._leave = leave
         """Ends the gateway when its container is terminated."""
@@ -170,7 +176,8 @@ class Gateway:
 
     def _offer(self) -> None:
         if self._supervisor is not None:
-            self._container.register_functions(ChildServices(self._supervisor), "supervisor")
+            services = ChildServices(self._supervisor, lambda: described(self._file, self._plan))
+            self._container.register_functions(services, "supervisor")
 
     def _leave_networks(self) -> None:
         self._guests.close()
@@ -197,17 +204,6 @@ def _warn_of_forwarding(plan: Plan) -> None:
 def _status(running: Gateway) -> str:
     settings = running.container.settings
     return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
-
-
-def _say_news(out: Output, waiting: "queue.SimpleQueue[News]") -> None:
-    while not waiting.empty():
-        news = waiting.get()
-        if out.as_json:
-            out.data(news)
-        elif news.bad:
-            complain(news.text)
-        else:
-            out.say(escape(news.text))
 
 
 def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:

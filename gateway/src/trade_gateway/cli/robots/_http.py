@@ -1,5 +1,6 @@
 """``trade http``: the HTTP gateway, which serves HTTP and WebSocket clients and the dashboard."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -17,6 +18,7 @@ from trade_gateway.process._signals import leaving, refuse_twice, settle
 _LOOK_EVERY_S: Final = 1.0
 _TOKENS: Final = Path("http-tokens.toml")
 _NAME: Final = "http"
+AGENTS: Final = "Agents"
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -51,6 +53,20 @@ def http(
     host: Annotated[
         list[str] | None, typer.Option(rich_help_panel=CONNECTION, help="Further host name of this server. Repeatable.")
     ] = None,
+    mcp: Annotated[
+        bool, typer.Option("--mcp", rich_help_panel=AGENTS, help="Serve agents at /mcp (Model Context Protocol).")
+    ] = False,
+    ask_first: Annotated[
+        list[str] | None,
+        typer.Option(
+            rich_help_panel=AGENTS,
+            help="Require approval (trade approvals) for agents' calls to this group. Repeatable.",
+        ),
+    ] = None,
+    twin: Annotated[
+        Path | None,
+        typer.Option(rich_help_panel=AGENTS, metavar="ROBOT.toml", help="Robot file to simulate for agents' dry runs."),
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the gateway's container.")] = _NAME,
     as_json: Json = False,
 ) -> None:
@@ -59,6 +75,7 @@ def http(
         return
     out = Output(as_json=as_json)
     opened = room_of_extra("http", "trade http")
+    _check_agents(mcp=mcp, ask_first=ask_first or (), twin=twin)
     choice: SystemChoice = context.obj
     with (
         leaving() as asked_to_leave,
@@ -70,6 +87,9 @@ def http(
             tls=tls,
             origins=origin or (),
             hosts=host or (),
+            mcp=mcp,
+            ask_first=ask_first or (),
+            twin=twin,
         ) as standing,
     ):
         refuse_twice(container, "trade http")
@@ -80,6 +100,16 @@ def http(
             if not standing.serving:
                 raise ConfigurationError(where=standing.url, problem="the HTTP gateway has ended; its log says why")
         out.say("leaving")
+
+
+def _check_agents(*, mcp: bool, ask_first: Sequence[str], twin: Path | None) -> None:
+    """Raises ConfigurationError: options for agents without agents, no extra ``mcp``, or no such robot file."""
+    if mcp:
+        room_of_extra("mcp", "trade http --mcp")
+    elif ask_first or twin is not None:
+        raise ConfigurationError(where="trade http", problem="--ask-first and --twin are for agents. Add --mcp")
+    if twin is not None and not twin.exists():
+        raise ConfigurationError(where=str(twin), problem="there is no such robot file")
 
 
 @app.command()

@@ -6,6 +6,7 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import asked_for
+from trade_gateway.cli._completion import containers, groups
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
@@ -14,10 +15,14 @@ from trade_gateway.cli.services._services import describe
 
 def migrate(
     context: typer.Context,
-    group: Annotated[str, typer.Argument(help="Group of the provider, or a group with only this provider.")],
+    group: Annotated[
+        str, typer.Argument(autocompletion=groups, help="Group of the provider, or a group with only this provider.")
+    ],
     to: Annotated[str, typer.Option(help="Target container; with * or ?, the least busy match.")],
     name: Annotated[str | None, typer.Option(help="Name of a service, if the group has several providers.")] = None,
-    container: Annotated[str | None, typer.Option(help="Current container, if several have the group.")] = None,
+    container: Annotated[
+        str | None, typer.Option(autocompletion=containers, help="Current container, if several have the group.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Move a provider with its state to another container, on any host.

@@ -1,4 +1,4 @@
-"""``trade system``: starts the containers of a system file on their hosts, shows their state, ends them."""
+"""``trade system``: starts, shows and ends the containers of a system file, and compares the file with what runs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +10,9 @@ from rich.markup import escape
 from trade import Container
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import choice_of
+from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli._system_choice import choice_of, visitor_among_others
+from trade_gateway.cli.robots._system_diff import compared, snapshot, write
 from trade_gateway.cli.robots._system_up import Bringing, Report, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
@@ -98,6 +99,57 @@ def down(
     with Container(plan.settings) as member:
         bringing = Bringing(plan, member, ssh_config=None, wait_s=5.0, report=_reporter(out))
         bringing.down(only_at_rest=not force)
+
+
+@app.command("diff")
+def diff(context: typer.Context, file: File, as_json: Json = False) -> None:
+    """Show the differences between a file and what runs.
+
+    The tables of supervised containers are compared key by key. The exit code is 1 if there is a difference.
+
+    For example: trade system diff examples/system.toml
+    """
+    out, plan = Output(as_json=as_json), _plan(context, file)
+    with Container(plan.settings) as member:
+        found = list(compared(plan, member))
+    if as_json:
+        out.data(found)
+    for one in found if not as_json else ():
+        place = f"{one.container}.{one.key}" if one.key else one.container
+        words = f"the file has {one.file}; what runs has {one.runs}" if one.key else f"{one.file}, and {one.runs}"
+        out.say(escape(f"{place}: {words}"))
+    if not found:
+        out.say(f"{escape(str(file))} describes what runs")
+    else:
+        raise typer.Exit(1)
+
+
+@app.command("snapshot")
+def take_snapshot(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="OUT.toml", help="The system file to write.")],
+    supervisor: Annotated[
+        str | None, typer.Option(metavar="CONTAINER", help="Supervisor whose containers to describe.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a system file from what a supervisor of this host keeps up.
+
+    Paths in it are absolute. Containers that no supervisor of this host started are named in a comment.
+    If files that are needed for a start are gone, nothing is written. The file contains the variables of programs.
+
+    For example: trade system snapshot now.toml
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as member:
+        taken = snapshot(member, supervisor)
+    write(file, taken.text, force=force)
+    if as_json:
+        out.data({"file": str(file), "containers": taken.containers, "left_out": taken.left_out})
+    out.say(escape(f"wrote {file}: {', '.join(taken.containers)}"))
+    for one in taken.left_out:
+        complain(f"not in the file, since no supervisor of this host started it: {one}")
 
 
 def _plan(context: typer.Context, file: Path) -> SystemPlan:

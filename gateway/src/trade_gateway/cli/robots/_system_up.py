@@ -16,14 +16,17 @@ from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway.cli.robots._detached import detached
+from trade_gateway.config._entry import LOCAL, ContainerSpec
 from trade_gateway.config._system import SystemPlan
-from trade_gateway.config._tables import ContainerSpec
 from trade_gateway.process._signals import SignalEvent
+from trade_gateway.supervisor import ChildInfo
 from trade_gateway.supervisor._objects import GROUP, lacking, make
 
 _LEFT_S: Final = 20.0
 """How long a container may take to shut down, in seconds: a robot is brought to rest first."""
 _LOOK_EVERY_S: Final = 0.05
+_ASK_EVERY_S: Final = 0.2
+_SHOWS: Final = "`trade call trade.child_tables` shows it"
 
 
 class Report(Struct, frozen=True, kw_only=True):
@@ -79,11 +82,15 @@ class Bringing:
             CannotStart, ConfigurationError: with the reason; before any start if a host is unreachable.
             TradeError: an object could not be created.
         """
-        check_hosts(self._plan, [part for part in self._plan.parts if self._seen(part) is None], self._ssh_config)
+        absent = [part for part in self._plan.parts if not self._is_supervised(part) and self._seen(part) is None]
+        check_hosts(self._plan, absent, self._ssh_config)
         began: list[_Began] = []
         try:
             for part in self._plan.parts:
-                self._bring(part, began)
+                if self._is_supervised(part):
+                    self._await_child(part, began, interrupted)
+                else:
+                    self._bring(part, began)
                 if interrupted.is_set():
                     raise KeyboardInterrupt
         except BaseException:
@@ -101,6 +108,48 @@ class Bringing:
         state = "was up" if was_up and not made else "started"
         took_s = time.monotonic() - at
         self._report(Report(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
+
+    def _is_supervised(self, part: ContainerSpec) -> bool:
+        return part.name in self._plan.supervised
+
+    def _supervisor(self, name: str) -> Handle:
+        plan = self._plan
+        return self._member.find(where(name=name, group=GROUP, container=plan.supervisor), wait_s=self._wait_s)
+
+    def _child(self, part: ContainerSpec) -> ChildInfo | None:
+        found: list[ChildInfo] = self._supervisor("children")()
+        return next((child for child in found if child.name == part.name), None)
+
+    def _await_child(
+        self, part: ContainerSpec, began: Sequence[_Began], interrupted: threading.Event | SignalEvent
+    ) -> None:
+        """Waits until the supervisor has a container up, and reports each change of its state.
+
+        Raises:
+            CannotStart: the supervisor gave it up, or it was not up in time.
+        """
+        at, known, where_, pause = time.monotonic(), "", self._plan.at(part.name), threading.Event()
+        is_new = any(one.part.name == self._plan.supervisor for one in began)
+        was_up = not is_new and (first := self._child(part)) is not None and first.state == "up"
+        while not interrupted.is_set():
+            child = self._child(part)
+            state = "unknown" if child is None else f"{child.state}: {child.why}" if child.why else child.state
+            if child is not None and child.state == "up":
+                state, took_s = "was up" if was_up else "started", time.monotonic() - at
+                self._report(Report(container=part.name, host=LOCAL, state=state, pid=child.pid, took_s=took_s))
+                return
+            late = time.monotonic() - at > self._wait_s
+            if late and child is None:
+                problem = f"{self._plan.supervisor} does not supervise it; which file does it read? {_SHOWS}"
+                raise ConfigurationError(where=where_, problem=problem)
+            if late or (child is not None and child.state == "given up"):
+                why, said = ("it did not come up", child.why if child else "") if not late else ("timeout", state)
+                remedy = f"its log is {part.name}.log in the folder logs of {self._plan.supervisor}"
+                raise CannotStart(host=LOCAL, container=part.name, reason=why, said=said, remedy=remedy)
+            if state not in (known, "stopped"):
+                known = state
+                self._report(Report(container=part.name, host=LOCAL, state=state))
+            pause.wait(_ASK_EVERY_S)
 
     def _start(self, part: ContainerSpec) -> Started:
         entry = part.entry
@@ -132,10 +181,13 @@ class Bringing:
 
     def _seen(self, part: ContainerSpec) -> ContainerInfo | None:
         """Returns the container of that name. Raises ConfigurationError if there are two."""
-        found = [info for info in self._member.containers() if info.name == part.name]
+        return self._seen_name(part.name)
+
+    def _seen_name(self, name: str) -> ContainerInfo | None:
+        found = [info for info in self._member.containers() if info.name == name]
         if len(found) > 1:
             problem = f"there are {len(found)} of that name: {', '.join(f'{one.pid} on {one.host}' for one in found)}"
-            raise ConfigurationError(where=self._plan.at(part.name), problem=problem)
+            raise ConfigurationError(where=self._plan.at(name), problem=problem)
         return found[0] if found else None
 
     def _undo(self, began: Sequence[_Began]) -> None:
@@ -167,10 +219,30 @@ class Bringing:
             TradeError: the call to end it failed.
         """
         for part in reversed(self._plan.parts):
-            if self._seen(part) is None:
+            if self._is_supervised(part):
+                self._end_child(part, only_at_rest=only_at_rest)
+            elif self._seen(part) is None:
                 self._report(Report(container=part.name, host=part.entry.host, state="was down"))
             else:
                 self._end(part, only_at_rest=only_at_rest)
+
+    def _end_child(self, part: ContainerSpec, *, only_at_rest: bool) -> None:
+        """Ends a supervised container, and keeps its supervisor from starting it again."""
+        supervised = self._seen_name(self._plan.supervisor) is not None
+        child = self._child(part) if supervised else None
+        if child is None or not child.pid:
+            self._report(Report(container=part.name, host=LOCAL, state="was down"))
+            return
+        at, pause = time.monotonic(), threading.Event()
+        if part.entry.kind == "robot" and self._seen(part) is not None:
+            self._own(part, "terminate_container").with_(deadline_s=_LEFT_S)("trade system down", only_at_rest)
+        self._supervisor("stop_child")(part.name)
+        while (child := self._child(part)) is not None and child.pid:
+            if time.monotonic() - at > 2 * _LEFT_S:
+                raise ConfigurationError(where=self._plan.at(part.name), problem="did not end; see `trade logs`")
+            pause.wait(_LOOK_EVERY_S)
+        took_s = time.monotonic() - at
+        self._report(Report(container=part.name, host=LOCAL, state="ended", took_s=took_s))
 
     def _end(self, part: ContainerSpec, *, only_at_rest: bool) -> None:
         at, info = time.monotonic(), self._seen(part)
@@ -189,6 +261,9 @@ class Bringing:
     def status(self) -> Iterator[Report]:
         """Returns the state of each container of the file, in order."""
         for part in self._plan.parts:
+            if self._is_supervised(part):
+                yield self._child_status(part)
+                continue
             info, host = self._seen(part), part.entry.host
             if info is None:
                 yield Report(container=part.name, host=host, state="down")
@@ -196,6 +271,15 @@ class Bringing:
             lacks = ", ".join(one.class_ for one in lacking(self._member, part))
             state = f"lacks {lacks}" if lacks else "up"
             yield Report(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
+
+    def _child_status(self, part: ContainerSpec) -> Report:
+        child = self._child(part) if self._seen_name(self._plan.supervisor) is not None else None
+        info = self._seen_name(part.entry.announces or part.name)
+        services = 0 if info is None else info.services
+        if child is None:
+            return Report(container=part.name, host=LOCAL, state="down")
+        state = f"{child.state}: {child.why}" if child.why else child.state
+        return Report(container=part.name, host=LOCAL, state=state, pid=child.pid, services=services)
 
 
 def check_hosts(plan: SystemPlan, parts: Sequence[ContainerSpec], ssh_config: Path | None) -> None:

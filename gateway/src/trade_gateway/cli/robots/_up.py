@@ -1,7 +1,7 @@
 """``trade up ROBOT.toml``: attaches a robot's devices and offers them as services until it is ended."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_drivers import AttachedRobot, FaultInfo, FaultLog, Gripper, Motor, attach, load, without
+from trade_drivers import AttachedRobot, FaultInfo, attach, load, without
 from trade_drivers import check as drivers_check
 from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
@@ -20,25 +20,28 @@ from trade_gateway.cli._options import CONNECTION, SELECT, Json
 from trade_gateway.cli._output import Output, as_commands, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import choice_of
+from trade_gateway.cli.robots._bus_processes import BusProcesses
+from trade_gateway.cli.robots._child_news import say_news
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.process._real_time import RealTime
 from trade_gateway.process._signals import leaving, refuse_twice, settle
 
-_CALLS: Final = ((Motor, "enable"), (Gripper, "activate"))
-"""The service that clears a fault once its cause is gone."""
 _SIMULATION: Final = "Simulation"
 
 
 class FaultWatch:
-    """Reports changes in a robot's fault log.
+    """Reports changes in the faults of a robot.
 
     Args:
-        log: the robot's fault log.
-        providers: the robot's devices by name.
+        robot: the robot.
+        open_faults: returns its open faults.
     """
 
-    def __init__(self, log: FaultLog, providers: Mapping[str, object]) -> None:
-        self._log = log
-        self._providers = providers
+    def __init__(self, robot: Robot, open_faults: Callable[[], Sequence[FaultInfo]]) -> None:
+        self._open_faults = open_faults
+        self._remedies = {f"{robot.name}.{joint.name}": "enable" for joint in robot.joints}
+        self._remedies |= {f"{robot.name}.{gripper.name}": "activate" for gripper in robot.grippers}
+        """By device, the service that clears a fault once its cause is gone."""
         self._known: dict[str, FaultInfo] = {}
         """By device, the fault that was reported."""
 
@@ -49,7 +52,7 @@ class FaultWatch:
 
     def report(self, out: Output) -> bool:
         """Reports what has changed since the last time, the newest fault of each device; returns whether any has."""
-        found = reversed(self._log.faults(open_only=True))
+        found = reversed(self._open_faults())
         now = {info.device: info for info in found}
         before, self._known = self._known, now
         changed = [device for device in {**before, **now} if _kind(before.get(device)) != _kind(now.get(device))]
@@ -67,9 +70,8 @@ class FaultWatch:
             out.say(f"{_now():%H:%M:%S} [bold red]{escape(text)}[/]")
 
     def _sentence(self, info: FaultInfo) -> str:
-        device = self._providers.get(info.device)
-        call = next((name for kind, name in _CALLS if isinstance(device, kind)), "")
-        if not info.remedy or not call:
+        call = self._remedies.get(info.device)
+        if not info.remedy or call is None:
             return f"{info.text}; {as_commands(info.device, info.remedy)}" if info.remedy else info.text
         end = "" if info.text.endswith("?") else "."
         return f"{info.text}{end} When you have looked: trade call {info.device}.{call}"
@@ -111,6 +113,9 @@ def up(
         ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the container. Default: the robot's.")] = None,
+    no_real_time: Annotated[
+        bool, typer.Option("--no-real-time", help="Keep ordinary priority, and do not lock memory.")
+    ] = False,
     check: Annotated[bool, typer.Option("--check", help="Check the file with its drivers, and exit.")] = False,
     detach: Detach = False,
     as_json: Json = False,
@@ -119,6 +124,7 @@ def up(
 
     The robot is left as its file says (hold or relax). Attaching moves nothing and resets nothing.
     A line reports each fault of a joint, and its end.
+    Without --sim, the process runs in real time (SCHED_FIFO) if this user may; `trade doctor` shows whether.
 
     For example: trade up examples/rosie.toml --sim
     """
@@ -127,10 +133,12 @@ def up(
     if sim and port:
         raise UsageError(where="--port", problem="names hardware, which --sim simulates; leave one of them out")
     out = Output(as_json=as_json)
-    robot, left_out = without(load(robot_file), leave_out or [])
+    whole, left_out = without(load(robot_file), leave_out or [])
+    own = whole.own_processes()
+    robot = without(whole, own)[0]
     named_ports = ports_named(port or [])
     if check:
-        drivers_check(robot)
+        drivers_check(whole)
         out.say(f"{robot_file} is right")
         return
     if detach:
@@ -138,21 +146,25 @@ def up(
         return
     with Notifier() as notifier, ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
-        simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
+        simulation = stack.enter_context(_simulation(whole, sim_log)) if sim else None
         ports: dict[str, str] = simulation.ports if simulation else named_ports
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
         if left_out:
             out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")
-        _say_attaching(out, robot, ports)
+        real_time = RealTime()
+        _hurry(out, real_time, wanted=not (sim or no_real_time))
+        options = _options(leave_out, ordinary=sim or no_real_time)
+        processes = stack.enter_context(BusProcesses(container, whole, own, ports, options))
+        _say_attaching(out, whole, robot, ports)
         state_dir = container.settings.state_dir
         attached = attach(
             robot,
             register=container.register,
             deregister=container.deregister,
             set_health=container.set_health,
-            ports=ports,
+            ports={part: port for part, port in ports.items() if part not in own},
             healthy=container.healthy,
             state_dir=state_dir and state_dir / container.settings.system,
         )
@@ -160,19 +172,34 @@ def up(
         stack.callback(_say_left, attached)
         stack.enter_context(attached)
         container.measured_by(attached.measures)
+        processes.wait_until_up(asked_to_leave)
         settle()
         _say_ready(out, robot, container, simulation)
-        faults = FaultWatch(attached.faults, attached.providers)
+        faults = FaultWatch(whole, lambda: attached.faults.faults(open_only=True) + processes.faults())
         faults.begin(out)
         stack.callback(notifier.leaving)
         notifier.ready(f"{robot.name} is up in container {container.name}")
         while not asked_to_leave.wait(_LOOK_EVERY_S):
             faults.report(out)
+            say_news(out, processes.news)
+            real_time.watch()
             if container.healthy():
                 notifier.alive()
             if simulation is not None and not simulation.running:
                 raise ConfigurationError(where="simulation", problem="its process ended; start again")
         out.say("leaving")
+        processes.leave()  # all buses stop at the same time
+
+
+def _options(leave_out: Sequence[str] | None, *, ordinary: bool) -> list[str]:
+    """Returns the options that the processes of single buses have, too."""
+    words = [word for part in leave_out or () for word in ("--without", part)]
+    return [*words, "--no-real-time"] if ordinary else words
+
+
+def _hurry(out: Output, real_time: RealTime, *, wanted: bool) -> None:
+    for problem in real_time.take() if wanted else ():
+        out.say(f"not in real time: {escape(problem)}; `trade doctor` shows the remedy")
 
 
 def ports_named(words: Sequence[str]) -> dict[str, str]:
@@ -210,8 +237,11 @@ def _say_left(attached: AttachedRobot) -> None:
         complain(f"shut down without confirmation that these are at rest: {', '.join(unseen)}")
 
 
-def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
-    for bus in robot.buses:
+def _say_attaching(out: Output, whole: Robot, robot: Robot, ports: dict[str, str]) -> None:
+    for bus in whole.buses:
+        if bus not in robot.buses:
+            out.say(f"[bold]{robot.name}[/]: bus {bus.name} has a process of its own")
+            continue
         devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))
         named = ", ".join(
             [

@@ -1,9 +1,10 @@
 """``trade call GROUP.NAME ARGUMENT...``: calls one service and prints its result."""
 
+import math
 import re
 import shlex
 import signal
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 from typing import Annotated, Any, Final
@@ -12,8 +13,11 @@ import msgspec
 import typer
 
 from trade import Handle
+from trade._protocol.messages import ServiceInfo
+from trade._protocol.schema import read_schema
 from trade.errors import TradeError
 from trade_gateway._usage import UsageError, find
+from trade_gateway.cli._completion import containers, services
 from trade_gateway.cli._options import TIMING, Json, Wait
 from trade_gateway.cli._output import Output, say_error
 from trade_gateway.cli._system_choice import visitor
@@ -22,22 +26,33 @@ _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECAS
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
 COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
 """Lets negative numbers pass as arguments."""
+_BRACKETS: Final = ("[", "{")
+_ANGLE = re.compile(r"_rad(_s2?)?$")
+_DEGREES = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)(?:deg|°)(?:/s2?)?(?![\w.])")
 _NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
 
 
 def call(
     context: typer.Context,
-    service: Annotated[str, typer.Argument(help="Group and name of the service: rosie.head.move_to.")],
+    service: Annotated[
+        str, typer.Argument(autocompletion=services, help="Group and name of the service: rosie.head.move_to.")
+    ],
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="Arguments as JSON, by position ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
+        typer.Argument(help="Arguments as JSON, by position ('[0.3, -0.2]') or by name (speed_rad_s=30deg)."),
     ] = None,
     deadline: Annotated[
         float,
         typer.Option(min=0.001, rich_help_panel=TIMING, metavar="SECONDS", help="Deadline of the call, in seconds."),
     ] = 10.0,
     wait: Wait = 2.0,
-    container: Annotated[str | None, typer.Option(help="Call the service of this container.")] = None,
+    container: Annotated[
+        str | None, typer.Option(autocompletion=containers, help="Call the service of this container.")
+    ] = None,
+    pick: Annotated[
+        str | None,
+        typer.Option(metavar="HOW", help="If several fit, call one: any, local, least_busy or nearest."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Call a service and print its result. Ctrl-C cancels a motion in progress.
@@ -46,9 +61,10 @@ def call(
 
     For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
     """
-    args, kwargs = parse_arguments(arguments or [])
+    check_brackets(arguments or [])
     with visitor(context) as visiting:
-        handle = find(visiting, service, container, wait).with_(deadline_s=deadline)
+        handle = find(visiting, service, container, wait, pick).with_(deadline_s=deadline)
+        args, kwargs = parse_arguments(arguments or [], handle.record.info)
         result = run_to_end(handle, *args, **kwargs)
     Output(as_json=as_json).data(result)
 
@@ -88,25 +104,78 @@ def _cancel(handle: Handle) -> None:
         say_error(error)
 
 
-def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
+def check_brackets(texts: list[str]) -> None:
+    """Refuses lists and objects that are no JSON before a service is looked up. Raises UsageError."""
+    for place, text in enumerate(texts):
+        value = named.group(2) if (named := _NAMED.fullmatch(text)) else text
+        if value[:1] in _BRACKETS:
+            try:
+                msgspec.json.decode(_DEGREES.sub(_radians, value))
+            except msgspec.DecodeError as bad:
+                raise _no_json(text, value, bad, texts[place + 1 :]) from None
+
+
+def _no_json(text: str, value: str, bad: msgspec.DecodeError, rest: list[str]) -> UsageError:
+    return UsageError(where=f"argument {text!r}", problem=f"is not JSON ({bad}); {_remedy(value, rest)}")
+
+
+def parse_arguments(texts: list[str], info: ServiceInfo) -> tuple[list[Any], dict[str, Any]]:
     """Parses the arguments of a call from words of the command line.
 
+    Words are JSON. Where the service takes a text, a word without quotes is that text. For angles, whose names end in
+    ``_rad``, ``_rad_s`` or ``_rad_s2``, ``30deg`` is a number in degrees.
+
     Raises:
-        UsageError: a word is not JSON.
+        UsageError: a word is not JSON, and the service takes no text there.
     """
+    schema = read_schema(info.arguments_schema)
+    places = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
     args: list[Any] = []
     kwargs: dict[str, Any] = {}
     for place, text in enumerate(texts):
         named = _NAMED.fullmatch(text)
+        name = named.group(1) if named else places[len(args)] if len(args) < len(places) else ""
+        word = named.group(2) if named else text
         try:
-            if named is None:
-                args.append(msgspec.json.decode(text))
-            else:
-                kwargs[named.group(1)] = msgspec.json.decode(named.group(2))
+            value = _value(word, name, schema)
         except msgspec.DecodeError as bad:
-            problem = f"is not JSON ({bad}); {_remedy(named.group(2) if named else text, texts[place + 1 :])}"
-            raise UsageError(where=f"argument {text!r}", problem=problem) from None
+            raise _no_json(text, word, bad, texts[place + 1 :]) from None
+        if named:
+            kwargs[name] = value
+        else:
+            args.append(value)
     return args, kwargs
+
+
+def _value(text: str, name: str, schema: Mapping[str, Any]) -> Any:
+    """The value of a word for one parameter. Raises msgspec.DecodeError."""
+    kinds = _kinds(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
+    in_radians = _DEGREES.sub(_radians, text) if _ANGLE.search(name) else text
+    try:
+        value = msgspec.json.decode(in_radians)
+    except msgspec.DecodeError:
+        if "string" in kinds and text[:1] not in (*_BRACKETS, '"'):
+            return text
+        raise
+    if kinds <= {"string", "null"} and "string" in kinds and not isinstance(value, str):
+        return None if value is None and "null" in kinds else text
+    return value
+
+
+def _kinds(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> set[str]:
+    """The JSON types that a schema allows."""
+    if "$ref" in schema:
+        return _kinds(definitions.get(str(schema["$ref"]).rpartition("/")[2], {}), definitions)
+    if "anyOf" in schema:
+        return set[str]().union(*(_kinds(one, definitions) for one in schema["anyOf"]))
+    if "enum" in schema:
+        return {"string" if isinstance(one, str) else "null" if one is None else "number" for one in schema["enum"]}
+    kind = schema.get("type", "any")
+    return set(kind) if isinstance(kind, list) else {str(kind)}  # pyright: ignore[reportUnknownArgumentType]
+
+
+def _radians(found: re.Match[str]) -> str:
+    return repr(math.radians(float(found[1])))
 
 
 def _remedy(value: str, rest: list[str]) -> str:

@@ -8,45 +8,89 @@ import typer
 from rich.markup import escape
 
 from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
+from trade._calls.pddl import domain_of
 from trade._protocol.messages import PROTOCOL
-from trade_gateway._usage import asked_for
+from trade_gateway._usage import UsageError, asked_for
+from trade_gateway.cli import _completion as completion
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.cli._output import NOT_FOUND, Output, complain
 from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.cli.services._states import State, say_state
 from trade_gateway.clients._load_table import loads, loads_table
 
 HEALTHY: Final = "healthy"
+_CONDITIONS: Final = "Conditions"
 _STARTS: Final = "; [bold]trade up examples/rosie.toml --sim[/] starts one"
 
 
 def services(
     context: typer.Context,
-    group: Annotated[str | None, typer.Option(help="List only this group and those beneath it: rosie.head.")] = None,
+    group: Annotated[
+        str | None,
+        typer.Option(autocompletion=completion.groups, help="List only this group and those beneath it: rosie.head."),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="List only this name; * and ? are wildcards.")] = None,
+    needs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PREDICATE", rich_help_panel=_CONDITIONS, help="List only what has this pre-condition: 'see(?x)'."
+        ),
+    ] = None,
+    achieves: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PREDICATE",
+            rich_help_panel=_CONDITIONS,
+            help="List only what has this post-condition: 'holding(?x)'.",
+        ),
+    ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Also list the middleware's own services.")] = False,
     doc: Annotated[bool, typer.Option("--doc", help="Show the documentation of each service.")] = False,
+    pddl: Annotated[
+        bool,
+        typer.Option(
+            "--pddl",
+            rich_help_panel=_CONDITIONS,
+            help="Print the conditions as a planning domain, in PDDL, for planners.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """List services with their arguments, containers and hosts.
 
     For example: trade services --group rosie.head --doc
     """
-    constraint = asked_for(f"--group {group}" if group else "services", group=group, name=name)
+    given = {"--group": group, "--name": name, "--needs": needs, "--achieves": achieves}
+    words = " ".join(f"{option} {text}" for option, text in given.items() if text is not None)
+    constraint = asked_for(words or "services", group=group, name=name, needs=needs, achieves=achieves)
     if not everything and group is None:
         constraint = constraint & ~where(group="trade")
     out = Output(as_json=as_json)
     with visitor_among_others(context) as container:
         found = container.services(constraint)
-        if as_json:
+        if pddl:
+            _say_domain(found, group or "trade")
+        elif as_json:
             out.data([describe(handle) for handle in found])
         elif not found:
             out.say(_nothing(container, constraint))
         elif doc:
             for handle in found:
-                doc_text = indent(handle.doc or "(undocumented)", "  ")
-                out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
+                doc_text = "\n\n".join(filter(None, (handle.doc or "(undocumented)", handle.record.info.conditions)))
+                out.say(
+                    f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(indent(doc_text, '  '))}\n"
+                )
         else:
             out.table(*_table(found))
+    if not found and words:
+        raise typer.Exit(NOT_FOUND)
+
+
+def _say_domain(found: Sequence[Handle], name: str) -> None:
+    domain = domain_of(found, name)
+    for label, reason in domain.left_out.items():
+        complain(f"left out {label}: {reason}")
+    typer.echo(domain.text, nl=False)
 
 
 def _nothing(container: Container, constraint: Constraint) -> str:
@@ -78,6 +122,8 @@ def describe(handle: Handle) -> dict[str, Any]:
         "effect": handle.effect,
         "verb": handle.verb,
         "roles": handle.roles,
+        "needs": handle.needs,
+        "achieves": handle.achieves,
         "resources": handle.resources,
         "doc": handle.doc,
         "container": handle.container,
@@ -102,16 +148,28 @@ def _table(found: Sequence[Handle]) -> tuple[tuple[str, ...], list[tuple[str, ..
 def containers(
     context: typer.Context,
     load: Annotated[bool, typer.Option("--load", help="Show how busy each container is, over 1 s.")] = False,
+    show: Annotated[
+        State | None,
+        typer.Option(
+            help="Show links, or network (endpoints, discovery, broadcast, end of the certificate), listeners (of "
+            "streams) or events (the latest changes of these)."
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """List the containers of the system.
+    """List the containers of the system, or one of their states.
 
-    For example: trade containers --load
+    For example: trade containers --show links
     """
+    if load and show is not None:
+        raise UsageError(where="trade containers", problem="takes only one of --load and --show")
     out = Output(as_json=as_json)
     with visitor_among_others(context) as container:
         if load:
             _say_loads(out, container, loads(container))
+            return
+        if show is not None:
+            say_state(out, container, show)
             return
         found = [info for info in container.containers() if info.epoch != container.address.epoch]
         if as_json:

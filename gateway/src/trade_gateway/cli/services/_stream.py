@@ -9,6 +9,7 @@ import typer
 from trade import Sample
 from trade._timestamps import clock
 from trade_gateway._usage import find
+from trade_gateway.cli._completion import services
 from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json, Wait
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
@@ -16,7 +17,9 @@ from trade_gateway.cli._system_choice import visitor
 
 def stream(
     context: typer.Context,
-    service: Annotated[str, typer.Argument(help="Group and name of a read-only service: rosie.head.state.")],
+    service: Annotated[
+        str, typer.Argument(autocompletion=services, help="Group and name of a read-only service: rosie.head.state.")
+    ],
     hz: Annotated[
         float,
         typer.Option(min=0.001, max=1000.0, rich_help_panel=TIMING, metavar="HZ", help="Highest sample rate, in Hz."),

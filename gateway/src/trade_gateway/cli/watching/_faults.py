@@ -1,14 +1,15 @@
 """``trade faults``: lists and shows the faults of devices with their measurements, and acknowledges them."""
 
+import contextlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Container, where
 from trade._timestamps import day_and_clock
-from trade.errors import TradeError
+from trade.errors import InvalidArgument, TradeError
 from trade_gateway._usage import UsageError, asked_for
 from trade_gateway.cli._options import FirstByDefault, Json
 from trade_gateway.cli._output import Output, as_commands, complain
@@ -75,7 +76,7 @@ def show(
     """
     out = Output(as_json=as_json)
     with visitor_among_others(context) as container:
-        fault: Fault = _service(container, fault_id, "fault")(fault_id)
+        fault: Fault = _asked(container, fault_id, "fault")
     if as_json:
         out.data(fault)
         return
@@ -101,7 +102,7 @@ def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
     """
     out = Output(as_json=as_json)
     with visitor_among_others(context) as container:
-        seen: FaultInfo = _service(container, fault_id, "acknowledge")(fault_id)
+        seen: FaultInfo = _asked(container, fault_id, "acknowledge")
     if as_json:
         out.data(seen)
     else:
@@ -116,11 +117,17 @@ def _logs(container: Container, robot: str | None) -> "Sequence[Handle]":
     return found
 
 
-def _service(container: Container, fault_id: str, name: str) -> "Handle":
+def _asked(container: Container, fault_id: str, name: str) -> Any:
+    """Calls a service of the log that has the fault; each process of a robot has a log."""
     robot = fault_id.rpartition("-")[0]
     if not robot:
         raise UsageError(where=fault_id, problem="is no id of a fault, such as rosie-3f2a; `trade faults` lists them")
-    return container.find(asked_for(f"id {fault_id!r}", name=name, group=f"{robot}.faults"), wait_s=_WAIT_S)
+    wanted = asked_for(f"id {fault_id!r}", name=name, group=f"{robot}.faults")
+    *others, last = container.services(wanted) or [container.find(wanted, wait_s=_WAIT_S)]
+    for log in others:
+        with contextlib.suppress(InvalidArgument):  # another log has it
+            return log(fault_id)
+    return last(fault_id)
 
 
 def _said(info: "FaultInfo") -> str:

@@ -6,6 +6,7 @@ import typer
 from rich.markup import escape
 
 from trade import HookInfo, NotificationInfo
+from trade_gateway.cli import _completion as completion
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
@@ -13,7 +14,10 @@ from trade_gateway.cli._system_choice import visitor_among_others
 
 def notifications(
     context: typer.Context,
-    cancel: Annotated[str | None, typer.Option(metavar="ID", help="Cancel this one, in any container.")] = None,
+    cancel: Annotated[
+        str | None,
+        typer.Option(metavar="ID", autocompletion=completion.notifications, help="Cancel this one, in any container."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """List the notifications of the system: event, call, owner and counts.
@@ -64,7 +68,10 @@ def _notification(info: NotificationInfo) -> tuple[str, ...]:
 
 def hooks(
     context: typer.Context,
-    detach: Annotated[str | None, typer.Option(metavar="ID", help="Detach this one, in any container.")] = None,
+    detach: Annotated[
+        str | None,
+        typer.Option(metavar="ID", autocompletion=completion.hooks, help="Detach this one, in any container."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """List the hooks of the system: target, call, owner, state and counts.

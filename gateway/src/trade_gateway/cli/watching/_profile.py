@@ -2,125 +2,26 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated
 
 import msgspec
 import typer
 from msgspec import Struct
 from rich.markup import escape
 
-from trade import Span
+from trade import CallDeviation, CallModel, Span, where
+from trade._atomic_file import replace
+from trade._telemetry.call_model import deviations, learn
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.cli.watching._trace import Name
-from trade_gateway.process._atomic_file import replace
-
-_ENOUGH: Final = 20
-"""The least count of an event before its rarity means anything."""
-_RARER: Final = 4.0
-"""How many times rarer than usual counts as a deviation."""
-
-Pair = tuple[str, str]
 
 
-class Model(Struct, forbid_unknown_fields=True):
-    """A model of call sequences: how often each service was called after each other one."""
-
-    v: Literal[1]
-    after: dict[str, dict[str, int]]
-
-    def share(self, before: str, after: str) -> float:
-        """Returns the share of one service among all calls after another."""
-        following = self.after.get(before, {})
-        return following.get(after, 0) / (sum(following.values()) or 1)
-
-    def count(self, before: str) -> int:
-        """Returns how often any call came after a service."""
-        return sum(self.after.get(before, {}).values())
-
-
-class Deviation(Struct, frozen=True, kw_only=True):
-    """A sequence of two calls that deviates from the model."""
-
-    kind: Literal["new", "rarer"]
-    before: str
-    after: str
-    usual: float
-    """The learned share of ``after`` among the calls after ``before``, from 0 to 1."""
-    now: float
-    call_id: int
-    """An example: a call of ``after``, or of the service called instead."""
-
-
-def sequences(spans: Iterable[Span]) -> list[list[Span]]:
-    """Returns sequences of calls: the top-level calls of each session, and the calls inside each call."""
-    known: dict[int, Span] = {}
-    for span in spans:
-        if span.call_id not in known or span.side == "served":
-            known[span.call_id] = span
-    found: dict[str | int, list[Span]] = {}
-    for span in sorted(known.values(), key=lambda one: (one.began, one.call_id)):
-        found.setdefault(span.calls[0] if span.calls else span.session, []).append(span)
-    return list(found.values())
-
-
-def _pairs(spans: Iterable[Span]) -> Iterable[tuple[Pair, int]]:
-    for calls in sequences(spans):
-        for before, after in pairwise(calls):
-            yield (before.service, after.service), after.call_id
-
-
-def learn(spans: Iterable[Span]) -> Model:
-    """Learns a model from calls."""
-    return _counted(_pairs(spans))
-
-
-def _counted(pairs: Iterable[tuple[Pair, int]]) -> Model:
-    model = Model(1, {})
-    for (before, after), _ in pairs:
-        following = model.after.setdefault(before, {})
-        following[after] = following.get(after, 0) + 1
-    return model
-
-
-def deviations(spans: Iterable[Span], usual: Model) -> list[Deviation]:
-    """Returns sequences that are new, and frequent ones that are now at most a quarter as frequent as usual."""
-    pairs = list(_pairs(spans))
-    now, example = _counted(pairs), dict(pairs)
-    latest = {before: call_id for (before, _), call_id in pairs}
-
-    def deviation(kind: Literal["new", "rarer"], before: str, after: str) -> Deviation:
-        return Deviation(
-            kind=kind,
-            before=before,
-            after=after,
-            usual=usual.share(before, after),
-            now=now.share(before, after),
-            call_id=example.get((before, after), latest[before]),
-        )
-
-    new = [deviation("new", *pair) for pair in sorted(example) if usual.share(*pair) == 0]
-    known = [
-        (before, after)
-        for before, following in sorted(usual.after.items())
-        if min(usual.count(before), now.count(before)) >= _ENOUGH
-        for after in sorted(following)
-    ]
-    return new + [deviation("rarer", *pair) for pair in known if _much_rarer(usual, now, pair)]
-
-
-def _much_rarer(usual: Model, now: Model, pair: Pair) -> bool:
-    """Whether a sequence is much rarer than usual, with enough calls to tell."""
-    was = usual.share(*pair)
-    return was * now.count(pair[0]) >= _RARER and now.share(*pair) * _RARER <= was
-
-
-def write(path: Path, model: Model) -> None:
+def write(path: Path, model: CallModel) -> None:
     """Writes a model. Raises ConfigurationError."""
     try:
         replace(path.resolve(), msgspec.json.format(msgspec.json.encode(model), indent=2) + b"\n", 0o644)
@@ -128,10 +29,10 @@ def write(path: Path, model: Model) -> None:
         raise ConfigurationError(where=str(path), problem=str(problem)) from None
 
 
-def read(path: Path) -> Model:
+def read(path: Path) -> CallModel:
     """Reads a model. Raises ConfigurationError."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Model)
+        return msgspec.json.decode(path.read_bytes(), type=CallModel)
     except (OSError, msgspec.DecodeError) as problem:
         raise ConfigurationError(where=str(path), problem=str(problem)) from None
 
@@ -152,6 +53,9 @@ def profile(
     context: typer.Context,
     learn_file: Annotated[Path | None, typer.Option("--learn", help="File to write what is usual to.")] = None,
     against: Annotated[Path | None, typer.Option(help="File to compare with; exit code 1 if calls deviate.")] = None,
+    watch_file: Annotated[
+        Path | None, typer.Option("--watch", help="File that containers compare their calls with from now on.")
+    ] = None,
     container: Name = "*",
     as_json: Json = False,
 ) -> None:
@@ -159,13 +63,18 @@ def profile(
 
     Only traced calls count, so run `trade tracing on` first.
     --learn records, for each service, what the same caller called next.
+    --watch gives this to the containers, which compare the calls that they make from then on.
+    trade containers --show events lists what deviates.
 
     For example: trade profile --learn usual.json, and later trade profile --against usual.json
     """
-    if learn_file is not None and against is not None:
-        raise UsageError(where="trade profile", problem="takes only one of --learn and --against")
+    if sum(file is not None for file in (learn_file, against, watch_file)) > 1:
+        raise UsageError(where="trade profile", problem="takes only one of --learn, --against and --watch")
     usual = None if against is None else read(against)
     out = Output(as_json=as_json)
+    if watch_file is not None:
+        _watch(context, out, container, read(watch_file))
+        return
     with visitor_among_others(context) as member:
         spans = member.spans(container=container)
     if usual is not None:
@@ -181,7 +90,23 @@ def profile(
     _show(out, statistics(spans))
 
 
-def _compare(out: Output, found: Sequence[Deviation]) -> None:
+def _watch(context: typer.Context, out: Output, container: str, usual: CallModel) -> None:
+    """Gives containers a model to compare their calls with."""
+    with visitor_among_others(context) as member:
+        asked = member.call_all(where(name="watch_calls", group="trade", container=container) & ~where.local, usual)
+    for outcome in asked:
+        if not outcome.ok:
+            complain(f"{outcome.handle.container} did not answer: {outcome.error}")
+    watched = sorted(outcome.handle.container for outcome in asked if outcome.ok)
+    if out.as_json:
+        out.data({"watched": watched})
+    else:
+        out.say(f"these compare the calls that they make: {escape(', '.join(watched)) or 'none'}")
+    if len(watched) < len(asked):
+        raise typer.Exit(1)
+
+
+def _compare(out: Output, found: Sequence[CallDeviation]) -> None:
     if out.as_json:
         out.data(found)
     elif not found:

@@ -15,6 +15,7 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.watching.rule_file import RuleFile
 from trade_gateway.process._signals import hangups, leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
@@ -58,6 +59,7 @@ def run(
         Rules(container, file, audit=audit, dry_run=dry_run, tell=firings.put) as rules,
     ):
         container.terminating.close = asked_to_leave.set
+        container.register_functions(RuleFile(container, file), "rule_file")
         refuse_twice(container, "trade rules run")
         seen = _contents(file)
         _say_ready(out, container, rules)

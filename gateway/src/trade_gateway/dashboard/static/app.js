@@ -1,6 +1,7 @@
 // The dashboard: a client of the HTTP API like any other. It connects, polls, disconnects and reconnects.
 
 import { readCalls, showCalls } from "./calls.js";
+import { lookAtContainers } from "./containers.js";
 import { STATE_HZ } from "./devices.js";
 import { gateway } from "./gateway.js";
 import { lookForEstops } from "./estop.js";
@@ -9,7 +10,7 @@ import { lookForLocks } from "./locks.js";
 import { readLog } from "./log.js";
 import { $, sleep, tell, write } from "./page.js";
 import { forget, lookAround, paintAll } from "./robots.js";
-import { lookAtAudit, lookAtContainers, lookAtNotifications, lookAtPolicy, lookAtSight } from "./system.js";
+import { lookAtAudit, lookAtNotifications, lookAtPolicy, lookAtSight } from "./system.js";
 
 const ASK_AGAIN_MS = 1000;
 const LONGEST_PAUSE_MS = 4000;

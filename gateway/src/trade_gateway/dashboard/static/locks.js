@@ -7,6 +7,8 @@ let locks = [];
 
 export const lockOn = (resources) => locks.find((one) => one.resources.some((name) => resources.includes(name)));
 
+export const lockedIn = (container) => locks.filter((one) => one.container === container).length;
+
 export async function lookForLocks() {
   locks = await gateway.get("/locks");
   const mine = new Map([...gateway.locks].map(([lock, resources]) => [[...resources].sort().join(), lock]));

@@ -51,7 +51,7 @@ export function tell(text) {
   hiding = setTimeout(() => write($("notice"), ""), SHOWN_FOR_MS);
 }
 
-/** A table; a cell is a text, or what a button says and does: `{ label, act, name }`. Without rows, a sentence. */
+/** A table; a cell is a text, or what a button says and does: `{ label, act, name, why }`; `why`: not now. Without rows, a sentence. */
 export function table(element, caption, columns, rows, none) {
   show(element, JSON.stringify([rows, none]), () => {
     if (!rows.length) return [make("p", { class: "note" }, none)];
@@ -62,6 +62,6 @@ export function table(element, caption, columns, rows, none) {
   });
 }
 
-const cellOf = (cell) => (typeof cell === "string" ? cell : button(cell.label, cell.act, { "aria-label": cell.name }));
+const cellOf = (cell) => (typeof cell === "string" ? cell : button(cell.label, cell.act, { "aria-label": cell.name, disabled: Boolean(cell.why), title: cell.why ?? "" }));
 
 export const measure = (value, digits, unit) => (value === null || value === undefined ? "—" : `${value.toFixed(digits)} ${unit}`.trim());

@@ -8,7 +8,8 @@ const cards = new Map();
 
 export function showServices() {
   const wanted = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
-  const fits = (one) => wanted.every((word) => `${one.group}.${one.name} ${one.doc}`.toLowerCase().includes(word));
+  const textOf = (one) => `${one.group}.${one.name} ${one.doc} ${one.needs.join(" ")} ${one.achieves.join(" ")}`.toLowerCase();
+  const fits = (one) => wanted.every((word) => textOf(one).includes(word));
   const found = services.filter(fits).sort((one, other) => keyOf(one).localeCompare(keyOf(other)));
   const shown = new Map();
   for (const one of found) {
@@ -71,7 +72,14 @@ function formOf(one) {
     [cancel.hidden, run.disabled] = [true, !one.allowed];
   };
   const where_ = make("p", { class: "note" }, `in ${one.container} on ${one.host}`);
-  return [make("p", { class: "doc" }, one.doc), make("p", { class: "note" }, make("code", {}, one.signature)), where_, form];
+  const doc = make("p", { class: "doc" }, one.doc);
+  return [doc, make("p", { class: "note" }, make("code", {}, one.signature)), ...conditionsOf(one), where_, form];
+}
+
+/** Its pre- and post-conditions: a line for each kind that it has. */
+function conditionsOf(one) {
+  const known = Object.entries({ needs: one.needs, achieves: one.achieves }).filter(([, texts]) => texts.length);
+  return known.map(([word, texts]) => make("p", { class: "note" }, `${word} ${texts.join(", ")}`));
 }
 
 /** One argument: a plain input if there is one for its type, JSON otherwise. An empty optional one is omitted. */

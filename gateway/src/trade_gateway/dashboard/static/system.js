@@ -1,9 +1,12 @@
-// The system: containers, notifications and hooks, rules and policy, the audit record.
+// The system: notifications and hooks, rules and policy, the audit record.
 
+import { confirmed } from "./confirm.js";
+import { showEditors } from "./editor.js";
 import { LONG_MS, gateway } from "./gateway.js";
-import { $, make, measure, moment, show, table } from "./page.js";
+import { $, make, moment, show, table, write } from "./page.js";
 import { services } from "./schemas.js";
 
+const ADMINISTERS = "Ending them needs the right to administer the system (group trade).";
 const VERBS = ["call", "read", "register", "lock", "instrument", "administer"];
 
 /** Endpoints that the HTTP gateway does not reach: robots behind them are not on this page, and receive no e-stop. */
@@ -15,31 +18,26 @@ export async function lookAtSight() {
   show($("apart"), JSON.stringify(said), () => said.map((one) => make("p", {}, one)));
 }
 
-export async function lookAtContainers() {
-  const [there, loads] = await Promise.all([gateway.get("/containers"), gateway.get("/loads")]);
-  const busy = new Map(loads.map((one) => [one.container, one]));
-  const rows = there.sort((one, other) => one.name.localeCompare(other.name)).map((one) => {
-    const load = busy.get(one.name);
-    const memory = load?.memory_bytes;
-    return [
-      one.name, one.identity, one.host, measure(load?.cpu_percent, 0, "%"), measure(load?.host_cpu_percent, 0, "%"),
-      memory ? `${(memory / 1e6).toFixed(0)} MB` : "—", measure(load?.calls_per_s, 1, "/s"), measure(load?.in_flight, 0, ""),
-    ];
-  });
-  table($("container-list"), "Containers, over the last second", ["Container", "Identity", "Host", "CPU", "Host’s CPU", "Memory", "Calls", "Running"], rows, "There is no container.");
-}
-
 export async function lookAtNotifications() {
   if (!gateway.me.reads) {
     table($("notification-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
+  write($("notification-rights"), gateway.me.administers ? "" : ADMINISTERS);
   const [standing, hooks] = await Promise.all([gateway.get("/notifications"), gateway.get("/hooks")]);
+  const end = (label, title, text, path) => ({
+    label,
+    name: title,
+    why: gateway.me.administers ? "" : ADMINISTERS,
+    act: () => confirmed($("notification-confirm"), { title, text, act: async () => (await gateway.request("DELETE", path, undefined, LONG_MS)).text }),
+  });
+  const cancel = (one) => end("Cancel …", `Cancel notification ${one.id}`, `Ends the notification “${one.occasion}” of ${one.owner} in ${one.container}: it no longer calls ${one.call}. A call that it has begun continues; nothing else ends and nothing moves.`, `/notifications/${encodeURIComponent(one.id)}`);
+  const detach = (one) => end("Detach …", `Detach hook ${one.id}`, `Ends the hook of ${one.owner} ${one.side} ${one.target}, in all containers: ${one.call} is no longer called. The services stay; nothing moves.`, `/hooks/${encodeURIComponent(one.id)}`);
   const rows = [
-    ...standing.map((one) => [one.occasion, one.call, one.condition || "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || one.state]),
-    ...hooks.map((one) => [`${one.side} ${one.target}`, one.call, "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || (one.suspended ? "suspended" : "attached")]),
+    ...standing.map((one) => [one.occasion, cancel(one), one.call, one.condition || "—", one.owner, one.container, `${one.fired}`, `${one.failures}`, one.last_error || one.state]),
+    ...hooks.map((one) => [`${one.side} ${one.target}`, detach(one), one.call, "—", one.owner, one.container, `${one.fired}`, `${one.failures}`, [one.suspended ? "suspended" : "", one.last_error].filter(Boolean).join(": ") || "attached"]),
   ];
-  table($("notification-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "There are no notifications and no hooks.");
+  table($("notification-list"), "Notifications and hooks", ["Occasion", "End it", "Call", "Condition", "Owner", "Container", "Fired", "Failed", "State"], rows, "There are no notifications and no hooks.");
 }
 
 export async function lookAtPolicy() {
@@ -48,7 +46,8 @@ export async function lookAtPolicy() {
     table($("policy-list"), "", [], [], "This needs the right to read the system (group trade).");
     return;
   }
-  const { governed, identities, revoked } = await gateway.get("/policy");
+  const [{ governed, identities, revoked }, files] = await Promise.all([gateway.get("/policy"), gateway.get("/rules")]);
+  showEditors(governed, files.map((one) => one.container));
   const rows = [
     ...identities.map((one) => [one.name, one.roles.join(", ") || "—", ...VERBS.map((verb) => one.rights[verb].join(", ") || "—")]),
     ...revoked.map((name) => [name, "revoked", ...VERBS.map(() => "—")]),

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Ended, Goal, Outcome
+from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
 from trade_gateway.ros.ros1._wire import action_types
@@ -85,10 +85,13 @@ class _Taken:
 class ActionServer:
     """Receives goals and runs them. See the module."""
 
-    def __init__(self, graph: "Ros1", name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
+    def __init__(
+        self, graph: "Ros1", name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None
+    ) -> None:
         types = action_types(graph.types, type_name)
         self._name = name
         self._do = do
+        self._refuse = refuse
         self._numbers = itertools.count(1)
         self._node = graph.node
         self.lock = threading.RLock()
@@ -137,14 +140,18 @@ class ActionServer:
         sent = _of(message["goal_id"]["stamp"])
         goal_id: Message = {"id": number, "stamp": day(at) if sent == (0, 0) else message["goal_id"]["stamp"]}
         taken = _Taken(self, goal_id, message["goal"], who, at)
+        refused = None if self._refuse is None else self._refuse(taken.message)
         with self.lock:
             if number in self._goals or self._closed.is_set():
                 return  # sent twice
             self._goals[number] = taken
             recalled = self._is_recalled(number, sent)
             replaced, before = None, self._running
-            if not recalled:
+            if not recalled and refused is None:
                 replaced, self._waiting = self._waiting, taken
+        if refused is not None:
+            self._end(taken, Status.REJECTED, refused.result, refused.text)
+            return
         if recalled:
             self._end(taken, Status.RECALLED, {}, "it was canceled before it arrived")
             return

@@ -19,10 +19,11 @@ from trade_gateway.ros._graph import (
     Outcome,
     Publisher,
     Pursuit,
+    Refuse,
     RosRefused,
 )
 from trade_gateway.ros._mailbox import Mailbox
-from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros._types import Message, Types, installed_definitions
 from trade_gateway.ros.ros1._action_client import ActionClient
 from trade_gateway.ros.ros1._action_server import ActionServer
 from trade_gateway.ros.ros1._link import Link, Opened
@@ -130,7 +131,7 @@ class Ros1(Graph):
         Raises:
             ConfigurationError: a name is not a name of ROS, or a definition cannot be read.
         """
-        self._types = Types(1, folders)
+        self._types = Types(1, folders, installed_definitions(1))
         self._nodes = Nodes()
         self._lock = threading.RLock()
         self._clients: dict[str, ActionClient] = {}
@@ -201,8 +202,8 @@ class Ros1(Graph):
 
     # --- actions
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
-        return self._closing((ActionServer(self, _name(name, "action"), type_name, do).close,))
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
+        return self._closing((ActionServer(self, _name(name, "action"), type_name, do, refuse).close,))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None

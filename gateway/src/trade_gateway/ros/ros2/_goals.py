@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from trade_gateway.ros._graph import Ended, Goal, Outcome
+from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._action import ANY, CANCEL, ENDS, STATUS, Refusal, Status, uuid
 from trade_gateway.ros.ros2._node import Node
@@ -90,12 +90,15 @@ class Pursued(Goal):
 class Action:
     """The services and topics of an action, and the goals that it has received."""
 
-    def __init__(self, node: Node, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
+    def __init__(
+        self, node: Node, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None
+    ) -> None:
         node.hashes.learn_action(type_name)
         self._node = node
         self._name = name
         self._type_name = type_name
         self._do = do
+        self._refuse = refuse
         self._lock = threading.Lock()
         self._goals: dict[bytes, Pursued] = {}
         self._closed = False
@@ -129,8 +132,9 @@ class Action:
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
         goal = Pursued(self, goal_id, request["goal"], asked.came_at)
+        refused = None if self._refuse is None else self._refuse(goal.message)
         with self._lock:
-            taken = not self._closed and goal_id not in self._goals
+            taken = refused is None and not self._closed and goal_id not in self._goals
             before = self._going()
             if taken:
                 self._goals[goal_id] = goal

@@ -7,8 +7,19 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Answer, Closes, Goal, Graph, Heard, NodeListener, Outcome, Publisher, Pursuit
-from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros._graph import (
+    Answer,
+    Closes,
+    Goal,
+    Graph,
+    Heard,
+    NodeListener,
+    Outcome,
+    Publisher,
+    Pursuit,
+    Refuse,
+)
+from trade_gateway.ros._types import Message, Types, installed_definitions
 from trade_gateway.ros.ros2 import _parameters
 from trade_gateway.ros.ros2._goals import Action
 from trade_gateway.ros.ros2._link import Link
@@ -49,7 +60,7 @@ class Ros2(Graph):
         """
         if domain_id < 0:
             raise ConfigurationError(where="ROS domain", problem=f"{domain_id} must be 0 or more, as ROS_DOMAIN_ID is")
-        self._types = Types(2, folders)
+        self._types = Types(2, folders, installed_definitions(2))
         self._link = Link(router)
         self._lock = threading.Lock()
         self._opened: weakref.WeakSet[Closes] = weakref.WeakSet()
@@ -99,9 +110,9 @@ class Ros2(Graph):
                 client = self._clients[name, type_name] = Client(self._node, name, type_name)
         return client.call(request, timeout_s)
 
-    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome], refuse: Refuse | None = None) -> Closes:
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
-        return self._keep(Action(self._node, name, type_name, do))
+        return self._keep(Action(self._node, name, type_name, do, refuse))
 
     def pursue(
         self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None

@@ -16,6 +16,7 @@ from trade._transport.memory.links import Delay, Kind, Link, Way
 from trade._transport.memory.node import Node
 from trade._transport.memory.questions import MemoryQuestion
 from trade._transport.memory.traffic import Arrive, Traffic
+from trade._transport.memory.wait_clock import MovedWaitClock
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Network:
     Messages arrive at once, before ``put`` returns, unless their link has a delay or is cut. Nothing else takes time:
     queries (``ask``, ``present``) and replies arrive at once wherever the link has not been given up, and a new node is
     linked with all others. The network has its own time, which stops until it is moved: see ``clock`` and ``traffic``.
-    Containers measure their deadlines with the real clock.
+    ``waits`` is the clock of deadlines, leases and lock waits: it runs, and a test can move it ahead.
 
     A link that is cut (``partition``) keeps what is sent on it, as a TCP connection would. If it heals within the
     lease, it delivers all of that. Otherwise the link is given up: signs of life disappear on both sides and the kept
@@ -59,6 +60,7 @@ class Network:
         self, *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, clock: Clock | None = None
     ) -> None:
         self.clock: Final = clock or Clock()
+        self.waits: Final = MovedWaitClock()
         self.sent: Final[Counter[Kind]] = Counter()
         """How many messages of each kind were sent from one transport to another."""
         self.lock: Final = threading.RLock()

@@ -47,6 +47,7 @@ class MemoryTransport(Transport):
     def __init__(self, network: Network, name: str = "") -> None:
         self.network = network
         self.beat_s = network.beat_s
+        self.clock = network.waits
         self.node = network.join(name)
 
     @property

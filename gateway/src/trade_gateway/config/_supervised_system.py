@@ -1,0 +1,45 @@
+"""A system file as the gateway file of its supervisor: the containers of this host that `trade gateway` keeps up."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from trade.errors import ConfigurationError
+from trade_gateway.config._entry import LOCAL
+from trade_gateway.config._tables import at
+
+__all__ = ["as_gateway", "is_supervised"]
+
+_OF_GATEWAY = ("tls", "policy", "audit", "connect")
+"""Keys of ``[system]`` that its supervisor takes, too."""
+
+
+def as_gateway(path: Path, text: str, raw: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Returns the contents of a file as those of a gateway file; another file than a system file is left as it is.
+
+    Raises:
+        ConfigurationError: it is a system file without a supervisor.
+    """
+    system = raw.get("system")
+    if not isinstance(system, dict):
+        return raw
+    said, tables = cast("dict[str, Any]", system), raw.get("container")
+    if not said.get("supervisor"):
+        problem = 'this is a system file; run `trade system up`, or write supervisor = "keeper" here'
+        raise ConfigurationError(where=at(path, text, ("system",), ""), problem=problem)
+    own = {key: said[key] for key in _OF_GATEWAY if key in said}
+    around = {"connect": said["connect"]} if said.get("connect") else {}
+    containers = {
+        name: {**around, **table}
+        for name, table in (cast("dict[str, Any]", tables) if isinstance(tables, dict) else {}).items()
+        if is_supervised(table)
+    }
+    return {"system": said.get("name"), "name": said.get("supervisor"), **own, "container": containers}
+
+
+def is_supervised(table: object) -> bool:
+    """Whether a table of a system file with a supervisor is one of its containers."""
+    if not isinstance(table, dict):
+        return True  # the reader of tables refuses it
+    said = cast("dict[str, Any]", table)
+    return said.get("host", LOCAL) == LOCAL and not said.get("gateway")

@@ -1,0 +1,160 @@
+"""The orders about motion: locks, stops, and what lets things move again."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
+from typing import Final
+
+from trade import where
+from trade_gateway.language._names import groups_named, one_group, resources, said
+from trade_gateway.language._requests import (
+    PURPOSE,
+    Ambiguous,
+    Answer,
+    Asker,
+    Gaps,
+    Plan,
+    Request,
+    Unknown,
+    done,
+    order,
+)
+
+__all__ = ["MOTION_ORDERS"]
+
+_LOCK_WAIT_S: Final = 5.0
+
+
+# --- locks
+
+
+def _lock(asker: Asker, gaps: Gaps) -> Plan:
+    group = one_group(asker, gaps["group"])
+    if not asker.keeps:
+        problem = f"a lock of {group} would end with this command, so it was not taken. Say it in a dialogue"
+        raise Unknown(f"{problem} (`trade ask` alone), or run a program under it: `trade lock {group} -- COMMAND`")
+
+    held = {name for lock in asker.locks if lock.held for name in lock.resources}
+    moved = [handle for handle in asker.container.services(where(group=group)) if handle.effect == "actuate"]
+    if moved and held >= resources(moved):
+        raise Unknown(f"you have {group} already")
+
+    def do() -> Answer:
+        taken = asker.container.lock(group, purpose=PURPOSE, wait_s=_LOCK_WAIT_S).acquire()
+        asker.locks.append(taken)
+        return Answer(len(taken.resources), {"count": len(taken.resources), "report": said(taken.resources)}, group)
+
+    return Plan(f"lock {group}", do, confirm=False)
+
+
+def _release(asker: Asker, gaps: Gaps) -> Plan:
+    _require_locks(asker)
+    words = gaps.get("group", "")
+    held = [(said(lock.resources), lock) for lock in asker.locks]
+    if words and words not in [name for name, _ in held]:
+        group = one_group(asker, words)
+        used = resources(asker.container.services(where(group=group)))
+        held = [(name, lock) for name, lock in held if not used.isdisjoint(lock.resources)]
+        if not held:
+            mine = "; ".join(said(lock.resources) for lock in asker.locks)
+            raise Unknown(f"I hold no lock of {group}. I hold {mine}")
+    elif words:
+        held = [(name, lock) for name, lock in held if name == words]
+    if len(held) > 1:
+        raise Ambiguous("group", [name for name, _ in held])
+    [(name, lock)] = held
+
+    def do() -> Answer:
+        asker.locks.remove(lock)
+        lock.release()
+        return done(name)
+
+    return Plan(f"release {name}", do, confirm=False)
+
+
+def _release_all(asker: Asker, _gaps: Gaps) -> Plan:
+    _require_locks(asker)
+    names = said([said(lock.resources) for lock in asker.locks])
+
+    def do() -> Answer:
+        while asker.locks:
+            asker.locks.pop().release()
+        return done(names)
+
+    return Plan(f"release {names}", do, confirm=False)
+
+
+def _require_locks(asker: Asker) -> None:
+    if not asker.locks:
+        raise Unknown("I hold no lock. `trade locks` lists the locks of others, and `trade unlock` breaks one")
+
+
+# --- stops
+
+
+def _stop(asker: Asker, gaps: Gaps) -> Plan:
+    try:
+        groups = groups_named(asker, gaps["group"])
+    except Unknown as unknown:
+        raise Unknown(f"{unknown}. Nothing was stopped; `stop` alone stops everything") from None
+
+    def do() -> Answer:
+        with ThreadPoolExecutor(len(groups), "trade-ask-stop") as at_once:
+            reports = list(at_once.map(asker.container.stop, groups, repeat(gaps.get("reason", PURPOSE))))
+        stopped = sorted({name for report in reports for name in report.stopped})
+        failed = {name: why for report in reports for name, why in report.failed.items()}
+        shown = [f"stopped: {said(stopped)}"] if stopped else []
+        shown += [f"FAILED: {name}: {why}" for name, why in sorted(failed.items())]
+        empty = [report.group for report in reports if not (report.stopped or report.failed)]
+        shown += [f"FAILED: {group} has nothing that can be stopped" for group in empty]
+        return Answer(len(stopped), {"count": len(stopped), "report": "; ".join(shown)}, reports)
+
+    return Plan(f"stop {said(groups)}", do, confirm=False, stops=True)
+
+
+def _estop(asker: Asker, gaps: Gaps) -> Plan:
+    def do() -> Answer:
+        report = asker.container.estop(gaps.get("reason", "requested in a sentence"))
+        troubles = [f"{name} did not answer" for name in report.missing]
+        troubles += [f"{name} failed: {why}" for name, why in report.failed.items()]
+        shown = f"confirmed by {said(report.confirmed) or 'none'}{'; ' if troubles else ''}{'; '.join(troubles)}"
+        count = len(report.confirmed)
+        return Answer(count, {"count": count, "report": shown, "id": report.id}, report)
+
+    return Plan("stop the whole system", do, confirm=False, stops=True)
+
+
+def _resume(asker: Asker, gaps: Gaps) -> Plan:
+    group = one_group(asker, gaps["group"])
+
+    def do() -> Answer:
+        resumed = sorted(asker.container.resume(group))
+        return Answer(len(resumed), {"count": len(resumed), "report": said(resumed)}, resumed)
+
+    return Plan(f"let {group} move again", do)
+
+
+def _clear(asker: Asker, _gaps: Gaps) -> Plan:
+    ids = [one.id for one in asker.container.estops()]
+    if not ids:
+        raise Unknown("no e-stop is open")
+
+    def do() -> Answer:
+        report = asker.container.estop_clear(ids)
+        troubles = [*report.missing, *report.failed]
+        shown = f"{said(ids)}{f'; not in {said(troubles)}' if troubles else ''}"
+        return Answer(len(ids), {"count": len(ids), "report": shown}, report)
+
+    return Plan(f"clear e-stop {said(ids)}", do)
+
+
+MOTION_ORDERS: Final[Mapping[str, Request]] = {
+    "lock": order(("group",), _lock),
+    "release": order(("group",), _release),
+    "release_all": order((), _release_all),
+    "stop": order(("group", "reason"), _stop),
+    "estop": Request(("reason",), ("count", "report", "id"), _estop, is_order=True),
+    "resume": order(("group",), _resume),
+    "clear": order((), _clear),
+}
+"""By their names in the lexicon."""

@@ -1,0 +1,1 @@
+"""What TRADE has of ROS: services, topics, actions and joints of ROS as providers."""

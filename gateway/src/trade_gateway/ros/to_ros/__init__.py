@@ -1,0 +1,1 @@
+"""What ROS has of TRADE: services, streams, joints, grippers and robots of TRADE in ROS."""

@@ -1,0 +1,70 @@
+"""The description of a robot in ROS, and the transforms of its links, as RViz and MoveIt need them."""
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from trade import Container
+from trade_gateway.ros._conversion import ros_stamp
+from trade_gateway.ros._file import RobotEntry
+from trade_gateway.ros._graph import Graph
+from trade_gateway.ros._joints import Measured
+from trade_gateway.ros._types import Message
+from trade_gateway.ros._urdf import Transform, UrdfJoint, read_urdf
+from trade_gateway.ros.to_ros._streams import LimbTopic, Topics
+
+__all__ = ["Description", "TransformsToRos"]
+
+_TF: Final = "tf2_msgs/msg/TFMessage"
+
+
+class Description:
+    """The description and the transforms of fixed joints, published once for all, also for later subscribers."""
+
+    def __init__(self, entry: RobotEntry, graph: Graph) -> None:
+        """Raises ConfigurationError: the file cannot be read any more."""
+        text = Path(entry.urdf).read_text(encoding="utf-8")
+        self._publishers = [
+            graph.advertise(entry.topic, "std_msgs/msg/String", latched=True),
+            graph.advertise("/tf_static", _TF, latched=True),
+        ]
+        joints = read_urdf(text, entry.urdf)
+        fixed = [_stamped(joint, joint.origin, time.time()) for joint in joints if joint.fixed]
+        self._publishers[0].send({"data": text})
+        self._publishers[1].send({"transforms": fixed})
+
+    def close(self) -> None:
+        """Withdraws them."""
+        for publisher in self._publishers:
+            publisher.close()
+
+
+class TransformsToRos(LimbTopic):
+    """``[[to_ros.robot]]``: the transforms of the joints that are measured."""
+
+    def __init__(self, entry: RobotEntry, topics: Topics, container: Container) -> None:
+        """Raises ConfigurationError: the description is invalid."""
+        super().__init__(entry, "/tf", _TF, topics, container)
+        self._moving = [one for one in read_urdf(Path(entry.urdf).read_text("utf-8"), entry.urdf) if not one.fixed]
+
+    def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:
+        positions = dict(zip(names, now.positions_rad, strict=True))
+        return {"transforms": list(self._transforms(positions, at_s))}
+
+    def _transforms(self, positions: Mapping[str, float], at_s: float) -> Iterable[Message]:
+        for joint in self._moving:
+            name, multiplier, offset = joint.mimic or (joint.name, 1.0, 0.0)
+            if name in positions:
+                yield _stamped(joint, joint.at(multiplier * positions[name] + offset), at_s)
+
+
+def _stamped(joint: UrdfJoint, transform: Transform, at_s: float) -> Message:
+    return {
+        "header": {"stamp": ros_stamp(at_s), "frame_id": joint.parent},
+        "child_frame_id": joint.child,
+        "transform": {
+            "translation": dict(zip("xyz", transform.xyz_m, strict=True)),
+            "rotation": dict(zip("xyzw", transform.rotation, strict=True)),
+        },
+    }
