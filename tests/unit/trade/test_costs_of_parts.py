@@ -66,6 +66,7 @@ class Heard:
     """What goes from one container to another."""
 
     def __init__(self, system: MemorySystem) -> None:
+        self._system = system
         self.kinds: Counter[Kind] = Counter()
         self.streamed: Counter[str] = Counter()
         self.bytes = 0
@@ -82,7 +83,8 @@ class Heard:
 
     @contextmanager
     def exactly(self, **kinds: int) -> Iterator[None]:
-        """Of these kinds so many messages pass meanwhile, and no others."""
+        """Of these kinds so many messages pass meanwhile, and no others; before, containers get to know each other."""
+        self._system.settle()
         self.kinds.clear()
         yield
         assert {kind.name.lower(): count for kind, count in self.kinds.items() if count} == kinds
