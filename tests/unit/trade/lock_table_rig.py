@@ -35,6 +35,7 @@ class Table:
     def __init__(self) -> None:
         self.now = 0.0
         self.table = LockTable(EPOCH, "home", Now(lambda: self.now))
+        self.table._leases.by = lambda _: None  # type: ignore[method-assign]  # leases end by `advance`, on no other thread
         self.resources = {name: self.table.adopt(Resource(name, coupled=COUPLED.get(name, ()))) for name in NAMES}
         self.stopping: list[tuple[Resource, Callable[[Resource, str], None]]] = []
         self.table.stop_with(self._stop)
