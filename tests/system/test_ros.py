@@ -245,8 +245,8 @@ def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_wi
     killed_at = time.monotonic()
     bridged.program.process.kill()
     bridged.stopped(killed_at)
-    bridged.restart()
     again_at = time.monotonic()
+    bridged.restart()
     bridged.begun(again_at)  # it still says so
 
 

@@ -17,7 +17,7 @@ from msgspec import Struct
 from typer.testing import CliRunner
 
 from tests.support.full_disks import FullDisk
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Container, Resource, Secret, service, where
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
@@ -220,7 +220,8 @@ def test_a_client_that_traced_calls_before_continues(
     sink.enough = lambda sink: bool(sink.by_topic["/calls"])
     with Recorder(container, Wanted(), threading.Event()) as recorder:
         began = threading.Thread(target=lambda: [_move(robot, 0.2) for _ in range(3)])
-        recorder._watch._calls.read()  # what was noted before is not of this recording
+        # What was noted before is not of this recording: its own thread has to have read that.
+        wait_until(lambda: recorder._watch._calls._read)
         began.start()
         with pytest.raises(Seen):
             recorder.run(sink, PATIENCE_S, lambda: None)
