@@ -10,6 +10,10 @@ from typing import Final, NamedTuple
 
 import pytest
 
+from tests.contract.complaints.test_page import PROVEN, names
+from tests.docs.test_paper import SHOWN
+from tests.docs.test_safety_page import RULES
+from tests.docs.test_safety_page import TESTS as OF_RULES
 from tests.support.tiers import in_system_folder
 
 ROOT: Final = Path(__file__).parents[2]
@@ -57,21 +61,11 @@ def _says_below(mark: ast.expr) -> bool:
 
 def shown() -> dict[str, dict[str, set[str]]]:
     """For each kind of row, the rows and the tests that they name."""
-    every = {test.name for test in all_tests()}
-    rules = re.findall(r"^### (S\d\d) ", (DOCS / "safety.md").read_text(encoding="utf-8"), re.MULTILINE)
-    promises = (DOCS / "paper.md").read_text(encoding="utf-8").partition("## Shown by")[2]
-    complaints = (DOCS / "complaints.md").read_text(encoding="utf-8").partition("## Tests and mutants")[2]
     faults = re.findall(r"^\| ([^|]+) \| `", (DOCS / "faults.md").read_text(encoding="utf-8"), re.MULTILINE)
     return {
-        "safety rules": {rule: {name for name in every if re.search(rf"_{rule}_", name)} for rule in rules},
-        "promises of the paper": {
-            row: set(re.findall(r"`(test_\w+)", names))
-            for row, names in re.findall(r"^- (P\d\d):\n((?:  .+\n)+)", promises, re.MULTILINE)
-        },
-        "complaints": {
-            row: set(re.findall(r"`(test_\w+)`", names))
-            for row, names in re.findall(r"^\| ([^|]+) \| (`test[^|]+)", complaints, re.MULTILINE)
-        },
+        "safety rules": {rule: {shown.name for shown in OF_RULES if shown.rule == rule} for rule, _ in RULES},
+        "promises of the paper": {row: set(re.findall(r"`(test_\w+)", named)) for row, named in SHOWN.items()},
+        "complaints": {row[0]: set(names(row[1])) for row in PROVEN},
         "faults of devices": {f"{number} {row}": FAULT_TESTS for number, row in enumerate(faults)},
     }
 
