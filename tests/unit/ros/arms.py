@@ -77,7 +77,8 @@ class FakeJoints(JointGroup):
             wait_until(lambda: self.stopped.is_set() or (call is not None and call.cancelled))
         for resource in self._resources:
             resource.moving = False
-        if call is not None:
+        if call is not None and call.cancelled:
+            self.stop()  # as a driver does: who cancels first leaves nothing to stop for who comes second
             call.raise_if_cancelled()
         if self.error is not None:
             raise self.error
