@@ -44,7 +44,7 @@ test: $(UV) ## what decides whether a change lands: code, containers and zenoh w
 	@$(RUN) pytest --durations=10 -n 4 --dist worksteal --hypothesis-profile ci -m "not realtime and not system" $(ARGS)
 
 test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 13 minutes
-	@$(RUN) pytest --rerun --durations=10 -n 4 --dist worksteal -m "realtime and not system" $(ARGS)
+	@$(RUN) pytest --rerun --real-time --durations=10 -n 4 --dist worksteal -m "realtime and not system" $(ARGS)
 
 test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 16 minutes (root)
 	@failed=; part() { code=0; "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; *) failed=1 ;; esac; }; \

@@ -19,12 +19,18 @@ def gate() -> Iterator[Gate]:
     made.release()
 
 
+_OWN_TIME = {"ur"}
+"""Vendors whose library is in C, and keeps its own time."""
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Runs a rule on the rigs of all vendors that it applies to."""
+    """Runs a rule on the rigs of all vendors that it applies to, on virtual time where that is possible."""
     if "rig" in metafunc.fixturenames:
         rule = metafunc.definition.originalname
         vendors = [vendor for vendor, made in RIGS.items() if rule not in made.lacks]
-        metafunc.parametrize("rig", vendors, indirect=True)
+        marks = [pytest.mark.realtime if vendor in _OWN_TIME else pytest.mark.virtual_time for vendor in vendors]
+        rigs = [pytest.param(vendor, marks=mark) for vendor, mark in zip(vendors, marks, strict=True)]
+        metafunc.parametrize("rig", rigs, indirect=True)
 
 
 @pytest.fixture

@@ -10,8 +10,6 @@ import pytest
 from tests.contract.rigs.base import SafetyRig
 from trade.errors import ConfigurationError
 
-pytestmark = pytest.mark.realtime
-
 
 def refused(rig: SafetyRig) -> str:
     announced: list[object] = []

@@ -22,8 +22,6 @@ from trade.errors import (
     TradeError,
 )
 
-pytestmark = pytest.mark.realtime
-
 # --- S11
 
 

@@ -27,8 +27,6 @@ from trade.errors import (
 )
 from trade_hil_sim import Mute, Replug, Unplug
 
-pytestmark = pytest.mark.realtime
-
 
 def pass_s(seconds: float) -> None:
     sleep_past(time.monotonic_ns() + round(seconds * 1e9))

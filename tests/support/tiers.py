@@ -4,6 +4,7 @@
 more says so with a marker, or is in a folder that says so for it:
 
 - no marker: code, containers and zenoh within the process. Waits end by a condition.
+- `virtual_time`: also simulated devices, as their time is virtual. With `--real-time`, these tests are `realtime`.
 - `realtime`: simulators on real clocks, child processes, programs of other people.
 - `system`: also network namespaces, browsers and other toolchains.
 
@@ -119,9 +120,11 @@ def pytest_configure() -> None:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what whole folders are, before `-m` selects."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what whole folders are, and what is on the real clock, before `-m` selects."""
     for item in items:
+        if config.getoption("--real-time", default=False) and item.get_closest_marker("virtual_time"):
+            item.add_marker(pytest.mark.realtime)
         if in_system_folder(item.path):
             item.add_marker(pytest.mark.system)
 

@@ -30,11 +30,15 @@ class Now(WaitClock):
 
 
 class Table:
-    """A lock table whose clock and whose stops are the test's."""
+    """A lock table whose clock and whose stops are the test's.
 
-    def __init__(self) -> None:
+    Args:
+        clock: gives the seconds; default: `now`, which a test sets.
+    """
+
+    def __init__(self, clock: Callable[[], float] | None = None) -> None:
         self.now = 0.0
-        self.table = LockTable(EPOCH, "home", Now(lambda: self.now))
+        self.table = LockTable(EPOCH, "home", Now(clock or (lambda: self.now)))
         self.table._leases.by = lambda _: None  # type: ignore[method-assign]  # leases end by `advance`, on no other thread
         self.resources = {name: self.table.adopt(Resource(name, coupled=COUPLED.get(name, ()))) for name in NAMES}
         self.stopping: list[tuple[Resource, Callable[[Resource, str], None]]] = []

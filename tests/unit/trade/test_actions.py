@@ -237,3 +237,33 @@ def test_a_malformed_cancellation_is_an_error(here: Container, open_raw: Any, ca
     stop = Call(PROTOCOL, 1, "cancel", "raw/0", "tester/raw/0", None, (), Raw(cancel))
     raw.publish(call_key("tester", here.address, "trade", "system", stop=True)).put(encode_message(stop))
     assert decode_reply(replies.receive().payload or b"").status == Status.ERROR
+
+
+class Heeding:
+    """Waits for its cancellation once it is cancelled already."""
+
+    def __init__(self) -> None:
+        self.entered, self.waited = threading.Event(), threading.Event()
+        self.cancelled = False
+
+    @service
+    def heed_late(self) -> None:
+        call = current_call()
+        assert call is not None
+        self.entered.set()
+        while not call.cancelled:
+            time.sleep(0.01)
+        self.cancelled = call.wait_cancelled(20)
+        self.waited.set()
+
+
+@pytest.mark.virtual_time
+def test_waiting_for_a_cancellation_that_was_before_ends_at_once(offer: Any) -> None:
+    heeding = Heeding()
+    run = offer(heeding)("heed_late").start()
+    assert heeding.entered.wait(20)
+    run.cancel()
+    cancelled_at = time.monotonic()
+    assert heeding.waited.wait(30)
+    assert heeding.cancelled
+    assert time.monotonic() - cancelled_at < 1

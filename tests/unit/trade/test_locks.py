@@ -3,6 +3,7 @@
 import concurrent.futures
 import math
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -380,3 +381,19 @@ def test_admitting_and_emptying_at_the_same_moment_never_both_succeed(table: Tab
         if granted is not None and granted.token is not None:
             table.table.release(granted.token.number, "tester")
     assert both == 0
+
+
+@pytest.mark.virtual_time
+def test_a_client_behind_one_that_gives_up_is_woken() -> None:
+    began = time.monotonic()
+    table = Table(lambda: time.monotonic() - began)
+    try:
+        table.take("a", lease_s=60)
+        first = table.ask("ab", "one", wait_s=0.5)
+        second = table.ask("b", "two", wait_s=30.0)
+        with pytest.raises(LockedByOther):
+            first.result(20)
+        assert second.result(20).token is not None
+        assert time.monotonic() - began < 1
+    finally:
+        table.close()

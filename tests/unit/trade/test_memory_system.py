@@ -85,7 +85,7 @@ def test_the_page_on_testing_does_what_it_says() -> None:
     for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         exec(program, known)
     tests = [value for name, value in known.items() if name.startswith("test_")]
-    assert len(tests) == 9
+    assert len(tests) == 10
     for test in tests:
         test()
 

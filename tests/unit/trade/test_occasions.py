@@ -3,6 +3,7 @@
 import itertools
 import logging
 import queue
+import threading
 import time
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
@@ -425,3 +426,34 @@ def test_the_owner_of_a_notification_gets_its_failures_elsewhere(
     with caplog.at_level(logging.WARNING, "trade"):
         here.once(handle("go").bind("fast"), host=there.name)
         wait_until(lambda: "requested here, failed at" in caplog.text)
+
+
+class Asked:
+    """A condition that a test holds up."""
+
+    def __init__(self) -> None:
+        self.entered, self.open = threading.Event(), threading.Event()
+        self.fired = 0
+
+    @service(effect="read")
+    def holds(self) -> bool:
+        self.entered.set()
+        return self.open.wait(20)
+
+    @service
+    def fire(self) -> None:
+        self.fired += 1
+
+
+@pytest.mark.virtual_time
+def test_what_is_cancelled_while_its_condition_is_asked_does_not_fire(here: Container, there: Container) -> None:
+    asked = Asked()
+    there.register(asked, "base")
+    fire, holds = (here.find(where(name=name, group="base"), wait_s=20) for name in ("fire", "holds"))
+    noted = here.once(fire, when=holds, poll_s=0.02)
+    assert asked.entered.wait(20)
+    noted.cancel()
+    asked.open.set()
+    time.sleep(5)
+    assert asked.fired == 0
+    assert not noted.active

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.waiting import wait_until
 from tests.unit.trade.stream_listeners import FAST_HZ, PATIENCE_S, Battery, Display, Two
 from trade import Container, where
 from trade._protocol.samples import stream_key
@@ -330,3 +331,20 @@ def test_a_listener_that_does_not_renew_is_dropped(here: Container) -> None:
     source.wish(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now))
     assert source.tick() is None
     assert battery.asked == 1
+
+
+@pytest.mark.virtual_time
+def test_the_end_of_a_session_ends_its_streams_and_no_others(two: Two) -> None:
+    one, other = two.here.open_session("page"), two.here.open_session("page")
+    with one.use():
+        mine = two.here.stream(two.service("count"), hz=20)
+    with other.use():
+        others = two.here.stream(two.service("count"), hz=20)
+    mine.next(PATIENCE_S)
+    others.next(PATIENCE_S)
+    one.close()
+    wait_until(lambda: mine.ended)
+    assert isinstance(mine.why_ended, SessionEnded)
+    assert not others.ended
+    others.close()
+    other.close()

@@ -284,3 +284,13 @@ def test_the_latest_sample_can_be_read_without_taking_it(two: Two, eventually: A
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as stream:
         assert eventually(lambda: (latest := stream.latest()) is not None and latest.value >= 3)
         assert stream.next(PATIENCE_S).value == 1
+
+
+@pytest.mark.virtual_time
+def test_a_fast_listener_does_not_wait_for_a_slow_one(two: Two) -> None:
+    with two.here.stream(two.service("count"), hz=0.1, keep=10) as slow:
+        slow.next(PATIENCE_S)
+        began = time.monotonic()
+        with two.here.stream(two.service("count"), hz=50, keep=100) as fast:
+            some(fast, 5)
+        assert time.monotonic() - began < 2

@@ -1,4 +1,4 @@
-"""A pytest plug-in with the fixture `trade_system`. It imports trade only for tests that use the fixture.
+"""A pytest plug-in with the fixture `trade_system` and the marker `virtual_time`. It imports trade only for tests that use them.
 
 It is a package beside ``trade``, as a module inside of it would import trade in every pytest run.
 """
@@ -12,6 +12,39 @@ if TYPE_CHECKING:
     from trade.testing import MemorySystem
 
 __all__ = ["trade_system"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of virtual time."""
+    group = parser.getgroup("trade")
+    group.addoption("--seed", type=int, help="the seed of all tests on virtual time, instead of their own")
+    group.addoption("--real-time", action="store_true", help="run tests that are marked virtual_time on the real clock")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the markers."""
+    for line in (
+        "virtual_time(seed=0, switch=0.02): run the test and its fixtures of function scope on virtual time",
+        "realtime: keep the test on the real clock, whatever its module says",
+    ):
+        config.addinivalue_line("markers", line)
+
+
+@pytest.fixture(autouse=True)
+def _virtual_time(request: pytest.FixtureRequest) -> Generator[None, None, None]:
+    marker = request.node.get_closest_marker("virtual_time")
+    real = request.config.getoption("--real-time") or request.node.get_closest_marker("realtime")
+    if marker is None or real:
+        yield
+        return
+    from trade.testing import virtual_time  # noqa: PLC0415 - see above
+
+    wanted = {"seed": 0, **marker.kwargs}
+    if (seed := request.config.getoption("--seed")) is not None:
+        wanted["seed"] = seed
+    own = request.module.__name__.partition(".")[0]
+    with virtual_time(**wanted, packages=[own]):
+        yield
 
 
 @pytest.fixture

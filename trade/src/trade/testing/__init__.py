@@ -7,9 +7,11 @@ from trade._transport.memory import Clock, InFlightMessage, Kind, Network
 from trade.testing._losses import LossConformance, Severable
 from trade.testing._system import MemorySystem, memory_system
 from trade.testing._transports import TransportConformance
+from trade.testing.virtual import Deadlock, VirtualTime, VirtualTimeError, virtual_time
 
 __all__ = [
     "Clock",
+    "Deadlock",
     "InFlightMessage",
     "Kind",
     "LossConformance",
@@ -17,5 +19,8 @@ __all__ = [
     "Network",
     "Severable",
     "TransportConformance",
+    "VirtualTime",
+    "VirtualTimeError",
     "memory_system",
+    "virtual_time",
 ]

@@ -1,0 +1,197 @@
+"""Virtual time: waits cost nothing, the same seed gives the same run, and what it cannot do is refused by name."""
+
+import asyncio
+import queue
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from trade import Container, Settings, service, where
+from trade.testing import Deadlock, VirtualTime, VirtualTimeError, memory_system, virtual_time
+
+HERE = [__name__.partition(".")[0]]
+
+
+@pytest.fixture
+def clock() -> Iterator[VirtualTime]:
+    with virtual_time(seed=1, packages=HERE) as clock:
+        yield clock
+
+
+class Arm:
+    @service
+    def move(self, to_rad: float) -> float:
+        time.sleep(3.0)
+        return to_rad
+
+
+def test_a_sleep_takes_its_time_on_the_clock_and_none_of_the_computers(clock: VirtualTime) -> None:
+    began, wall = time.monotonic(), time.time()
+    time.sleep(86_400 / 25)
+    assert time.monotonic() - began == pytest.approx(3456, abs=0.01)
+    assert time.time() - wall == pytest.approx(3456, abs=0.01)
+    assert clock.elapsed_s == pytest.approx(3456, abs=0.01)
+
+
+def test_threads_wait_for_each_other_by_every_primitive(clock: VirtualTime) -> None:
+    heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+    go, ready = threading.Event(), threading.Condition()
+    seen: list[str] = []
+
+    def work() -> None:
+        assert go.wait(10)
+        time.sleep(1)
+        heard.put("one")
+        with ready:
+            seen.append("two")
+            ready.notify_all()
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    go.set()
+    assert heard.get(timeout=5) == "one"
+    with ready:
+        assert ready.wait_for(lambda: seen, 5)
+    worker.join(1)
+    assert not worker.is_alive()
+    assert 1 <= clock.elapsed_s < 1.01
+
+
+def test_a_wait_ends_at_its_deadline(clock: VirtualTime) -> None:
+    with pytest.raises(queue.Empty):
+        queue.SimpleQueue().get(timeout=7)
+    assert not threading.Event().wait(3)
+    lock = threading.Lock()
+    assert lock.acquire()
+    assert not lock.acquire(timeout=2)
+    assert clock.elapsed_s == pytest.approx(12, abs=0.01)
+
+
+def test_a_timer_calls_at_its_time_and_not_after_it_was_cancelled(clock: VirtualTime) -> None:
+    called: list[float] = []
+    threading.Timer(5, lambda: called.append(time.monotonic())).start()
+    cancelled = threading.Timer(6, lambda: called.append(0.0))
+    cancelled.start()
+    time.sleep(5.5)
+    cancelled.cancel()
+    time.sleep(5)
+    assert len(called) == 1
+
+
+def test_executors_and_asyncio_are_on_the_same_clock(clock: VirtualTime) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        assert [run.result(5) for run in [pool.submit(time.sleep, 2), pool.submit(time.sleep, 2)]] == [None, None]
+    assert clock.elapsed_s == pytest.approx(2, abs=0.01)
+
+    async def both() -> None:
+        await asyncio.gather(asyncio.sleep(4), asyncio.to_thread(time.sleep, 3))
+
+    asyncio.run(both())
+    assert clock.elapsed_s == pytest.approx(6, abs=0.01)
+
+
+def test_containers_lock_move_and_expire(clock: VirtualTime) -> None:
+    with memory_system() as system:
+        robot, one, other = (system.container(name) for name in ("robot", "one", "other"))
+        robot.register(Arm(), "arm")
+        move = one.find(where(name="move"), wait_s=5)
+        assert move(0.5) == 0.5
+        with pytest.raises(TimeoutError):
+            move.with_(deadline_s=1)(0.5)
+    assert clock.elapsed_s < 20
+
+
+def test_containers_started_by_name_are_linked_in_memory(clock: VirtualTime) -> None:
+    with (
+        Container(Settings.read(system="virtual", container="a")) as one,
+        Container(Settings.read(system="virtual", container="b")) as other,
+    ):
+        one.register(Arm(), "arm")
+        assert other.find(where(name="move"), wait_s=5)(0.1) == 0.1
+
+
+def _order(seed: int) -> tuple[list[int], int]:
+    """In which order five threads take a lock, and how often threads took turns."""
+    taken: list[int] = []
+    with virtual_time(seed=seed, switch=0.3, packages=HERE) as clock:
+        lock = threading.Lock()
+
+        def take(number: int) -> None:
+            for _ in range(5):
+                with lock:
+                    taken.append(number)
+                    time.sleep(0.001)
+
+        threads = [threading.Thread(target=take, args=[number]) for number in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return taken, clock.switches
+
+
+def test_the_same_seed_gives_the_same_order_and_another_one_another() -> None:
+    assert _order(7) == _order(7)
+    assert len({tuple(_order(seed)[0]) for seed in range(8)}) > 1
+
+
+def test_a_deadlock_is_an_error_with_the_stack_of_each_thread() -> None:
+    with pytest.raises(Deadlock, match=r"(?s)--- main.*never_set.wait\(\).*--- stuck.*lock.acquire\(\)"):
+        with virtual_time(packages=HERE):
+            lock, never_set = threading.Lock(), threading.Event()
+            lock.acquire()
+
+            def wait() -> None:
+                lock.acquire()
+
+            threading.Thread(target=wait, name="stuck").start()
+            never_set.wait()
+
+
+def test_a_thread_that_is_left_behind_is_named_and_ended() -> None:
+    with pytest.raises(VirtualTimeError, match="threads are left behind: forgotten"):
+        with virtual_time(packages=HERE):
+            thread = threading.Thread(target=lambda: time.sleep(1000), name="forgotten")
+            thread.start()
+    threading.Thread.join(thread, 10)
+    assert "forgotten" not in {one.name for one in threading.enumerate()}
+
+
+def test_a_loop_that_only_reads_the_clock_ends(clock: VirtualTime) -> None:
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        pass
+
+
+def test_a_test_that_waits_in_circles_ends_at_its_limit() -> None:
+    with pytest.raises(VirtualTimeError, match="more than 100 s of virtual time have passed"):
+        with virtual_time(packages=HERE, limit_s=100):
+            while True:
+                time.sleep(1)
+
+
+def test_a_process_is_refused_by_name(clock: VirtualTime) -> None:
+    with pytest.raises(VirtualTimeError, match="subprocess.run was called"):
+        subprocess.run(["true"], check=True)
+
+
+def test_everything_is_as_before_at_the_end() -> None:
+    before = (time.monotonic, threading.Lock, queue.SimpleQueue)
+    with virtual_time(packages=HERE):
+        assert time.monotonic is not before[0]
+    assert (time.monotonic, threading.Lock, queue.SimpleQueue) == before
+    with pytest.raises(KeyError), virtual_time(packages=HERE):
+        raise KeyError
+    assert (time.monotonic, threading.Lock, queue.SimpleQueue) == before
+
+
+def test_ids_come_from_the_seed() -> None:
+    addresses = []
+    for _ in range(2):
+        with virtual_time(seed=3), memory_system() as system:
+            addresses.append(str(system.container("robot").address))
+    assert addresses[0] == addresses[1]

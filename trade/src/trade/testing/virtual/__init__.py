@@ -1,0 +1,82 @@
+"""Virtual time: every wait of a test costs nothing, and its order of threads can be tried again."""
+
+import asyncio
+import contextlib
+import gc
+from collections.abc import Iterator, Sequence
+
+from trade._container.container import Container
+from trade._settings import Settings
+from trade._transport.base import Transport
+from trade._transport.memory import MemoryTransport, Network
+from trade.testing.virtual._loop import Policy
+from trade.testing.virtual._modules import replaced
+from trade.testing.virtual._scheduler import Deadlock, Scheduler, VirtualTimeError
+
+__all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
+
+
+class VirtualTime:
+    """The time of one test; made by `virtual_time`."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler = scheduler
+
+    @property
+    def elapsed_s(self) -> float:
+        """How much virtual time has passed, in seconds."""
+        return self._scheduler.elapsed_s
+
+    @property
+    def switches(self) -> int:
+        """How often another thread went on: the same for the same seed."""
+        return self._scheduler.switches
+
+    def sleep(self, duration_s: float) -> None:
+        """Let time pass, in seconds; other threads run meanwhile."""
+        self._scheduler.wait((), duration_s)
+
+
+@contextlib.contextmanager
+def virtual_time(
+    seed: int = 0, *, switch: float = 0.02, packages: Sequence[str] = (), limit_s: float = 3600.0
+) -> Iterator[VirtualTime]:
+    """Run what is inside on virtual time: one thread at a time, on a clock that jumps when all of them wait.
+
+    Containers are linked in memory. The real names are put back at the end.
+
+    Args:
+        seed: draws the order of threads, and ids; the same seed gives the same run.
+        switch: the probability of a switch to another thread where a lock is taken or an event is set, from 0 to 1.
+        packages: packages of yours whose modules use `threading`, `time` and their like.
+        limit_s: how much virtual time may pass, in seconds.
+
+    Raises:
+        Deadlock: all threads wait without a deadline; with the stack of each.
+        VirtualTimeError: a process or a real socket was used, a thread is left behind, or `limit_s` has passed.
+    """
+    scheduler = Scheduler(seed, switch, limit_s)
+    networks: dict[str, Network] = {}
+
+    start = Container.__init__
+
+    def start_in_memory(
+        container: Container, settings: Settings | None = None, *, transport: Transport | None = None
+    ) -> None:
+        settings = settings or Settings.read()
+        network = networks.setdefault(settings.system, Network(seed=seed))
+        start(container, settings, transport=transport or MemoryTransport(network, settings.container))
+
+    policy = asyncio.get_event_loop_policy()
+    with replaced(scheduler, packages) as undo:
+        if gc.isenabled():  # a finalizer would run on any thread, also on one that virtual time does not know
+            undo.callback(gc.enable)
+            gc.disable()
+        undo.callback(setattr, Container, "__init__", start)
+        Container.__init__ = start_in_memory  # type: ignore[method-assign]
+        undo.callback(asyncio.set_event_loop_policy, policy)
+        asyncio.set_event_loop_policy(Policy(scheduler))
+        undo.callback(scheduler.end)
+        yield VirtualTime(scheduler)
+        if left := scheduler.forgotten():
+            raise VirtualTimeError(f"threads are left behind: {', '.join(left)}")

@@ -1,0 +1,254 @@
+"""Puts stand-ins in place of `threading`, `time` and their like in the modules of a program, and takes them out again."""
+
+import asyncio.base_events
+import concurrent.futures._base
+import concurrent.futures.thread
+import contextlib
+import importlib.util
+import itertools
+import logging
+import os
+import queue
+import random
+import secrets
+import socket
+import sys
+import threading
+import time
+import types
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import ModuleType
+from typing import Any, Final
+
+from trade.testing.virtual import _descriptors, _sockets, _threads
+from trade.testing.virtual._descriptors import Descriptors
+from trade.testing.virtual._scheduler import Scheduler, VirtualTimeError
+
+PACKAGES: Final = (
+    "trade",
+    "trade_drivers",
+    "trade_gateway",
+    "trade_hil_sim",
+    "can",
+    "canopen",
+    "dynamixel_sdk",
+    "pymodbus",
+)
+"""The packages whose modules live on virtual time, beside those that a test names."""
+_STANDARD: Final = (
+    asyncio.base_events,
+    concurrent.futures._base,
+    concurrent.futures.thread,
+    logging,
+)
+"""Modules of the standard library that wait, or hold a lock while other code runs."""
+_OWN: Final = __package__
+_LOCK: Final = type(threading.Lock())
+_RLOCK: Final = type(threading.RLock())
+
+
+class Replacements:
+    """What stands in for what, by the identity of the real one."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._of: dict[int, Any] = {}
+        self._keep: list[Any] = []
+        threads = self._module(threading, _threads.stand_ins(scheduler))
+        clocks = self._module(time, _clocks(scheduler))
+        queues = _queues(threads, clocks)
+        self._put(queue, queues)
+        self._put(queue.SimpleQueue, queues.SimpleQueue)
+        self._put(queue.Queue, queues.Queue)
+        self._module(secrets, _ids(scheduler))
+        self._module(uuid, {"uuid4": lambda: uuid.UUID(int=scheduler.random.getrandbits(128), version=4)})
+        self._module(random, _drawn(scheduler))
+        files = Descriptors(scheduler)
+        for module, names in _descriptors.stand_ins(files).items():
+            self._module(module, names)
+        self._module(socket, _sockets.stand_ins(scheduler, files))
+        for name, used in _REFUSED.items():
+            if (module := sys.modules.get(name)) is not None:
+                self._module(module, {each: _refused(getattr(module, each), f"{name}.{each}") for each in used})
+        self._lock, self._rlock = threads.Lock, threads.RLock
+
+    def _put(self, real: Any, stand_in: Any) -> None:
+        self._keep.append(real)  # its identity is not given to another object
+        self._of[id(real)] = stand_in
+
+    def _module(self, module: ModuleType, names: Mapping[str, Any]) -> ModuleType:
+        """A copy of a module with other names; functions and classes of it are replaced where they were imported, too."""
+        copy = types.ModuleType(module.__name__, module.__doc__)
+        copy.__dict__.update(module.__dict__)
+        copy.__dict__.update(names)
+        self._put(module, copy)
+        for name, stand_in in names.items():
+            if hasattr(module, name):
+                self._put(getattr(module, name), stand_in)
+        return copy
+
+    def get(self, value: Any) -> Any:
+        """What stands in for a value; None if nothing does. A lock is one that nobody holds."""
+        found = self._of.get(id(value))
+        if found is None and type(value) is _LOCK:
+            return self._lock()
+        if found is None and type(value) is _RLOCK:
+            return self._rlock()
+        return found
+
+
+def replaced(scheduler: Scheduler, packages: Iterable[str]) -> contextlib.ExitStack:
+    """Replace the names in all modules of these packages, also in those imported later; closing it puts them back."""
+    undo = contextlib.ExitStack()
+    replacements = Replacements(scheduler)
+    roots = {*PACKAGES, *packages}
+    for module in _STANDARD:
+        _replace_in(module, replacements, undo)
+    for handler in [ref() for ref in logging._handlerList]:  # type: ignore[attr-defined]
+        if handler is not None and handler.lock is not None:
+            _set(handler, "lock", replacements.get(handler.lock), undo)
+    for name, module in list(sys.modules.items()):
+        if module is not None and _is_of(name, roots):
+            _replace_in(module, replacements, undo)
+    finder = _Finder(roots, lambda module: _replace_in(module, replacements, undo))
+    sys.meta_path.insert(0, finder)
+    undo.callback(sys.meta_path.remove, finder)
+    return undo
+
+
+def _is_of(name: str, roots: set[str]) -> bool:
+    return name.partition(".")[0] in roots and not name.startswith(_OWN)
+
+
+class _Finder:
+    """Replaces the names of modules that are imported while virtual time runs."""
+
+    def __init__(self, roots: set[str], loaded: Callable[[ModuleType], None]) -> None:
+        self._roots = roots
+        self._loaded = loaded
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
+        if not _is_of(name, self._roots):
+            return None
+        for finder in sys.meta_path:
+            if finder is not self and (spec := finder.find_spec(name, path, target)) is not None:
+                self._watch(spec.loader)
+                return spec
+        return None
+
+    def _watch(self, loader: Any) -> None:
+        run = loader.exec_module
+
+        def run_and_replace(module: ModuleType) -> None:
+            run(module)
+            self._loaded(module)
+
+        loader.exec_module = run_and_replace
+
+
+def _replace_in(module: ModuleType, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+    for name, value in list(vars(module).items()):
+        if (stand_in := replacements.get(value)) is not None:
+            _set(module, name, stand_in, undo)
+        elif isinstance(value, types.FunctionType):
+            _replace_defaults(value, replacements, undo)
+        elif isinstance(value, type) and value.__module__ == module.__name__:
+            _replace_in_class(value, replacements, undo)
+
+
+def _replace_in_class(kind: type, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+    for name, value in list(vars(kind).items()):
+        function = getattr(value, "__func__", value)
+        if isinstance(function, types.FunctionType):
+            _replace_defaults(function, replacements, undo)
+        elif (stand_in := replacements.get(value)) is not None:
+            undo.callback(setattr, kind, name, value)
+            setattr(kind, name, staticmethod(stand_in) if isinstance(stand_in, types.FunctionType) else stand_in)
+
+
+def _replace_defaults(function: Any, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+    """A default argument is bound when its function is defined."""
+    if any(replacements.get(value) is not None for value in function.__defaults__ or ()):
+        values = tuple(_or_itself(replacements, value) for value in function.__defaults__)
+        _set(function, "__defaults__", values, undo)
+    if any(replacements.get(value) is not None for value in (function.__kwdefaults__ or {}).values()):
+        named = {name: _or_itself(replacements, value) for name, value in function.__kwdefaults__.items()}
+        _set(function, "__kwdefaults__", named, undo)
+
+
+def _or_itself(replacements: Replacements, value: Any) -> Any:
+    stand_in = replacements.get(value)
+    return value if stand_in is None else stand_in
+
+
+def _set(owner: Any, name: str, value: Any, undo: contextlib.ExitStack) -> None:
+    undo.callback(setattr, owner, name, getattr(owner, name))
+    setattr(owner, name, value)
+
+
+# --- what stands in
+
+
+def _clocks(scheduler: Scheduler) -> dict[str, Any]:
+    def seconds() -> float:
+        return scheduler.monotonic_ns() / 1e9
+
+    def wall_s() -> float:
+        return scheduler.wall_ns() / 1e9
+
+    return {
+        "monotonic": seconds,
+        "perf_counter": seconds,
+        "clock_gettime": lambda clock: wall_s() if clock == time.CLOCK_REALTIME else seconds(),
+        "time": wall_s,
+        "monotonic_ns": scheduler.monotonic_ns,
+        "perf_counter_ns": scheduler.monotonic_ns,
+        "clock_gettime_ns": lambda clock: (
+            scheduler.wall_ns() if clock == time.CLOCK_REALTIME else scheduler.monotonic_ns()
+        ),
+        "time_ns": scheduler.wall_ns,
+        "sleep": scheduler.sleep,
+    }
+
+
+def _queues(threads: ModuleType, clocks: ModuleType) -> Any:
+    """The module `queue`, in pure Python over other threads."""
+    spec = importlib.util.find_spec("queue")
+    assert spec is not None and spec.loader is not None
+    module: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.threading, module.time = threads, clocks.monotonic
+    module.SimpleQueue = module._PySimpleQueue
+    module.Empty, module.Full = queue.Empty, queue.Full
+    return module
+
+
+def _ids(scheduler: Scheduler) -> dict[str, Any]:
+    drawn = scheduler.random
+    return {
+        "token_hex": lambda nbytes=16: drawn.randbytes(nbytes or 16).hex(),
+        "token_bytes": lambda nbytes=16: drawn.randbytes(nbytes or 16),
+        "randbits": drawn.getrandbits,
+        "choice": drawn.choice,
+        "randbelow": drawn.randrange,
+    }
+
+
+def _drawn(scheduler: Scheduler) -> dict[str, Any]:
+    names = ("random", "uniform", "randrange", "randint", "choice", "shuffle", "sample", "getrandbits", "randbytes")
+    return {name: getattr(scheduler.random, name) for name in names}
+
+
+_REFUSED: Final = {
+    "subprocess": ("Popen", "run", "check_call", "check_output", "call"),
+    "multiprocessing": ("Process", "Pool"),
+    "socketserver": ("TCPServer", "UDPServer"),
+}
+"""What waits for something outside, by module."""
+
+
+def _refused(real: Any, name: str) -> Any:
+    def refuse(*_args: Any, **_named: Any) -> Any:
+        raise VirtualTimeError(f"{name} was called: virtual time has threads of this process only")
+
+    return type(real.__name__, (real,), {"__new__": refuse}) if isinstance(real, type) else refuse
