@@ -1,6 +1,7 @@
 """``trade.stream``: services sampled while a client listens, once for all listeners."""
 
 import itertools
+import time
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,6 +1,7 @@
-"""A pytest plug-in with the fixture `trade_system` and the marker `virtual_time`. It imports trade only for tests that use them.
+"""A pytest plug-in with the fixture `trade_system` and the marker `virtual_time`.
 
-It is a package beside ``trade``, as a module inside of it would import trade in every pytest run.
+It imports trade only for tests that use them. It is a package beside ``trade``,
+as a module inside of it would import trade in every pytest run.
 """
 
 from collections.abc import Generator
@@ -42,8 +43,8 @@ def _virtual_time(request: pytest.FixtureRequest) -> Generator[None, None, None]
     wanted = {"seed": 0, **marker.kwargs}
     if (seed := request.config.getoption("--seed")) is not None:
         wanted["seed"] = seed
-    own = request.module.__name__.partition(".")[0]
-    with virtual_time(**wanted, packages=[own]):
+    own: str = request.node.module.__name__
+    with virtual_time(**wanted, packages=[own.partition(".")[0]]):
         yield
 
 

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import gc
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 
 from trade._container.container import Container
 from trade._settings import Settings
@@ -40,7 +40,7 @@ class VirtualTime:
 @contextlib.contextmanager
 def virtual_time(
     seed: int = 0, *, switch: float = 0.02, packages: Sequence[str] = (), limit_s: float = 3600.0
-) -> Iterator[VirtualTime]:
+) -> Generator[VirtualTime]:
     """Run what is inside on virtual time: one thread at a time, on a clock that jumps when all of them wait.
 
     Containers are linked in memory. The real names are put back at the end.
@@ -67,15 +67,15 @@ def virtual_time(
         network = networks.setdefault(settings.system, Network(seed=seed))
         start(container, settings, transport=transport or MemoryTransport(network, settings.container))
 
-    policy = asyncio.get_event_loop_policy()
+    policy = asyncio.get_event_loop_policy()  # pyright: ignore[reportDeprecated] - Python 3.10 has no other way
     with replaced(scheduler, packages) as undo:
         if gc.isenabled():  # a finalizer would run on any thread, also on one that virtual time does not know
             undo.callback(gc.enable)
             gc.disable()
         undo.callback(setattr, Container, "__init__", start)
         Container.__init__ = start_in_memory  # type: ignore[method-assign]
-        undo.callback(asyncio.set_event_loop_policy, policy)
-        asyncio.set_event_loop_policy(Policy(scheduler))
+        undo.callback(asyncio.set_event_loop_policy, policy)  # pyright: ignore[reportDeprecated]
+        asyncio.set_event_loop_policy(Policy(scheduler))  # pyright: ignore[reportDeprecated]
         undo.callback(scheduler.end)
         yield VirtualTime(scheduler)
         if left := scheduler.forgotten():

@@ -6,7 +6,9 @@ import os
 import select
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, Protocol
 
@@ -104,6 +106,10 @@ class Descriptors:
         del end.incoming[:size]
         return data
 
+    def set_blocking(self, number: int, blocking: bool) -> None:
+        """As `os.set_blocking`."""
+        self.end(number).blocking = blocking
+
     def write(self, number: int, data: bytes) -> int:
         """As `os.write`; what nobody reads is kept without a limit."""
         end = self.end(number)
@@ -150,18 +156,20 @@ def stand_ins(files: Descriptors) -> dict[ModuleType, dict[str, Any]]:
             "read": _either(files.read, os.read),
             "write": _either(files.write, os.write),
             "close": _either(files.close, os.close),
-            "set_blocking": _either(lambda number, value: setattr(files.end(number), "blocking", value), os.set_blocking),
+            "set_blocking": _either(files.set_blocking, os.set_blocking),
             "ttyname": _either(files.ttyname, os.ttyname),
             "pipe": files.pipe,
             "openpty": files.openpty,
         },
         select: {
-            "poll": lambda: _Poll(files),
-            "epoll": lambda *_: _Epoll(files),
-            "select": lambda *lists: _select(files, *lists),
+            "poll": partial(_Poll, files),
+            "epoll": partial(_Epoll, files),
+            "select": partial(_select, files),
         },
     }
-    for name, made in (("pty", _pty), ("tty", _tty), ("termios", _termios), ("serial", _serial)):
+    if (module := sys.modules.get("pty")) is not None:
+        replaced[module] = {"openpty": files.openpty}
+    for name, made in (("tty", _tty), ("termios", _termios), ("serial", _serial)):
         if (module := sys.modules.get(name)) is not None:
             replaced[module] = made(module, files)
     return replaced
@@ -169,11 +177,15 @@ def stand_ins(files: Descriptors) -> dict[ModuleType, dict[str, Any]]:
 
 def _either(virtual: Callable[..., Any], real: Callable[..., Any]) -> Callable[..., Any]:
     """The one for virtual descriptors and the real one for all others."""
-    return lambda number, *rest: (virtual if isinstance(number, int) and number >= _FIRST else real)(number, *rest)
+
+    def call(number: Any, *rest: Any) -> Any:
+        return (virtual if isinstance(number, int) and number >= _FIRST else real)(number, *rest)
+
+    return call
 
 
-class _Poll:
-    """As `select.poll`, for reading."""
+class _Waits:
+    """What `select.poll` and `select.epoll` share."""
 
     def __init__(self, files: Descriptors) -> None:
         self._files = files
@@ -191,9 +203,6 @@ class _Poll:
     def close(self) -> None:
         self._numbers.clear()
 
-    def poll(self, timeout_ms: float | None = None) -> list[tuple[int, int]]:
-        return self._wait(None if timeout_ms is None or timeout_ms < 0 else timeout_ms / 1e3)
-
     def _wait(self, timeout_s: float | None) -> list[tuple[int, int]]:
         writing = {number for number, mask in self._numbers.items() if mask & select.POLLOUT}
         readable = set(self._files.wait(list(self._numbers), 0.0 if writing else timeout_s))
@@ -204,10 +213,20 @@ class _Poll:
         ]
 
 
-class _Epoll(_Poll):
-    """As `select.epoll`, for reading: its time is in seconds."""
+class _Poll(_Waits):
+    """As `select.poll`: its time is in milliseconds."""
 
-    def poll(self, timeout: float | None = None, maxevents: int = -1) -> list[tuple[int, int]]:
+    def poll(self, timeout_ms: float | None = None) -> list[tuple[int, int]]:
+        return self._wait(None if timeout_ms is None or timeout_ms < 0 else timeout_ms / 1e3)
+
+
+class _Epoll(_Waits):
+    """As `select.epoll`: its time is in seconds."""
+
+    def __init__(self, files: Descriptors, *_: int) -> None:
+        super().__init__(files)
+
+    def poll(self, timeout: float | None = None, _most: int = -1) -> list[tuple[int, int]]:
         return self._wait(None if timeout is None or timeout < 0 else timeout)
 
     def __enter__(self) -> "_Epoll":
@@ -230,11 +249,7 @@ def _number_of(file: Any) -> int:
     return file if isinstance(file, int) else file.fileno()
 
 
-def _pty(module: ModuleType, files: Descriptors) -> dict[str, Any]:
-    return {"openpty": files.openpty}
-
-
-def _tty(module: ModuleType, files: Descriptors) -> dict[str, Any]:
+def _tty(module: ModuleType, _: Descriptors) -> dict[str, Any]:
     return {"setraw": _either(lambda *_: None, module.setraw)}
 
 
@@ -281,6 +296,5 @@ def _serial(module: ModuleType, files: Descriptors) -> dict[str, Any]:
 
 
 def _target_of(port: str) -> str:
-    return os.readlink(port) if os.path.islink(port) else os.path.realpath(port)
-
-
+    path = Path(port)
+    return str(path.readlink() if path.is_symlink() else path.resolve())

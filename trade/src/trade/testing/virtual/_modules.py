@@ -1,13 +1,11 @@
-"""Puts stand-ins in place of `threading`, `time` and their like in the modules of a program, and takes them out again."""
+"""Puts stand-ins in place of `threading`, `time` and their like in modules, and takes them out again."""
 
 import asyncio.base_events
 import concurrent.futures._base
 import concurrent.futures.thread
 import contextlib
 import importlib.util
-import itertools
 import logging
-import os
 import queue
 import random
 import secrets
@@ -17,7 +15,7 @@ import threading
 import time
 import types
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Any, Final
 
@@ -43,7 +41,7 @@ _STANDARD: Final = (
     logging,
 )
 """Modules of the standard library that wait, or hold a lock while other code runs."""
-_OWN: Final = __package__
+_OWN: Final = "trade.testing.virtual"
 _LOCK: Final = type(threading.Lock())
 _RLOCK: Final = type(threading.RLock())
 
@@ -77,7 +75,7 @@ class Replacements:
         self._of[id(real)] = stand_in
 
     def _module(self, module: ModuleType, names: Mapping[str, Any]) -> ModuleType:
-        """A copy of a module with other names; functions and classes of it are replaced where they were imported, too."""
+        """A copy of a module with other names, which are replaced where they were imported, too."""
         copy = types.ModuleType(module.__name__, module.__doc__)
         copy.__dict__.update(module.__dict__)
         copy.__dict__.update(names)
@@ -104,11 +102,12 @@ def replaced(scheduler: Scheduler, packages: Iterable[str]) -> contextlib.ExitSt
     roots = {*PACKAGES, *packages}
     for module in _STANDARD:
         _replace_in(module, replacements, undo)
-    for handler in [ref() for ref in logging._handlerList]:  # type: ignore[attr-defined]
+    handlers: list[Any] = [ref() for ref in logging._handlerList]  # type: ignore[attr-defined]
+    for handler in handlers:
         if handler is not None and handler.lock is not None:
             _set(handler, "lock", replacements.get(handler.lock), undo)
     for name, module in list(sys.modules.items()):
-        if module is not None and _is_of(name, roots):
+        if _is_of(name, roots):
             _replace_in(module, replacements, undo)
     finder = _Finder(roots, lambda module: _replace_in(module, replacements, undo))
     sys.meta_path.insert(0, finder)
@@ -171,8 +170,9 @@ def _replace_defaults(function: Any, replacements: Replacements, undo: contextli
     if any(replacements.get(value) is not None for value in function.__defaults__ or ()):
         values = tuple(_or_itself(replacements, value) for value in function.__defaults__)
         _set(function, "__defaults__", values, undo)
-    if any(replacements.get(value) is not None for value in (function.__kwdefaults__ or {}).values()):
-        named = {name: _or_itself(replacements, value) for name, value in function.__kwdefaults__.items()}
+    by_name: dict[str, Any] = function.__kwdefaults__ or {}
+    if any(replacements.get(value) is not None for value in by_name.values()):
+        named = {name: _or_itself(replacements, value) for name, value in by_name.items()}
         _set(function, "__kwdefaults__", named, undo)
 
 
@@ -196,16 +196,20 @@ def _clocks(scheduler: Scheduler) -> dict[str, Any]:
     def wall_s() -> float:
         return scheduler.wall_ns() / 1e9
 
+    def by_clock(clock: int) -> int:
+        return scheduler.wall_ns() if clock == time.CLOCK_REALTIME else scheduler.monotonic_ns()
+
+    def clock_s(clock: int) -> float:
+        return by_clock(clock) / 1e9
+
     return {
         "monotonic": seconds,
         "perf_counter": seconds,
-        "clock_gettime": lambda clock: wall_s() if clock == time.CLOCK_REALTIME else seconds(),
+        "clock_gettime": clock_s,
         "time": wall_s,
         "monotonic_ns": scheduler.monotonic_ns,
         "perf_counter_ns": scheduler.monotonic_ns,
-        "clock_gettime_ns": lambda clock: (
-            scheduler.wall_ns() if clock == time.CLOCK_REALTIME else scheduler.monotonic_ns()
-        ),
+        "clock_gettime_ns": by_clock,
         "time_ns": scheduler.wall_ns,
         "sleep": scheduler.sleep,
     }
@@ -213,8 +217,7 @@ def _clocks(scheduler: Scheduler) -> dict[str, Any]:
 
 def _queues(threads: ModuleType, clocks: ModuleType) -> Any:
     """The module `queue`, in pure Python over other threads."""
-    spec = importlib.util.find_spec("queue")
-    assert spec is not None and spec.loader is not None
+    spec: Any = importlib.util.find_spec("queue")
     module: Any = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.threading, module.time = threads, clocks.monotonic
@@ -251,4 +254,7 @@ def _refused(real: Any, name: str) -> Any:
     def refuse(*_args: Any, **_named: Any) -> Any:
         raise VirtualTimeError(f"{name} was called: virtual time has threads of this process only")
 
-    return type(real.__name__, (real,), {"__new__": refuse}) if isinstance(real, type) else refuse
+    if not isinstance(real, type):
+        return refuse
+    kind: type[Any] = real
+    return type(kind.__name__, (kind,), {"__new__": refuse})

@@ -12,7 +12,8 @@ import random
 import sys
 import traceback
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from types import FrameType
 from typing import Final
 
 WaitList = deque["Task"]
@@ -24,6 +25,7 @@ _READ_NS: Final = 200
 _READS_BEFORE_MORE: Final = 1_000
 _LONGEST_READ_NS: Final = 1_000_000
 _FRAMES: Final = 6
+_FOLDER: Final = "trade/testing/virtual/"
 
 
 class VirtualTimeError(RuntimeError):
@@ -65,7 +67,7 @@ class Scheduler:
     """
 
     def __init__(self, seed: int, switch: float, limit_s: float) -> None:
-        self.random: Final = random.Random(seed)
+        self.random: Final = random.Random(seed)  # noqa: S311 - it draws orders, no secrets
         self.now_ns = _BEGIN_NS
         self.switches = 0
         self._switch = switch
@@ -219,8 +221,7 @@ class Scheduler:
             passed = f"more than {(self._limit_ns - _BEGIN_NS) / 1e9:g} s of virtual time have passed"
             self._limit_ns = sys.maxsize
             self._fail(VirtualTimeError(f"{passed}; say limit_s= if that is right:\n{self._stacks()}"))
-        assert following is not None
-        return following
+        return self._main if following is None else following
 
     def _next(self) -> Task | None:
         while not self._ready:
@@ -244,9 +245,7 @@ class Scheduler:
         frames = sys._current_frames()
         return "\n".join(self._stack(task, frames.get(task.ident or 0)) for task in self._tasks.values())
 
-    def _stack(self, task: Task, frame: object) -> str:
-        lines = traceback.format_stack(frame) if frame is not None else []  # type: ignore[arg-type]
-        own = [line for line in lines if f"{__package__.replace('.', '/')}/" not in line.replace("\\", "/")]
+    def _stack(self, task: Task, frame: FrameType | None) -> str:
+        lines = traceback.format_stack(frame) if frame is not None else []
+        own = [line for line in lines if _FOLDER not in line.replace("\\", "/")]
         return f"--- {task.name}\n{''.join(own[-_FRAMES:])}"
-
-

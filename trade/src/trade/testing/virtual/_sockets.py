@@ -5,7 +5,7 @@ import itertools
 import os
 import socket
 from collections import deque
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from trade.testing.virtual._descriptors import Descriptors
 from trade.testing.virtual._scheduler import Scheduler, VirtualTimeError, WaitList
@@ -28,9 +28,9 @@ class Socket:
 
     _network: Network
 
-    def __init__(self, family: int = -1, type: int = -1, proto: int = -1, fileno: int | None = None) -> None:  # noqa: A002 - as there
+    def __init__(self, family: int = -1, *_: int, fileno: int | None = None) -> None:
         if fileno is not None or family not in (-1, socket.AF_INET, socket.AF_UNIX):
-            raise VirtualTimeError(f"a socket of family {family} was opened: virtual time has TCP and Unix sockets only")
+            raise VirtualTimeError(f"a socket of family {family} was opened: virtual time has TCP and Unix sockets")
         self.family: Final = socket.AF_INET if family == -1 else family
         self.type = socket.SOCK_STREAM
         self.peer: Socket | None = None
@@ -66,7 +66,7 @@ class Socket:
 
     def setsockopt(self, *_: Any) -> None: ...
 
-    def getsockopt(self, level: int, name: int, buffer: int = 0) -> Any:
+    def getsockopt(self, *_: int) -> Any:
         return 0
 
     def set_inheritable(self, _: bool) -> None: ...
@@ -83,12 +83,12 @@ class Socket:
         if self.family == socket.AF_INET:
             address = (address[0], address[1] or next(self._network.ports))
         holders = self._network.bound.setdefault(_place(address), [])
-        if holders and self.family == socket.AF_UNIX or any(holder._backlog is not None for holder in holders):
+        if (holders and self.family == socket.AF_UNIX) or any(holder._backlog is not None for holder in holders):
             raise _error(errno.EADDRINUSE)
         holders.append(self)
         self._name = address
 
-    def listen(self, backlog: int = 128) -> None:
+    def listen(self, _most: int = 128) -> None:
         self._backlog = deque()
 
     # --- connections
@@ -103,18 +103,18 @@ class Socket:
         return accepted, accepted.getpeername()
 
     def connect(self, address: Any) -> None:
-        listening = [one for one in self._network.bound.get(_place(address), []) if one._backlog is not None]
-        if not listening:
+        holders = self._network.bound.get(_place(address), [])
+        found = next(((one, one._backlog) for one in holders if one._backlog is not None), None)
+        if found is None:
             raise _error(errno.ECONNREFUSED)
+        listener, backlog = found
         other = type(self)(self.family)
         other.peer, self.peer = self, other
-        other._name = listening[0]._name
+        other._name = listener._name
         if self.family == socket.AF_INET and not self._name[1]:
             self._name = ("127.0.0.1", next(self._network.ports))
-        backlog = listening[0]._backlog
-        assert backlog is not None
         backlog.append(other)
-        self._network.scheduler.wake_all(listening[0].waiting)
+        self._network.scheduler.wake_all(listener.waiting)
         self._network.scheduler.may_yield()
 
     def connect_ex(self, address: Any) -> int:
@@ -144,7 +144,7 @@ class Socket:
         memoryview(buffer).cast("B")[: len(data)] = data
         return len(data)
 
-    def send(self, data: Any, flags: int = 0) -> int:
+    def send(self, data: Any, _flags: int = 0) -> int:
         if self._number < 0:
             raise _error(errno.EBADF)
         peer = self.peer
@@ -210,9 +210,9 @@ class Socket:
 
 def stand_ins(scheduler: Scheduler, files: Descriptors) -> dict[str, Any]:
     """The names of `socket` that are another thing in a simulation."""
-    kind = type("socket", (Socket,), {"_network": Network(scheduler, files)})
+    kind: type[Socket] = type("socket", (Socket,), {"_network": Network(scheduler, files)})
 
-    def create_connection(address: Any, timeout: Any = None, source_address: Any = None, **_: Any) -> Socket:
+    def create_connection(address: Any, timeout: Any = None, *_: Any, **_named: Any) -> Socket:
         made = kind(socket.AF_INET)
         made.settimeout(timeout if isinstance(timeout, int | float) else None)
         try:
@@ -231,7 +231,7 @@ def stand_ins(scheduler: Scheduler, files: Descriptors) -> dict[str, Any]:
 
 
 def _place(address: Any) -> Any:
-    return address[1] if isinstance(address, tuple) else address
+    return cast("tuple[Any, ...]", address)[1] if isinstance(address, tuple) else address
 
 
 def _error(number: int) -> OSError:

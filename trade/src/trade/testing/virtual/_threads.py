@@ -214,8 +214,7 @@ class Thread(threading.Thread):
         self._task = task
         self.run = lambda: _run_in_turn(self._scheduler, task, run)  # type: ignore[method-assign]
         super().start()
-        assert self.ident is not None
-        self._scheduler.add(task, self.ident)
+        self._scheduler.add(task, self.ident or 0)
         self._scheduler.may_yield()
 
     def join(self, timeout: float | None = None) -> None:
@@ -236,7 +235,7 @@ def _run_in_turn(scheduler: Scheduler, task: Task, run: Callable[[], None]) -> N
         run()
     except (Ended, SystemExit):
         pass
-    except BaseException:
+    except BaseException:  # noqa: BLE001 - as a thread of threading does
         threading.excepthook(threading.ExceptHookArgs([*sys.exc_info(), threading.current_thread()]))
     finally:
         scheduler.remove(task)
