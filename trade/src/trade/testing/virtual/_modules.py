@@ -15,9 +15,9 @@ import threading
 import time
 import types
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from trade.testing.virtual import _descriptors, _sockets, _threads
 from trade.testing.virtual._descriptors import Descriptors
@@ -145,35 +145,61 @@ class _Finder:
         loader.exec_module = run_and_replace
 
 
+class _Site(NamedTuple):
+    """A name whose value is replaced, in a module, a class, or a function's defaults."""
+
+    owner: Any
+    name: str
+
+
+_sites_of: dict[str, tuple[ModuleType, list[_Site]]] = {}
+"""What was found in each module, which is looked for once."""
+
+
 def _replace_in(module: ModuleType, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+    known = _sites_of.get(module.__name__)
+    if known is None or known[0] is not module:
+        known = _sites_of[module.__name__] = (module, list(_sites(module, replacements)))
+    for owner, name in known[1]:
+        value = vars(owner)[name] if isinstance(owner, type) else getattr(owner, name)
+        undo.callback(setattr, owner, name, value)
+        setattr(owner, name, _instead(owner, name, value, replacements))
+
+
+def _instead(owner: Any, name: str, value: Any, replacements: Replacements) -> Any:
+    if name == "__defaults__":
+        return tuple(_or_itself(replacements, one) for one in value)
+    if name == "__kwdefaults__":
+        return {key: _or_itself(replacements, one) for key, one in value.items()}
+    stand_in = _or_itself(replacements, value)
+    return staticmethod(stand_in) if isinstance(owner, type) and type(stand_in) is types.FunctionType else stand_in
+
+
+def _sites(module: ModuleType, replacements: Replacements) -> Generator[_Site]:
     for name, value in list(vars(module).items()):
-        if (stand_in := replacements.get(value)) is not None:
-            _set(module, name, stand_in, undo)
-        elif isinstance(value, types.FunctionType):
-            _replace_defaults(value, replacements, undo)
-        elif isinstance(value, type) and value.__module__ == module.__name__:
-            _replace_in_class(value, replacements, undo)
+        if replacements.get(value) is not None:
+            yield _Site(module, name)
+        elif type(value) is types.FunctionType:
+            yield from _default_sites(value, replacements)
+        elif issubclass(type(value), type) and value.__module__ == module.__name__:
+            yield from _class_sites(value, replacements)
 
 
-def _replace_in_class(kind: type, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+def _class_sites(kind: type, replacements: Replacements) -> Generator[_Site]:
     for name, value in list(vars(kind).items()):
         function = getattr(value, "__func__", value)
-        if isinstance(function, types.FunctionType):
-            _replace_defaults(function, replacements, undo)
-        elif (stand_in := replacements.get(value)) is not None:
-            undo.callback(setattr, kind, name, value)
-            setattr(kind, name, staticmethod(stand_in) if isinstance(stand_in, types.FunctionType) else stand_in)
+        if type(function) is types.FunctionType:
+            yield from _default_sites(function, replacements)
+        elif replacements.get(value) is not None:
+            yield _Site(kind, name)
 
 
-def _replace_defaults(function: Any, replacements: Replacements, undo: contextlib.ExitStack) -> None:
+def _default_sites(function: types.FunctionType, replacements: Replacements) -> Generator[_Site]:
     """A default argument is bound when its function is defined."""
     if any(replacements.get(value) is not None for value in function.__defaults__ or ()):
-        values = tuple(_or_itself(replacements, value) for value in function.__defaults__)
-        _set(function, "__defaults__", values, undo)
-    by_name: dict[str, Any] = function.__kwdefaults__ or {}
-    if any(replacements.get(value) is not None for value in by_name.values()):
-        named = {name: _or_itself(replacements, value) for name, value in by_name.items()}
-        _set(function, "__kwdefaults__", named, undo)
+        yield _Site(function, "__defaults__")
+    if any(replacements.get(value) is not None for value in (function.__kwdefaults__ or {}).values()):
+        yield _Site(function, "__kwdefaults__")
 
 
 def _or_itself(replacements: Replacements, value: Any) -> Any:
