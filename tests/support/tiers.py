@@ -5,6 +5,7 @@ more says so with a marker, or is in a folder that says so for it:
 
 - no marker: code, containers and zenoh within the process. Waits end by a condition.
 - `virtual_time`: also simulated devices, as their time is virtual. With `--real-time`, these tests are `realtime`.
+- `real_clock`: as without a marker, where the module is on virtual time.
 - `realtime`: simulators on real clocks, child processes, programs of other people.
 - `system`: also network namespaces, browsers and other toolchains.
 
@@ -123,8 +124,11 @@ def pytest_configure() -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what whole folders are, and what is on the real clock, before `-m` selects."""
     for item in items:
-        if config.getoption("--real-time", default=False) and item.get_closest_marker("virtual_time"):
+        virtual = item.get_closest_marker("virtual_time") and not item.get_closest_marker("real_clock")
+        if virtual and config.getoption("--real-time", default=False):
             item.add_marker(pytest.mark.realtime)
+        if item.get_closest_marker("realtime"):
+            item.add_marker(pytest.mark.real_clock)
         if in_system_folder(item.path):
             item.add_marker(pytest.mark.system)
 

@@ -222,7 +222,7 @@ def open_raw(system: str) -> Iterator[OpenRaw]:
         yield start
 
 
-@pytest.fixture(params=["zenoh", "memory", "one container"])
+@pytest.fixture(params=[pytest.param("zenoh", marks=pytest.mark.realtime), "memory", "one container"])
 def two(request: pytest.FixtureRequest, start_container: Callable[..., Container]) -> Iterator[Two]:
     battery = Battery()
     if request.param == "memory":

@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the markers."""
     for line in (
         "virtual_time(seed=0, switch=0.02): run the test and its fixtures of function scope on virtual time",
-        "realtime: keep the test on the real clock, whatever its module says",
+        "real_clock: keep the test on the real clock, whatever its module says",
     ):
         config.addinivalue_line("markers", line)
 
@@ -34,7 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True)
 def _virtual_time(request: pytest.FixtureRequest) -> Generator[None, None, None]:
     marker = request.node.get_closest_marker("virtual_time")
-    real = request.config.getoption("--real-time") or request.node.get_closest_marker("realtime")
+    real = request.config.getoption("--real-time") or request.node.get_closest_marker("real_clock")
     if marker is None or real:
         yield
         return
