@@ -87,6 +87,7 @@ def test_S01_a_plain_call_waits_one_second_for_its_turn_at_most(rig: SafetyRig, 
 # --- S06 the last resort is in the device
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill -9", "SIGSTOP"])
 def test_S06_a_driver_process_that_dies_or_freezes_while_moving_is_stopped_by_the_device(
     rig: SafetyRig, number: int
@@ -98,6 +99,7 @@ def test_S06_a_driver_process_that_dies_or_freezes_while_moving_is_stopped_by_th
     rig.rests()
 
 
+@pytest.mark.realtime
 def test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why(rig: JointRig) -> None:
     driver = rig.driver_process()
     rig.under_way()

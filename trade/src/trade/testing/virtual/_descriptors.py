@@ -1,10 +1,11 @@
 """Pipes, pseudo-terminals and the waits for them, between threads of one simulation."""
 
+import contextlib
 import errno
+import importlib
 import itertools
 import os
 import select
-import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -167,10 +168,9 @@ def stand_ins(files: Descriptors) -> dict[ModuleType, dict[str, Any]]:
             "select": partial(_select, files),
         },
     }
-    if (module := sys.modules.get("pty")) is not None:
-        replaced[module] = {"openpty": files.openpty}
-    for name, made in (("tty", _tty), ("termios", _termios), ("serial", _serial)):
-        if (module := sys.modules.get(name)) is not None:
+    for name, made in (("pty", _pty), ("tty", _tty), ("termios", _termios), ("serial", _serial)):
+        with contextlib.suppress(ImportError):  # pyserial need not be installed
+            module = importlib.import_module(name)
             replaced[module] = made(module, files)
     return replaced
 
@@ -247,6 +247,10 @@ def _select(
 
 def _number_of(file: Any) -> int:
     return file if isinstance(file, int) else file.fileno()
+
+
+def _pty(_: ModuleType, files: Descriptors) -> dict[str, Any]:
+    return {"openpty": files.openpty}
 
 
 def _tty(module: ModuleType, _: Descriptors) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import asyncio.base_events
 import concurrent.futures._base
 import concurrent.futures.thread
 import contextlib
+import importlib
 import importlib.util
 import logging
 import queue
@@ -66,8 +67,8 @@ class Replacements:
             self._module(module, names)
         self._module(socket, _sockets.stand_ins(scheduler, files))
         for name, used in _REFUSED.items():
-            if (module := sys.modules.get(name)) is not None:
-                self._module(module, {each: _refused(getattr(module, each), f"{name}.{each}") for each in used})
+            module = importlib.import_module(name)
+            self._module(module, {each: _refused(getattr(module, each), f"{name}.{each}") for each in used})
         self._lock, self._rlock = threads.Lock, threads.RLock
 
     def _put(self, real: Any, stand_in: Any) -> None:
