@@ -2,11 +2,13 @@
 
 import asyncio
 import queue
+import re
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +16,7 @@ from trade import Container, Settings, service, where
 from trade.testing import Deadlock, VirtualTime, VirtualTimeError, memory_system, virtual_time
 
 HERE = [__name__.partition(".")[0]]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -196,3 +199,14 @@ def test_ids_come_from_the_seed() -> None:
         with virtual_time(seed=3), memory_system() as system:
             addresses.append(str(system.container("robot").address))
     assert addresses[0] == addresses[1]
+
+
+BOUND_AT_IMPORT = re.compile(r" = (time|threading|queue)\.\w+( *$|[,)])")
+"""A default argument. On virtual time, its function would wait for the real clock."""
+
+
+@pytest.mark.parametrize("package", ["trade", "drivers", "gateway", "hil-sim"])
+def test_no_default_argument_binds_a_clock_or_a_thread(package: str) -> None:
+    modules = {path: path.read_text() for path in (ROOT / package).glob("src/**/*.py") if path.parent.name != "virtual"}
+    assert len(modules) > 20
+    assert [path.name for path, source in modules.items() if BOUND_AT_IMPORT.search(source)] == []

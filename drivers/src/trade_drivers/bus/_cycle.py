@@ -114,8 +114,8 @@ class BusCycle(ABC, Generic[_Device]):
     Any thread may call ``submit``, ``leave`` and stops; only the thread that calls ``cycle()`` may call the rest.
     """
 
-    def __init__(self, bus: Bus, devices: Sequence[_Device], clock: Callable[[], int] = time.monotonic_ns) -> None:
-        self.clock = clock
+    def __init__(self, bus: Bus, devices: Sequence[_Device], clock: Callable[[], int] | None = None) -> None:
+        self.clock = clock or time.monotonic_ns
         self.lasting_clock = _lasting_ns
         """The clock that measures interruptions, including a suspended host."""
         self.wake = threading.Event()

@@ -58,12 +58,13 @@ class FaultLog:
         robot: str,
         store: FaultStore | None = None,
         *,
-        clock: Callable[[], float] = time.monotonic,
-        wall: Callable[[], float] = time.time,
+        clock: Callable[[], float] | None = None,
+        wall: Callable[[], float] | None = None,
         most: int = _MOST,
         devices: Collection[str] | None = None,
     ) -> None:
-        self._robot, self._store, self._clock, self._wall, self._most = robot, store, clock, wall, most
+        self._robot, self._store, self._most = robot, store, most
+        self._clock, self._wall = clock or time.monotonic, wall or time.time
         self._lock = threading.Lock()
         self._entries: dict[Key, _Entry] = {}
         self._before: set[Key] = set()
@@ -74,7 +75,7 @@ class FaultLog:
         """Faults of the last write to disk, which may have failed."""
         self._saving: Future[bool] | None = None
         self._saved_s = -_SAVE_EVERY_S
-        self._started_s = clock()
+        self._started_s = self._clock()
         for number, fault in store.load() if store is not None else ():
             if devices is None or fault.device in devices:
                 self._restore(number, fault)

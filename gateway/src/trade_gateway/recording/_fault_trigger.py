@@ -34,7 +34,7 @@ class SavedAtFault:
         attachments: Sequence[Attachment],
         saved: Saved,
         failed: Callable[[str], None],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         """Creates the sink.
 
@@ -60,7 +60,7 @@ class SavedAtFault:
         self._attachments = attachments
         self._saved = saved
         self._failed = failed
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self._held_until = 0.0
 
     def write(self, message: Message) -> None:

@@ -57,11 +57,11 @@ class Supervisor:
         folder: Path,
         *,
         grace_s: float = GRACE_S,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
         launch: Callable[[Child, Path, Path | None, TimerLease | None], Process] = Process,
         furnish: Callable[[Callable[[], Container], Child, Started, Mapping[str, Any]], CreatedObjects] = furnish,
     ) -> None:
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self._new_process = launch
         self._furnishes = furnish
         self._member = member

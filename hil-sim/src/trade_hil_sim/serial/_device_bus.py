@@ -55,11 +55,11 @@ class DeviceLine(ABC, Generic[_Device]):
         name: str = "bus",
         log: ByteLog | None = None,
         paced: bool = True,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self.name, self.port = name, port
         self.log = ByteLog() if log is None else log
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self._devices = list(devices)
         for device in self._devices:
             device.emit = self._emit

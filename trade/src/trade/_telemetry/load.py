@@ -79,12 +79,12 @@ class LoadMeter:
         container: str,
         pools: Callable[[], Sequence[Pool]],
         queued: Callable[[], int],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._container = container
         self._pools = pools
         self._queued = queued
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self._lock = threading.Lock()
         self._before = self._last = self._sample()
 

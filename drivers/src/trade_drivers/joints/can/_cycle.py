@@ -51,7 +51,7 @@ class MotorExchange(Exchange[_Axis]):
     """The pause before an offline motor is tried again."""
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[_Axis], clock: Callable[[], int] = time.monotonic_ns
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[_Axis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(bus, axes, clock)
         self.port = port

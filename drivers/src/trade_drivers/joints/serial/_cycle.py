@@ -1,7 +1,6 @@
 """The cyclic exchange with all servos of one bus: stops, measurements, work, goals. One thread calls ``cycle()``."""
 
 import logging
-import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
@@ -42,7 +41,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         wire: _Wire_co,
         bus: "SerialBus",
         axes: Sequence[_Servo],
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         super().__init__(bus, axes, clock)
         self._wire = wire

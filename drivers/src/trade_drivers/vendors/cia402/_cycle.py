@@ -1,7 +1,6 @@
 """The cyclic exchange with all drives of one CAN bus: heartbeat, SYNC, measurements, handshakes, work."""
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -38,7 +37,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
     again_ns = PROBE_NS
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] = time.monotonic_ns
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.nodes = Net(self.net)

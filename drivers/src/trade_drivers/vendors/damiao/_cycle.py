@@ -4,7 +4,6 @@ A motor sends feedback only in answer to a frame. So each cycle sends a motor wi
 other motor a request. Its own ramps are unreliable, so this driver generates them.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -31,7 +30,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     """The exchange with the Damiao motors of one bus."""
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] = time.monotonic_ns
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.timeout = round(bus.watchdog_s * frames.TICKS_PER_S)

@@ -1,6 +1,5 @@
 """Commands to Dynamixel servos in the cyclic exchange with a bus."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -33,7 +32,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         wire: "Wire",
         bus: "SerialBus",
         axes: Sequence[DynamixelAxis],
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         super().__init__(wire, bus, axes, clock)
         self.watchdog_counts = max(1, min(127, round(bus.watchdog_s / table.BUS_WATCHDOG.si_per_count)))

@@ -1,7 +1,6 @@
 """Commands to ODrives in the cyclic exchange with a bus."""
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -34,14 +33,14 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     """
 
     def __init__(
-        self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] = time.monotonic_ns
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.deaf_ns = max(_BEATS_MISSED_NS, self.stale_after_ns)
         self.rival = False
         """True if another driver commands these axes."""
         for axis in axes:
-            for command, listener in axis.listeners(clock).items():
+            for command, listener in axis.listeners(self.clock).items():
                 self.net.hear(frame_id(axis.id, command), listener)
             self._listen_for_rivals(axis)
 

@@ -1,7 +1,6 @@
 """The cyclic exchange with all grippers of one bus: stops, measurements, work. One thread calls ``cycle()``."""
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
@@ -27,7 +26,7 @@ class Exchange(BusCycle[Hand]):
     """The exchange with the grippers of one bus. Any thread may also call ``stop``."""
 
     def __init__(
-        self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] = time.monotonic_ns
+        self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(bus, hands, clock)
         self.wire = wire

@@ -2,7 +2,6 @@
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Final
 
@@ -37,7 +36,7 @@ _SERVO_NS: Final = 50_000_000
 class Exchange(BusCycle[ArmStatus]):
     """The exchange with one controller. Any thread may also call ``stop``."""
 
-    def __init__(self, link: Link, bus: UrBus, limb: ArmStatus, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, link: Link, bus: UrBus, limb: ArmStatus, clock: Callable[[], int] | None = None) -> None:
         super().__init__(bus, [limb], clock)
         self.link = link
         self.limb = limb

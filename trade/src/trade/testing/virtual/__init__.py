@@ -3,10 +3,11 @@
 import asyncio
 import contextlib
 import gc
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Sequence, Set
 
 from trade._container.container import Container
 from trade._settings import Settings
+from trade._threads import fork_guard
 from trade._transport.base import Transport
 from trade._transport.memory import MemoryTransport, Network
 from trade.testing.virtual._loop import Policy
@@ -77,6 +78,13 @@ def virtual_time(
         undo.callback(asyncio.set_event_loop_policy, policy)  # pyright: ignore[reportDeprecated]
         asyncio.set_event_loop_policy(Policy(scheduler))  # pyright: ignore[reportDeprecated]
         undo.callback(scheduler.end)
+        undo.callback(_forget_containers, set(fork_guard.live))
         yield VirtualTime(scheduler)
         if left := scheduler.forgotten():
             raise VirtualTimeError(f"threads are left behind: {', '.join(left)}")
+
+
+def _forget_containers(before: Set[object]) -> None:
+    """Containers that a test has left open end with its threads; the process must not close them at its end."""
+    for container in set(fork_guard.live) - before:
+        fork_guard.live.discard(container)

@@ -18,7 +18,7 @@ import types
 import uuid
 from collections.abc import Callable, Generator, Iterable, Mapping
 from types import ModuleType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from trade.testing.virtual import _descriptors, _sockets, _threads
 from trade.testing.virtual._descriptors import Descriptors
@@ -147,7 +147,7 @@ class _Finder:
 
 
 class _Site(NamedTuple):
-    """A name whose value is replaced, in a module, a class, or a function's defaults."""
+    """A name whose value is replaced, in a module or a class."""
 
     owner: Any
     name: str
@@ -164,48 +164,19 @@ def _replace_in(module: ModuleType, replacements: Replacements, undo: contextlib
     for owner, name in known[1]:
         value = vars(owner)[name] if isinstance(owner, type) else getattr(owner, name)
         undo.callback(setattr, owner, name, value)
-        setattr(owner, name, _instead(owner, name, value, replacements))
-
-
-def _instead(owner: Any, name: str, value: Any, replacements: Replacements) -> Any:
-    if name == "__defaults__":
-        return tuple(_or_itself(replacements, one) for one in value)
-    if name == "__kwdefaults__":
-        return {key: _or_itself(replacements, one) for key, one in value.items()}
-    stand_in = _or_itself(replacements, value)
-    return staticmethod(stand_in) if isinstance(owner, type) and type(stand_in) is types.FunctionType else stand_in
+        stand_in = replacements.get(value)
+        of_class = isinstance(owner, type) and type(stand_in) is types.FunctionType
+        setattr(owner, name, staticmethod(stand_in) if of_class else value if stand_in is None else stand_in)
 
 
 def _sites(module: ModuleType, replacements: Replacements) -> Generator[_Site]:
     for name, value in list(vars(module).items()):
         if replacements.get(value) is not None:
             yield _Site(module, name)
-        elif type(value) is types.FunctionType:
-            yield from _default_sites(value, replacements)
         elif issubclass(type(value), type) and value.__module__ == module.__name__:
-            yield from _class_sites(value, replacements)
-
-
-def _class_sites(kind: type, replacements: Replacements) -> Generator[_Site]:
-    for name, value in list(vars(kind).items()):
-        function = getattr(value, "__func__", value)
-        if type(function) is types.FunctionType:
-            yield from _default_sites(function, replacements)
-        elif replacements.get(value) is not None:
-            yield _Site(kind, name)
-
-
-def _default_sites(function: types.FunctionType, replacements: Replacements) -> Generator[_Site]:
-    """A default argument is bound when its function is defined."""
-    if any(replacements.get(value) is not None for value in function.__defaults__ or ()):
-        yield _Site(function, "__defaults__")
-    if any(replacements.get(value) is not None for value in (function.__kwdefaults__ or {}).values()):
-        yield _Site(function, "__kwdefaults__")
-
-
-def _or_itself(replacements: Replacements, value: Any) -> Any:
-    stand_in = replacements.get(value)
-    return value if stand_in is None else stand_in
+            for of_class, one in list(vars(cast("type", value)).items()):
+                if replacements.get(one) is not None:
+                    yield _Site(value, of_class)
 
 
 def _set(owner: Any, name: str, value: Any, undo: contextlib.ExitStack) -> None:
