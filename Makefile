@@ -15,10 +15,11 @@ SEED ?= 1
 MINUTES ?= 3
 HOURS ?= 1
 MUTANT ?=
+SEEDS ?= 50
 MINIMISE ?=
 
 .PHONY: demo screenshots docs release-check test test-realtime test-system test-all test-socketcan soak soak-registry soak-relocation
-.PHONY: chaos chaos-locks chaos-robots siege mutants
+.PHONY: chaos chaos-locks chaos-robots siege explore mutants
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
@@ -72,6 +73,9 @@ siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
+
+explore: $(UV) ## stories of robots on virtual time under drawn troubles (SEEDS=..; ARGS="--first 17 --only 0,2")
+	@$(RUN) python -m tests.endurance.explore --seeds $(SEEDS) $(ARGS)
 
 mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's)
 	@$(RUN) pytest -m mutant -p tests.support.mutant_table tests tests/endurance/siege_mutants.py $(ARGS)

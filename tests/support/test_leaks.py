@@ -42,7 +42,7 @@ def test_a_test_that_leaves_something_behind_fails(
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     conftest = Path(__file__).parents[1].joinpath("conftest.py").read_text(encoding="utf-8")
-    pytester.makeconftest(conftest.replace("_SETTLE_S = 5.0", "_SETTLE_S = 0.2"))
+    pytester.makeconftest(conftest.replace("_SETTLE_S = 15.0", "_SETTLE_S = 0.2"))
     pytester.makepyfile(LEAKS[what] + "\n\n        def test_innocent():\n            pass\n")
     result = pytester.runpytest_subprocess("-q")
     result.assert_outcomes(passed=2, errors=1)

@@ -33,6 +33,19 @@ class VirtualTime:
         """How often another thread went on: the same for the same seed."""
         return self._scheduler.switches
 
+    def step_wall_clock(self, by_s: float) -> None:
+        """Set the wall clock ahead or back, in seconds; the monotonic clock goes on."""
+        self._scheduler.wall_step_ns += round(by_s * 1e9)
+
+    def stall_threads(self, probability: float, longest_s: float = 2.0) -> None:
+        """From now on, threads stand still where another one may run, as on a computer that does not run them.
+
+        Args:
+            probability: of each such place, from 0 (none, as at the beginning) to 1.
+            longest_s: the longest time for which one stands still, in seconds.
+        """
+        self._scheduler.stall, self._scheduler.longest_stall_s = probability, longest_s
+
     def sleep(self, duration_s: float) -> None:
         """Let time pass, in seconds; other threads run meanwhile."""
         self._scheduler.wait((), duration_s)
@@ -40,7 +53,11 @@ class VirtualTime:
 
 @contextlib.contextmanager
 def virtual_time(
-    seed: int = 0, *, switch: float = 0.02, packages: Sequence[str] = (), limit_s: float = 3600.0
+    seed: int = 0,
+    *,
+    switch: float = 0.02,
+    packages: Sequence[str] = (),
+    limit_s: float = 3600.0,
 ) -> Generator[VirtualTime]:
     """Run what is inside on virtual time: one thread at a time, on a clock that jumps when all of them wait.
 

@@ -69,8 +69,13 @@ class Scheduler:
     def __init__(self, seed: int, switch: float, limit_s: float) -> None:
         self.random: Final = random.Random(seed)  # noqa: S311 - it draws orders, no secrets
         self.now_ns = _BEGIN_NS
+        self.wall_step_ns = 0
+        """How far the wall clock was set, in nanoseconds."""
         self.switches = 0
         self._switch = switch
+        self.stall = 0.0
+        """The probability that a thread stands still where another one may run."""
+        self.longest_stall_s = 0.0
         self._limit_ns = _BEGIN_NS + round(limit_s * 1e9)
         self._reads = 0
         self._ready: list[Task] = []
@@ -100,7 +105,7 @@ class Scheduler:
 
     def wall_ns(self) -> int:
         """The wall clock, which advances as the other one does."""
-        return self.monotonic_ns() - _BEGIN_NS + _WALL_NS
+        return self.monotonic_ns() - _BEGIN_NS + _WALL_NS + self.wall_step_ns
 
     def number(self) -> int:
         """The next of the numbers of what is made."""
@@ -140,7 +145,9 @@ class Scheduler:
             self.wake(task)
 
     def may_yield(self) -> None:
-        """A place where another thread may run: with the probability of a switch."""
+        """A place where another thread may run, with the probability of a switch or a stall."""
+        if self.stall and self.random.random() < self.stall:
+            self.sleep(self.random.random() * self.longest_stall_s)
         if self._ready and self._switch and self.random.random() < self._switch:
             self.yield_now()
 
