@@ -80,6 +80,7 @@ def _play(stage: "_Stage", troubles: Sequence[tuple[int, float, str, str]]) -> N
             TROUBLES[name](stage, group)
         stage.clock.sleep(max(0.0, stage.began + _LASTS_S - time.monotonic()))
         stage.over.set()
+        stage.clock.stall_threads(0.0)
         for thread in clients:
             thread.join(_ENDS_S)
         stage.told.violations += [f"a call of {one.name} does not end" for one in clients if one.is_alive()]
@@ -189,7 +190,7 @@ class _Stage:
 
     def judge(self) -> None:
         self.clock.sleep(_LEFT_S)
-        left = [f"{one.holder.session} still has {one.resources}" for one in self.operator.locks()]
+        left = [f"{one.holder.session} still has {one.resources}" for one in self.operator.locks() if one.token.number]
         self.told.violations += left
         logs: dict[str, Sequence[Entry]] = {group: list(bus.log.entries) for group, bus in self.buses.items()}
         self.told.bytes = sum(map(len, logs.values()))

@@ -12,8 +12,6 @@ from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 
 SEEDS = 50
-_ENOUGH = 30
-"""In so many stories, each of the mutants shows."""
 
 
 @pytest.mark.parametrize("seed", range(1, SEEDS + 1))
@@ -42,18 +40,13 @@ def _no_lease_ends(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mutate", "says"),
+    ("mutate", "seed", "says"),
     [
-        (_no_stop_holds, "after its stop was confirmed"),
-        (_two_owners, "and worker held|and planner held"),
-        (_no_lease_ends, "still has"),
+        (_no_stop_holds, 4, "stop was confirmed"),
+        (_two_owners, 1, "and (worker|planner) held"),
+        (_no_lease_ends, 15, "still has"),
     ],
 )
-def test_the_judge_sees_what_is_wrong(mutate: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_judge_sees_what_is_wrong(mutate: Any, seed: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     mutate(monkeypatch)
-    for seed in range(1, _ENOUGH + 1):
-        found = "\n".join(tell(seed).violations)
-        if found:
-            assert re.search(says, found), found
-            return
-    pytest.fail(f"{_ENOUGH} stories, and none shows it")
+    assert re.search(says, "\n".join(tell(seed).violations))
