@@ -59,11 +59,11 @@ class MotorExchange(Exchange[_Axis]):
         self.problems: dict[_Axis, Exception] = {}
         """Why motors were not accepted at their last check."""
         self._looks: dict[_Axis, Generator[None, None, None]] = {}
-        self._began_ns = self._listening_ns = clock()
+        self._began_ns = self._listening_ns = self.clock()
         """The start of the last cycle, and the time since which cycles have been on time."""
         for axis in axes:
-            axis.forget(clock())
-            axis.probe_at_ns = clock()
+            axis.forget(self.clock())
+            axis.probe_at_ns = self.clock()
 
     # --- requests, which depend on the kind of motor
 

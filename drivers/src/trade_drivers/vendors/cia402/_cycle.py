@@ -45,7 +45,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._synced_ns = clock()
+        self._synced_ns = self.clock()
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         self.rival = False
         """True if the heartbeats of another driver were received."""

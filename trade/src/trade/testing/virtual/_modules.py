@@ -60,7 +60,7 @@ class Replacements:
         self._put(queue.SimpleQueue, queues.SimpleQueue)
         self._put(queue.Queue, queues.Queue)
         self._module(secrets, _ids(scheduler))
-        self._module(uuid, {"uuid4": lambda: uuid.UUID(int=scheduler.random.getrandbits(128), version=4)})
+        self._module(uuid, {"uuid4": lambda: uuid.UUID(int=scheduler.numbers.getrandbits(128), version=4)})
         self._module(random, _drawn(scheduler))
         files = Descriptors(scheduler)
         for module, names in _descriptors.stand_ins(files).items():
@@ -110,7 +110,7 @@ def replaced(scheduler: Scheduler, packages: Iterable[str]) -> contextlib.ExitSt
     for name, module in list(sys.modules.items()):
         if _is_of(name, roots):
             _replace_in(module, replacements, undo)
-    finder = _Finder(roots, lambda module: _replace_in(module, replacements, undo))
+    finder = _Finder(scheduler, roots, lambda module: _replace_in(module, replacements, undo))
     sys.meta_path.insert(0, finder)
     undo.callback(sys.meta_path.remove, finder)
     return undo
@@ -123,7 +123,8 @@ def _is_of(name: str, roots: set[str]) -> bool:
 class _Finder:
     """Replaces the names of modules that are imported while virtual time runs."""
 
-    def __init__(self, roots: set[str], loaded: Callable[[ModuleType], None]) -> None:
+    def __init__(self, scheduler: Scheduler, roots: set[str], loaded: Callable[[ModuleType], None]) -> None:
+        self._scheduler = scheduler
         self._roots = roots
         self._loaded = loaded
 
@@ -140,8 +141,12 @@ class _Finder:
         run = loader.exec_module
 
         def run_and_replace(module: ModuleType) -> None:
-            run(module)
-            self._loaded(module)
+            self._scheduler.importing += 1
+            try:
+                run(module)
+                self._loaded(module)
+            finally:
+                self._scheduler.importing -= 1
 
         loader.exec_module = run_and_replace
 
@@ -225,7 +230,7 @@ def _queues(threads: ModuleType, clocks: ModuleType) -> Any:
 
 
 def _ids(scheduler: Scheduler) -> dict[str, Any]:
-    drawn = scheduler.random
+    drawn = scheduler.numbers
     return {
         "token_hex": lambda nbytes=16: drawn.randbytes(nbytes or 16).hex(),
         "token_bytes": lambda nbytes=16: drawn.randbytes(nbytes or 16),
@@ -237,7 +242,7 @@ def _ids(scheduler: Scheduler) -> dict[str, Any]:
 
 def _drawn(scheduler: Scheduler) -> dict[str, Any]:
     names = ("random", "uniform", "randrange", "randint", "choice", "shuffle", "sample", "getrandbits", "randbytes")
-    return {name: getattr(scheduler.random, name) for name in names}
+    return {name: getattr(scheduler.numbers, name) for name in names}
 
 
 _REFUSED: Final = {

@@ -21,7 +21,7 @@ WaitList = deque["Task"]
 
 _BEGIN_NS: Final = 1_000_000_000_000
 _WALL_NS: Final = 1_700_000_000_000_000_000
-_READ_NS: Final = 200
+_READ_NS: Final = 1_000
 _READS_BEFORE_MORE: Final = 1_000
 _LONGEST_READ_NS: Final = 1_000_000
 _FRAMES: Final = 6
@@ -68,6 +68,7 @@ class Scheduler:
 
     def __init__(self, seed: int, switch: float, limit_s: float) -> None:
         self.random: Final = random.Random(seed)  # noqa: S311 - it draws orders, no secrets
+        self.numbers: Final = random.Random(~seed)  # noqa: S311 - what a program draws changes no order
         self.now_ns = _BEGIN_NS
         self.wall_step_ns = 0
         """How far the wall clock was set, in nanoseconds."""
@@ -76,6 +77,8 @@ class Scheduler:
         self.stall = 0.0
         """The probability that a thread stands still where another one may run."""
         self.longest_stall_s = 0.0
+        self.importing = 0
+        """How many imports are under way. They switch no threads, as only the first run of a process has them."""
         self._limit_ns = _BEGIN_NS + round(limit_s * 1e9)
         self._reads = 0
         self._ready: list[Task] = []
@@ -146,6 +149,8 @@ class Scheduler:
 
     def may_yield(self) -> None:
         """A place where another thread may run, with the probability of a switch or a stall."""
+        if self.importing:
+            return
         if self.stall and self.random.random() < self.stall:
             self.sleep(self.random.random() * self.longest_stall_s)
         if self._ready and self._switch and self.random.random() < self._switch:
