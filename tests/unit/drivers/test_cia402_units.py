@@ -1,5 +1,7 @@
 """S23 for CiA 402 drives: scale and units are what the drive says, or it is refused before anything is sent."""
 
+import re
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +23,7 @@ from tests.unit.drivers.legs import (
 )
 from trade.errors import ConfigurationError, DeviceFault, TradeError
 from trade_drivers.vendors.cia402._motor import Drive
-from trade_hil_sim import BrownOut, Entry
+from trade_hil_sim import BrownOut, Entry, Place
 from trade_hil_sim.cia402 import Object, factor_objects, unit_objects
 
 pytestmark = pytest.mark.virtual_time
@@ -298,3 +300,33 @@ def test_S23_units_that_a_loss_of_power_has_changed_are_used_from_then_on(rig: L
     motor.enable()
     assert [drive.store.get(name) for name in RAMPS] == [716, 4774, 4774, 4774]
     assert motor.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
+# --- range
+
+
+@pytest.mark.parametrize(("limit", "at"), [("position_limit_max", 42_373), ("position_limit_min", -42_373)])
+def test_S23_a_drive_beyond_its_own_range_is_not_enabled(rig: Leg, limit: str, at: int) -> None:
+    drive = plug(rig, position_limit_min=-33_247, position_limit_max=33_247)
+    only(1, CYCLIC_POSITION)(rig.sim)
+    rig.sim.do(Place(ids=(HIP,), counts=at))
+    robot = rig.attach()
+    motor, group = robot.motor("leg.hip"), robot.group("leg")
+    place, end = drive.joint_rad(time.monotonic()), at / abs(at) * 1.02
+    complaint = f"it is at {place:.4g} rad, beyond its own limit {end:.4g} rad (607Dh)"
+    mark = written_now()
+    for act in (
+        motor.enable,
+        lambda: motor.move_to(0.5),
+        lambda: motor.set_velocity(-0.1 if at > 0 else 0.1),
+        group.enable,
+    ):
+        with pytest.raises(DeviceFault, match=re.escape(complaint)):
+            act()
+    assert not commands(rig, mark)
+    assert not rig.truth(HIP).torque
+    assert rig.truth(HIP).position_counts == at
+    rig.sim.do(Place(ids=(HIP,), counts=33_250 * at // abs(at)))  # its own end, as nearly as it can hold
+    wait_until(lambda: abs(motor.state().position_rad) < 1.03, "it was turned by hand")
+    motor.enable()
+    assert motor.move_to(0.5) == pytest.approx(0.5, abs=0.01)

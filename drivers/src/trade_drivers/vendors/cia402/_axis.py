@@ -66,6 +66,8 @@ class DriveAxis(MotorAxis):
         """True after a heartbeat in state stopped by network management: it answers nothing until restarted."""
         self.recalled = False
         """True while a job waits until it is restarted and set up."""
+        self.own_range: tuple[int, int] | None = None
+        """The drive's own limits of positions (607Dh), in counts."""
         self.unfit = ""
         """Why it was not admitted again, though it answers."""
         self.operational = False
@@ -208,6 +210,17 @@ class DriveAxis(MotorAxis):
         if self.silent:  # even with a recent measurement, as it is not admitted again yet
             raise self.absence(now_ns)
         return super().fresh(now_ns, stale_after_ns)
+
+    def check_place(self, sample: Sample) -> None:
+        """Raises ``DeviceFault`` if it is beyond the drive's own range, to which some modes would drive it at once."""
+        place = sample.position
+        low, high = self.own_range or (place, place)
+        if not low - self.grain.arrived <= place <= high + self.grain.arrived:
+            end = self.scale.angle_rad(low if place < low else high)
+            raise self.faulty(
+                f"it is at {self.scale.angle_rad(place):.4g} rad, beyond its own limit {end:.4g} rad (607Dh): "
+                "turn it back by hand, or widen that limit"
+            )
 
     def absence(self, now_ns: int) -> DeviceError:
         """Returns the error for a drive that is left out."""
