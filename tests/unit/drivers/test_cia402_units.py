@@ -23,7 +23,7 @@ from tests.unit.drivers.legs import (
 )
 from trade.errors import ConfigurationError, DeviceFault, TradeError
 from trade_drivers.vendors.cia402._motor import Drive
-from trade_hil_sim import BrownOut, Entry, Place
+from trade_hil_sim import Absent, BrownOut, Entry, Place, Replug, Unplug
 from trade_hil_sim.cia402 import Object, factor_objects, unit_objects
 
 pytestmark = pytest.mark.virtual_time
@@ -272,21 +272,34 @@ def test_S23_another_scale_than_the_files_is_refused_with_both_numbers(
     ],
     ids=["scale", "unit"],
 )
-def test_S23_a_drive_that_says_something_else_after_a_loss_of_power_is_not_commanded(
-    rig: Leg, objects: list[Object], complaint: str
+@pytest.mark.parametrize(
+    ("loss", "end"),
+    [
+        (BrownOut(ids=(HIP,)), None),
+        (Absent(ids=(HIP,)), Absent(ids=(HIP,), on=False)),
+        (Unplug(), Replug()),
+    ],
+    ids=["power", "cable", "port"],
+)
+def test_S23_a_drive_that_says_something_else_after_a_loss_is_not_commanded(
+    rig: Leg, loss: Any, end: Any, objects: list[Object], complaint: str
 ) -> None:
     drive = plug(rig)
     motor = rig.attach().motor("leg.hip")
     motor.move_to(0.3)
     drive.says(*objects)
+    rig.sim.do(loss)
+    wait_until(lambda: outcome(motor.state), "it is noticed")
     mark = written_now()
-    rig.sim.do(BrownOut(ids=(HIP,)))
+    if end is not None:
+        rig.sim.do(end)
     wait_until(lambda: complaint in outcome(motor.state), "it is compared again")
     for act in (motor.enable, lambda: motor.move_to(0.1), lambda: motor.set_velocity(0.1)):
         with pytest.raises(DeviceFault, match=complaint):
             act()
-    assert not commands(rig, rig.wait_for("booted", HIP, mark).t)
-    assert not rig.truth(HIP).torque
+    assert not commands(rig, mark)
+    assert not rig.events("motion_started", HIP, mark)
+    assert not rig.events("torque_on", HIP, mark)
 
 
 def test_S23_units_that_a_loss_of_power_has_changed_are_used_from_then_on(rig: Leg) -> None:
