@@ -126,6 +126,7 @@ def test_S23_the_drives_greatest_speed_is_read_in_its_own_unit(rig: Leg, limit_r
         (unit_objects(acceleration=RPM_S), "it has a unit of its own in 60AAh, but no 60A9h"),
         (unit_objects(velocity=RPM, acceleration=RPM_S, access="wo"), "it refuses to be read: 60A9h"),
         (unit_objects(position=0x00B50000, access="wo"), "it refuses to be read: 60A8h"),
+        ([Object(0x60A9, 0, "short", "u16", "ro", 0x4700)], "refuses to be read: 60A9h: it came with 2 bytes, not 4"),
         (unit_objects(velocity=0x7FB44700, acceleration=RPM_S), "max_speed_rad_s: 2 is below"),
         (unit_objects(velocity=0x81B44700, acceleration=RPM_S), "does not fit into 32 bits of the drive's own unit"),
     ],
