@@ -67,6 +67,7 @@ class CanBench(Bench):
         *,
         firmware: str = "",
         serial_number: int | None = None,
+        counts_per_rev: float | None = None,
         torque: bool | None = None,
         problem: str = "",
     ) -> Found:
@@ -79,6 +80,7 @@ class CanBench(Bench):
             model=model,
             firmware=firmware,
             serial_number=serial_number,
+            counts_per_rev=counts_per_rev,
             torque=torque,
             problem=problem,
         )

@@ -34,6 +34,8 @@ class Found(Struct, frozen=True, kw_only=True):
     firmware: str = ""
     serial_number: int | None = None
     """None if the device reports none."""
+    counts_per_rev: float | None = None
+    """Counts of a position for one turn of the motor; None if the device does not report them."""
     torque: bool | None = None
     """None if the device has no torque, or cannot report it."""
     problem: str = ""

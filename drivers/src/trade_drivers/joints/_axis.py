@@ -95,13 +95,7 @@ class Axis(BusDevice[Sample]):
         super().__init__(name, bus, Resource(name, coupled=coupled))
         self.joint = joint
         self.id = joint.id
-        self.grain = grain
-        self.scale = Scale(joint, grain)
-        ends = sorted((self.scale.counts(joint.min_rad), self.scale.counts(joint.max_rad)))
-        self.low, self.high = floor(ends[0]), ceil(ends[1])
-        self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
-        self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
-
+        self.use(grain)
         self.remedy = ""
         """The remedy for a fault that the device itself has latched."""
         self.ready = False
@@ -109,6 +103,16 @@ class Axis(BusDevice[Sample]):
         self.motion: Motion[Any] | None = None
         self.held_counts: int | None = None
         """The position of the last hold command."""
+
+    def use(self, grain: Grain) -> None:
+        """Uses a resolution: limits and ranges are in its counts."""
+        joint = self.joint
+        self.grain = grain
+        self.scale = Scale(joint, grain)
+        ends = sorted((self.scale.counts(joint.min_rad), self.scale.counts(joint.max_rad)))
+        self.low, self.high = floor(ends[0]), ceil(ends[1])
+        self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
+        self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 
     def note(self, sample: Sample) -> None:
         """Stores a cyclic measurement."""

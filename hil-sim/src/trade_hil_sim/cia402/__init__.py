@@ -8,6 +8,7 @@ from ._node import NodeState
 from ._objects import OBJECTS, Object, pdo_objects
 from ._sdo import SdoServer
 from ._store import Abort, AbortCode, Store
+from ._units import factor_objects, unit_objects
 
 __all__ = [
     "OBJECTS",
@@ -23,6 +24,8 @@ __all__ = [
     "State",
     "Store",
     "command",
+    "factor_objects",
     "next_state",
     "pdo_objects",
+    "unit_objects",
 ]

@@ -82,13 +82,17 @@ class Drive(JointDevice):
             offset_rad=offset_rad,
         )
         self.due = t
-        self.store = Store([*_named(model), *pdo_objects(device_id)])
+        self.store = Store([*_named(model), *pdo_objects(device_id)], counts_per_rev)
         self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
         self._machine = Machine(self.store, self._shaft, self.modes, self.note)
         self._mode_due = self._look_due = inf
         self._behind_since: float | None = None
         self.node = Node(device_id, self.store, self, t)
         self._plan(t)
+
+    def says(self, *objects: Object) -> None:
+        """Have these objects, too, from now on: of its units (`unit_objects`), or its scale (`factor_objects`)."""
+        self.store.add(objects)
 
     @property
     def state_now(self) -> State:
@@ -137,9 +141,9 @@ class Drive(JointDevice):
         position, speed = self._shaft.actual.at(t)[:2] if self._frozen is None else self._frozen
         torque = self._torque(acceleration)
         self.store.set("position_actual", round(position - self.modes.zero))
-        self.store.set("velocity_actual", round(speed))
+        self.store.set("velocity_actual", round(speed / self.store.unit("velocity_actual")))
         self.store.set("position_demand", round(wanted - self.modes.zero))
-        self.store.set("velocity_demand", round(wanted_speed))
+        self.store.set("velocity_demand", round(wanted_speed / self.store.unit("velocity_demand")))
         self.store.set("following_error", round(wanted - position))
         self.store.set("torque_actual", torque)
         self.store.set("current_actual", torque)
@@ -153,7 +157,7 @@ class Drive(JointDevice):
             return max(-most, min(most, self.store.get("target_torque")))
         if self._shaft.jammed and self._shaft.parted:
             return most
-        return round(acceleration / self.store.get("max_acceleration") * FULL)
+        return round(acceleration / self.store.rate("max_acceleration") * FULL)
 
     def check(self, entry: Object, value: int) -> None:
         """Refuse unsupported modes and methods; raises `Abort`."""
@@ -271,7 +275,7 @@ class Drive(JointDevice):
         elif abs(self._shaft.behind(t)) > self.store.get("following_error_window"):
             self._machine.fail(FOLLOWING_ERROR, t, self.node)
         else:
-            self._shaft.go(t, demand, self.store.get("max_profile_velocity"), self.store.get("max_acceleration"))
+            self._shaft.go(t, demand, self.store.rate("max_profile_velocity"), self.store.rate("max_acceleration"))
 
     def wrong_model(self, number: int) -> None:
         """Identify as another product."""

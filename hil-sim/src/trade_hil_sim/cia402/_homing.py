@@ -49,8 +49,8 @@ class Homing:
             self.bits = FAILED | REACHED
             return
         self.running, self.bits = True, 0
-        speed = self._store.get("homing_switch_speed" if method in SWITCHES else "homing_zero_speed")
-        self._shaft.go(t, self._place(method, t), speed, self._store.get("homing_acceleration"))
+        speed = self._store.rate("homing_switch_speed" if method in SWITCHES else "homing_zero_speed")
+        self._shaft.go(t, self._place(method, t), speed, self._store.rate("homing_acceleration"))
 
     def _place(self, method: int, t: float) -> float:
         here, step = self._shaft.position(t), self._counts_per_rev
@@ -66,7 +66,7 @@ class Homing:
         """Stop the search."""
         if self.running:
             self.forget()
-            self._shaft.spin(t, 0.0, self._store.get("homing_acceleration"))
+            self._shaft.spin(t, 0.0, self._store.rate("homing_acceleration"))
 
     @property
     def due(self) -> float:

@@ -176,7 +176,7 @@ class Machine:
         option = "shutdown_option" if wanted is Command.SHUTDOWN else "disable_operation_option"
         if self._store.get(option) and self._shaft.moving(t):
             self._then = state
-            self._modes.stop(t, self._store.get("profile_deceleration"))
+            self._modes.stop(t, self._store.rate("profile_deceleration"))
         else:
             self.enter(state, t)
 
@@ -187,7 +187,7 @@ class Machine:
             return
         self.enter(State.QUICK_STOP_ACTIVE, t)
         slow = option in {1, STAYING}
-        self._modes.stop(t, self._store.get("profile_deceleration" if slow else "quick_stop_deceleration"))
+        self._modes.stop(t, self._store.rate("profile_deceleration" if slow else "quick_stop_deceleration"))
         if option < STAYING:
             self._then = State.SWITCH_ON_DISABLED
 
@@ -220,7 +220,7 @@ class Machine:
         if self.state in POWERED and option:
             self.enter(State.FAULT_REACTION_ACTIVE, t)
             slow = option == 1
-            self._modes.stop(t, self._store.get("profile_deceleration" if slow else "quick_stop_deceleration"))
+            self._modes.stop(t, self._store.rate("profile_deceleration" if slow else "quick_stop_deceleration"))
             self._then = State.FAULT
         else:
             self.enter(State.FAULT, t)

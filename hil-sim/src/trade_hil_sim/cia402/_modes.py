@@ -86,7 +86,7 @@ class Modes:
         self.mode = mode
         self._forget()
         if self.enabled:
-            self.stop(t, self._store.get("profile_deceleration"))
+            self.stop(t, self._store.rate("profile_deceleration"))
             self._follow(t)
 
     def enable(self, t: float) -> None:
@@ -94,7 +94,7 @@ class Modes:
         self.enabled = True
         self._forget()
         self._shaft.forget(t)
-        self.stop(t, self._store.get("profile_deceleration"))
+        self.stop(t, self._store.rate("profile_deceleration"))
         self._follow(t)
 
     def disable(self) -> None:
@@ -142,7 +142,7 @@ class Modes:
     def advance(self, t: float) -> None:
         """Run what is due."""
         if self._shaft.settles_at is not None and t >= self._shaft.settles_at:
-            self._shaft.settle(t, self._top_speed(), self._store.get("max_acceleration"))
+            self._shaft.settle(t, self._top_speed(), self._store.rate("max_acceleration"))
         if self._next is not None and t >= self._shaft.demand.ends:
             self._begin(self._next, t)
             self._next = None
@@ -193,7 +193,7 @@ class Modes:
         self._halted = halt
         if halt:
             slow = self._store.get("halt_option") == 1
-            rate = self._store.get("profile_deceleration" if slow else "quick_stop_deceleration")
+            rate = self._store.rate("profile_deceleration" if slow else "quick_stop_deceleration")
             self._shaft.spin(t, 0.0, rate)
             self.homing.interrupt(t)
         elif self.mode is Mode.PROFILE_POSITION and self._goal is not None:
@@ -222,8 +222,8 @@ class Modes:
 
     def _begin(self, goal: float, t: float) -> None:
         self._goal = goal
-        speed = min(self._store.get("profile_velocity"), self._top_speed())
-        self._shaft.go(t, goal, speed, self._store.get("profile_acceleration"))
+        speed = min(self._store.rate("profile_velocity"), self._top_speed())
+        self._shaft.go(t, goal, speed, self._store.rate("profile_acceleration"))
 
     def _heed_homing(self, before: int, now: int, t: float) -> None:
         if now & NEW_SET_POINT and not before & NEW_SET_POINT and not self._halted:
@@ -235,19 +235,19 @@ class Modes:
         """Move to the set-point, in modes whose set-point stays in effect."""
         match self.mode:
             case Mode.PROFILE_VELOCITY:
-                self._spin(self._store.get("target_velocity"), self._store.get("profile_acceleration"), t)
+                self._spin(self._store.rate("target_velocity"), self._store.rate("profile_acceleration"), t)
             case Mode.CYCLIC_VELOCITY:
-                wanted = self._store.get("target_velocity") + self._store.get("velocity_offset")
-                self._spin(wanted, self._store.get("max_acceleration"), t)
+                wanted = self._store.rate("target_velocity") + self._store.rate("velocity_offset")
+                self._spin(wanted, self._store.rate("max_acceleration"), t)
             case Mode.PROFILE_TORQUE:
-                self._push(self._store.get("target_torque"), self._store.get("profile_acceleration"), t)
+                self._push(self._store.get("target_torque"), self._store.rate("profile_acceleration"), t)
             case Mode.CYCLIC_TORQUE:
                 wanted = self._store.get("target_torque") + self._store.get("torque_offset")
-                self._push(wanted, self._store.get("max_acceleration"), t)
+                self._push(wanted, self._store.rate("max_acceleration"), t)
             case Mode.CYCLIC_POSITION:
                 goal = self._within(self._store.get("target_position") + self._store.get("position_offset"))
                 if goal != self._shaft.demand.goal or self._shaft.parted:
-                    acceleration = self._store.get("max_acceleration")
+                    acceleration = self._store.rate("max_acceleration")
                     self._shaft.track(t, goal, self._period_s(), self._top_speed(), acceleration)
             case _:
                 pass
@@ -287,7 +287,7 @@ class Modes:
         )
 
     def _top_speed(self) -> float:
-        return float(max(1, self._store.get("max_profile_velocity")))
+        return float(max(1, self._store.rate("max_profile_velocity")))
 
     def _period_s(self) -> float:
         return self._store.get("interpolation_period") * 10.0 ** self._store.get("interpolation_exponent")

@@ -56,6 +56,10 @@ class Node:
         self._missed = set[int]()
         self.reset(t)
 
+    def map_only_pre_operational(self) -> None:
+        """Refuse changes of PDOs while operational, as many drives do."""
+        self._pdos.strict = True
+
     # time
 
     @property

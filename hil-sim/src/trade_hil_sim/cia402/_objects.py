@@ -1,6 +1,7 @@
 """The object dictionary of a servo drive, by hand: CiA 301 (communication), CiA 402-2 (drive profile).
 
-Positions are in counts, speeds in counts/s, accelerations in counts/s^2; torque and current in thousandths of rated.
+Positions are in counts; speeds in counts/s and accelerations in counts/s^2, unless the drive has objects that say
+otherwise (`unit_objects`). Torque and current are in thousandths of rated.
 """
 
 from collections.abc import Iterable
@@ -29,7 +30,7 @@ class Object:
     kind: str
     """``u8`` to ``i32``, or ``text``."""
     access: str
-    """``ro`` or ``rw``."""
+    """``ro``, ``rw`` or ``wo``."""
     default: int | bytes = 0
     mapped: str = ""
     """Which PDOs may carry it: ``r``, ``t`` or both."""
@@ -37,6 +38,8 @@ class Object:
     high: int | None = None
     measured: bool = False
     """Whether it changes continuously, so that a change of it is no event."""
+    optional: bool = False
+    """Whether a drive lacks it unless it is added."""
 
     @property
     def size(self) -> int:
@@ -142,6 +145,19 @@ DRIVE: Final = (
     Object(0x6502, 0, "supported_modes", "u32", "ro", MODE_BITS),
 )
 
+OPTIONAL: Final = (
+    *(
+        Object(index, sub, f"{name}_{sub or 'count'}", "u32" if sub else "u8", "ro", 1 if sub else 2, optional=True)
+        for index, name in ((0x608F, "encoder"), (0x6091, "gear_ratio"), (0x6092, "feed"))
+        for sub in range(3)
+    ),
+    *(
+        Object(index, 0, f"si_{name}", "u32", "ro", optional=True)
+        for index, name in ((0x60A8, "position"), (0x60A9, "velocity"), (0x60AA, "acceleration"))
+    ),
+)
+"""Scale and units: the factor group, and what positions, speeds and accelerations count in."""
+
 DUMMIES: Final = tuple(
     Object(index, 0, f"dummy_{kind}", kind, "rw", mapped="r")
     for index, kind in ((2, "i8"), (3, "i16"), (4, "i32"), (5, "u8"), (6, "u16"), (7, "u32"))
@@ -176,4 +192,4 @@ def _pdo(index: int, name: str, cob_id: int, carries: tuple[int, ...]) -> list[O
     ]
 
 
-OBJECTS: Final = (*COMMUNICATION, *DRIVE)
+OBJECTS: Final = (*COMMUNICATION, *DRIVE, *OPTIONAL)

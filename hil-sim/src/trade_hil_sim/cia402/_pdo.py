@@ -117,6 +117,8 @@ class Pdos:
     def __init__(self, store: Store, application: Application, complain: Callable[[int, float], None]) -> None:
         self._store, self._app, self._complain = store, application, complain
         self.running = False
+        self.strict = False
+        """Whether its objects can be changed only while the node is pre-operational, as CiA 301 permits."""
         self._load()
 
     def _load(self) -> None:
@@ -189,6 +191,8 @@ class Pdos:
 
     def check(self, entry: Object, value: int) -> None:
         """Refuse invalid writes to a PDO's objects; raises `Abort`."""
+        if self.strict and self.running:
+            raise Abort(AbortCode.DEVICE_STATE)
         index, kind, number = entry.index, "r" if entry.index < FIRST_SENT else "t", entry.index & NUMBER
         name = f"{kind}pdo{number + 1}"
         valid = not self._store.get(f"{name}_cob_id") & INVALID

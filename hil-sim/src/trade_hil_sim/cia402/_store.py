@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 
 from ._objects import Object
+from ._units import unit_in_counts
 
 __all__ = ["Abort", "AbortCode", "Store"]
 
@@ -40,14 +41,22 @@ class Store:
 
     Args:
         objects: of the dictionary.
+        counts_per_rev: counts of a position for one turn of the motor.
     """
 
-    def __init__(self, objects: Iterable[Object]) -> None:
-        self._objects = {(entry.index, entry.sub): entry for entry in objects}
+    def __init__(self, objects: Iterable[Object], counts_per_rev: float = 4096.0) -> None:
+        self._objects = dict[tuple[int, int], Object]()
+        self._counts_per_rev = counts_per_rev
+        self._values: dict[str, int] = {}
+        self.add(objects)
+
+    def add(self, objects: Iterable[Object]) -> None:
+        """Have these objects, too, with their defaults as values; without the optional ones."""
+        new = {(entry.index, entry.sub): entry for entry in objects if not entry.optional}
+        self._objects |= new
         self._indexes = {index for index, _ in self._objects}
         self._ranges = {entry.name: _range(entry) for entry in self._objects.values()}
-        self._values: dict[str, int] = {}
-        self.reset()
+        self._values |= _defaults(new.values())
 
     @property
     def numbers(self) -> list[Object]:
@@ -56,7 +65,7 @@ class Store:
 
     def reset(self) -> None:
         """Reset all values to their defaults."""
-        self._values = {o.name: o.default for o in self._objects.values() if isinstance(o.default, int)}
+        self._values = _defaults(self._objects.values())
 
     def find(self, index: int, sub: int) -> Object:
         """The object at an address; raises `Abort`."""
@@ -70,13 +79,24 @@ class Store:
         """The value of a number."""
         return self._values[name]
 
+    def rate(self, name: str) -> float:
+        """A speed in counts/s, or an acceleration in counts/s^2."""
+        return self._values[name] * self.unit(name)
+
+    def unit(self, name: str) -> float:
+        """What one of a speed or an acceleration is, in counts/s or counts/s^2; 1 without objects 60A9h and 60AAh."""
+        unit = self._values.get("si_acceleration" if "celeration" in name else "si_velocity")
+        return 1.0 if unit is None else unit_in_counts(unit, self._counts_per_rev)
+
     def set(self, name: str, value: int) -> None:
         """Change the value of a number, whatever its access; a value out of range becomes the nearest in range."""
         low, high = self._ranges[name]
         self._values[name] = value if low <= value <= high else min(high, max(low, value))
 
     def read(self, entry: Object) -> bytes:
-        """The bytes of an object."""
+        """The bytes of an object; raises `Abort` if it cannot be read."""
+        if entry.access == "wo":
+            raise Abort(AbortCode.WRITE_ONLY)
         return entry.default if isinstance(entry.default, bytes) else entry.encode(self._values[entry.name])
 
     def check(self, entry: Object, data: bytes) -> int:
@@ -89,6 +109,10 @@ class Store:
         if (entry.low is not None and value < entry.low) or (entry.high is not None and value > entry.high):
             raise Abort(AbortCode.VALUE)
         return value
+
+
+def _defaults(objects: Iterable[Object]) -> dict[str, int]:
+    return {entry.name: entry.default for entry in objects if isinstance(entry.default, int)}
 
 
 def _range(entry: Object) -> tuple[int, int]:

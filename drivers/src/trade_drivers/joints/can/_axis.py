@@ -7,9 +7,10 @@ from typing import Final
 from trade_drivers.joints import Axis, Grain, Sample, Unfit
 from trade_drivers.robotfile import Joint
 
-__all__ = ["Another", "MotorAxis", "grain_of"]
+__all__ = ["STILL_RAD_S", "Another", "MotorAxis", "grain_of"]
 
-_STILL_RAD_S: Final = 0.01
+STILL_RAD_S: Final = 0.01
+"""The maximum speed at rest."""
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 
@@ -22,8 +23,8 @@ def grain_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Grain:
         rad_s=rad,
         rad_s2=rad,
         centre=0,
-        still_velocity=max(1, round(_STILL_RAD_S / rad)),
-        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
+        still_velocity=max(1, round(STILL_RAD_S / rad)),
+        still_counts=max(1, round(STILL_RAD_S / rate_hz / rad)),
         arrived=max(2, round(_ARRIVED_RAD / rad)),
         near=max(4, round(_NEAR_RAD / rad)),
     )

@@ -75,9 +75,10 @@ class Admission:
             self.axis.be_awaited(self._exchange.clock())
             self._exchange.beat_next()
         except NoAnswer as silent:
+            self.axis.unfit = ""
             self._try_later(silent)
         except (Unfit, Refused) as unfit:
-            self.axis.fault = str(unfit)  # replaces an earlier fault, as this must be fixed first
+            self.axis.fault = self.axis.unfit = str(unfit)  # replaces an earlier fault, as this must be fixed first
             self._try_later(unfit)
 
     def _await(self) -> None:

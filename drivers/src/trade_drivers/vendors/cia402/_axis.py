@@ -66,6 +66,12 @@ class DriveAxis(MotorAxis):
         """True after a heartbeat in state stopped by network management: it answers nothing until restarted."""
         self.recalled = False
         """True while a job waits until it is restarted and set up."""
+        self.own_range: tuple[int, int] | None = None
+        """The drive's own limits of positions (607Dh), in counts."""
+        self.unfit = ""
+        """Why it was not admitted again, though it answers."""
+        self.operational = False
+        """Whether it is operational, as far as its heartbeats and the commands to it say."""
         self.to_start = False
         """True if its heartbeat contradicts the start command: the frame was lost, or it fell back."""
 
@@ -106,7 +112,7 @@ class DriveAxis(MotorAxis):
     def take_heartbeat(self, data: bytes, now_ns: int) -> None:
         """Handles a heartbeat or a boot-up message; after a boot, earlier commands are lost."""
         state = data[0] & 0x7F if data else table.BOOT_UP
-        self.stopped = state == table.STOPPED
+        self.stopped, self.operational = state == table.STOPPED, state == table.OPERATIONAL
         if state == table.BOOT_UP:
             self._lose("it has restarted; is its supply sound?", now_ns)
         elif state == table.OPERATIONAL:
@@ -133,7 +139,7 @@ class DriveAxis(MotorAxis):
         """Starts the wait for its frames after set-up."""
         if self.ready:
             self.latch("it was away")
-        self.stage, self.set_up_ns = Stage.SET_UP, now_ns
+        self.stage, self.set_up_ns, self.unfit = Stage.SET_UP, now_ns, ""
         self.entered, self.stream = 0, None
 
     def welcome(self, now_ns: int) -> None:
@@ -205,9 +211,21 @@ class DriveAxis(MotorAxis):
             raise self.absence(now_ns)
         return super().fresh(now_ns, stale_after_ns)
 
+    def check_place(self, sample: Sample) -> None:
+        """Raises ``DeviceFault`` if it is beyond the drive's own range, to which some modes would drive it at once."""
+        place = sample.position
+        low, high = self.own_range or (place, place)
+        if not low - self.grain.arrived <= place <= high + self.grain.arrived:
+            end = self.scale.angle_rad(low if place < low else high)
+            raise self.faulty(
+                f"it is at {self.scale.angle_rad(place):.4g} rad, beyond its own limit {end:.4g} rad (607Dh): "
+                "turn it back by hand, or widen that limit"
+            )
+
     def absence(self, now_ns: int) -> DeviceError:
         """Returns the error for a drive that is left out."""
-        return self.faulty(_STOPPED) if self.stopped else self.deaf(now_ns)
+        why = _STOPPED if self.stopped else self.unfit
+        return self.faulty(why) if why else self.deaf(now_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample = self.fresh(now_ns, stale_after_ns)

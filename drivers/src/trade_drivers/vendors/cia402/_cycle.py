@@ -151,13 +151,21 @@ class DriveExchange(MotorExchange[DriveAxis]):
         match mode:
             case table.CYCLIC_POSITION:
                 speed, accel = (
-                    axis.joint.max_speed_rad_s / axis.grain.rad_s,
-                    axis.joint.max_accel_rad_s2 / axis.grain.rad_s2,
+                    axis.joint.max_speed_rad_s / axis.grain.rad,
+                    axis.joint.max_accel_rad_s2 / axis.grain.rad,
                 )
                 return Following(axis.id, position, speed=speed, accel=accel, period_s=period_s)
             case table.CYCLIC_VELOCITY | table.PROFILE_VELOCITY_MODE:
                 blind_s = self._bus.watchdog_s + 2 * period_s
-                return Turning(axis.id, accel=axis.accel_counts, period_s=period_s, blind_s=blind_s)
+                grain = axis.grain
+                return Turning(
+                    axis.id,
+                    accel=axis.accel_counts,
+                    period_s=period_s,
+                    blind_s=blind_s,
+                    speed_unit=grain.rad_s / grain.rad,
+                    accel_unit=grain.rad_s2 / grain.rad,
+                )
             case _:
                 return None
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import frame_bits
 from trade_drivers.joints import Steps, Unfit, check_joints, check_least, check_rate
-from trade_drivers.joints.can import Another
+from trade_drivers.joints.can import STILL_RAD_S, Another
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
@@ -14,6 +14,7 @@ from trade_drivers.vendors.cia402._machine import State, state_of
 from trade_drivers.vendors.cia402._net import Answer, Net, Refused
 from trade_drivers.vendors.cia402._stream import interpolation_period
 from trade_drivers.vendors.cia402._table import Entry, Pdo
+from trade_drivers.vendors.cia402._units import check_units, read_optional
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
@@ -67,19 +68,20 @@ def motion_every(bus: "CanBus") -> int:
 def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     """Checks a drive's identity, arms its watchdog and maps its frames; stops a motion that no client owns.
 
-    Makes about sixty requests, one at a time; yields while it waits for answers.
+    Makes about seventy requests, one at a time; yields while it waits for answers.
 
     Raises:
         Unfit: the drive cannot be used.
         NoAnswer: the drive does not answer.
     """
     yield from _check_identity(net, axis)
+    yield from check_units(net, axis)
     yield from _check_abilities(net, axis)
     yield from _halt_if_moving(net, axis)
     try:
         yield from _arm(net, axis, bus)
-        for pdo, kind in ((table.STATUS, 1), (table.MOTION, motion_every(bus))):
-            yield from _map(net, axis.id, pdo, kind, table.NO_REMOTE)
+        yield from _map_first(net, axis)
+        yield from _map(net, axis.id, table.MOTION, motion_every(bus), table.NO_REMOTE)
         for pdo in (table.COMMAND, table.PROFILE):
             yield from _map(net, axis.id, pdo, table.AT_ONCE, 0)
         yield from _map_streams(net, axis, bus)
@@ -88,6 +90,7 @@ def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     for record in table.UNUSED:
         yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
     net.command(axis.id, table.NMT_START)
+    axis.operational = True
 
 
 def _check_identity(net: Net, axis: DriveAxis) -> Steps:
@@ -136,6 +139,7 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
         raise Unfit("it has no profile position mode (6502h)")
     low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
     high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
+    axis.own_range = (low, high) if low < high else None
     if low < high and (axis.low < low or axis.high > high):
         ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         joint = axis.joint
@@ -153,7 +157,9 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
 def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     """Stops a motion that no client owns; leaves torque as it is."""
     state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
-    if state is not State.ENABLED or abs((yield from net.read(axis.id, table.VELOCITY))) <= axis.grain.still_velocity:
+    if state is not State.ENABLED:
+        return
+    if abs((yield from net.read(axis.id, table.VELOCITY))) * axis.grain.rad_s <= STILL_RAD_S:
         return
     if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
         yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)
@@ -172,6 +178,22 @@ def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     for entry, value in ((table.QUICK_STOP_OPTION, _BRAKE_AND_STAY), (table.HALT_OPTION, _BRAKE)):
         yield from _try_write(net, axis.id, entry, value)
     yield from _try_write(net, axis.id, table.QUICK_STOP_DECELERATION, axis.accel_counts)
+
+
+def _map_first(net: Net, axis: DriveAxis) -> Steps:
+    """Maps the first PDO; an operational drive becomes pre-operational, as many refuse or ignore a new mapping before.
+
+    Torque stays as it is. A drive whose state is unknown is asked first, as attaching commands nothing needlessly.
+    """
+    if axis.operational:
+        net.command(axis.id, table.NMT_PREOPERATIONAL)
+    try:
+        yield from _map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
+    except Refused as refused:
+        if refused.code != table.NOT_IN_THIS_STATE:
+            raise
+        net.command(axis.id, table.NMT_PREOPERATIONAL)
+        yield from _map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
 
 
 def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
@@ -221,12 +243,8 @@ def _disabled(record: int, node: int) -> int:
 
 def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
     """Reads an optional object."""
-    try:
-        return (yield from net.read(node, entry))
-    except Refused as refused:
-        if refused.code in table.NO_SUCH_OBJECT:
-            return default
-        raise Unfit(f"it refuses to be read: {refused}") from None
+    value = yield from read_optional(net, node, entry)
+    return default if value is None else value
 
 
 def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:

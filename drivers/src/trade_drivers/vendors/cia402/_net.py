@@ -82,7 +82,7 @@ class Net:
         """
         data = yield from self._ask(node, entry, lambda: sdo.upload(entry.index, entry.sub))
         if len(data) < entry.size:
-            raise NoAnswer(f"{entry} came with {len(data)} bytes")
+            raise Refused(entry, 0, f"it came with {len(data)} bytes, not {entry.size}")
         return entry.decode(data)
 
     def read_text(self, node: int, index: int) -> Answer[str]:

@@ -7,9 +7,11 @@ from typing import Final
 from trade_drivers.bus.can import CanPort, Listeners
 from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.joints import Unfit
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._machine import state_of
 from trade_drivers.vendors.cia402._net import Answer, Net, NoAnswer, Refused
+from trade_drivers.vendors.cia402._units import read_scale
 
 __all__ = ["DriveBench"]
 
@@ -72,14 +74,18 @@ class DriveBench(CanBench):
             statusword = yield from self._net.read(node, table.STATUSWORD)
             model = yield from self._text(node, table.DEVICE_NAME)
             firmware = yield from self._text(node, table.SOFTWARE_VERSION)
+            scale = yield from read_scale(self._net, node)
         except (NoAnswer, Refused) as bad:
             return self.found(node, problem=f"it does not tell who it is: {bad}")
+        except Unfit as unfit:
+            return self.found(node, problem=str(unfit))
         state = state_of(statusword)
         return self.found(
             node,
             model,
             firmware=firmware,
             serial_number=serial_number or None,
+            counts_per_rev=scale.counts_per_rev,
             torque=state is not None and state.torque,
         )
 

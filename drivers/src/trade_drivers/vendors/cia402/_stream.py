@@ -33,16 +33,28 @@ class Turning:
     The velocity is 0 until the end and the speed are set. It slows down early enough for the drive to stop within the
     range even if the driver's frames stop, which the drive notices after ``blind_s``. Without a new measurement, it
     assumes that the joint follows the commanded velocity.
+
+    The drive's own units of speed and acceleration are so many counts/s and counts/s^2 of its positions.
     """
 
-    def __init__(self, node: int, *, accel: int, period_s: float, blind_s: float) -> None:
+    def __init__(
+        self,
+        node: int,
+        *,
+        accel: int,
+        period_s: float,
+        blind_s: float,
+        speed_unit: float = 1.0,
+        accel_unit: float = 1.0,
+    ) -> None:
         self.can_id = table.TURNING.base + node
         self.end: int | None = None
         """The end of its motion, in counts."""
         self.fastest = 0.0
-        """Speed in counts/s, without a sign."""
+        """Speed in the drive's own unit, without a sign."""
         self._speed = 0.0
-        self._accel, self._period_s, self._blind_s = accel, period_s, blind_s
+        self._ramp, self._accel, self._speed_unit = accel, accel * accel_unit, speed_unit
+        self._period_s, self._blind_s = period_s, blind_s
         self._measured_ns = self._sent_ns = 0
         self._travelled = 0.0
         """Expected motion since the last measurement, in counts."""
@@ -56,11 +68,14 @@ class Turning:
         self._measured_ns, self._sent_ns = sample.at_ns, now_ns
         wanted = 0.0 if self.end is None else self._allowed(self.end - sample.position - self._travelled)
         self._speed = towards(self._speed, wanted, self._accel * self._period_s)
-        return table.TURNING.layout.pack(self._accel, round(self._speed))
+        speed = int(round(self._speed / self._speed_unit, 6))  # never faster than allowed
+        return table.TURNING.layout.pack(self._ramp, speed)
 
     def _allowed(self, left: float) -> float:
         blind = self._accel * self._blind_s
-        return copysign(min(self.fastest, sqrt(blind * blind + 2 * self._accel * abs(left)) - blind), left)
+        return copysign(
+            min(self.fastest * self._speed_unit, sqrt(blind * blind + 2 * self._accel * abs(left)) - blind), left
+        )
 
 
 def interpolation_period(rate_hz: float) -> tuple[int, int]:

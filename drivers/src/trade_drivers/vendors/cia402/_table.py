@@ -63,6 +63,13 @@ POSITION: Final = Entry(0x6064, "i4")
 VELOCITY: Final = Entry(0x606C, "i4")
 TORQUE: Final = Entry(0x6077, "i2")
 TARGET_POSITION: Final = Entry(0x607A, "i4")
+ENCODER: Final = (Entry(0x608F, "u4", 1), Entry(0x608F, "u4", 2))
+"""Increments of the encoder, for so many turns of the motor."""
+GEAR_RATIO: Final = (Entry(0x6091, "u4", 1), Entry(0x6091, "u4", 2))
+"""Turns of the motor, for so many of the shaft."""
+FEED: Final = (Entry(0x6092, "u4", 1), Entry(0x6092, "u4", 2))
+"""Counts of a position, for so many turns of the shaft."""
+POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = (Entry(index, "u4") for index in (0x60A8, 0x60A9, 0x60AA))
 POSITION_LIMITS: Final = (Entry(0x607D, "i4", 1), Entry(0x607D, "i4", 2))
 MAX_PROFILE_VELOCITY: Final = Entry(0x607F, "u4")
 PROFILE_VELOCITY: Final = Entry(0x6081, "u4")
@@ -101,6 +108,7 @@ BOOT_UP, STOPPED, OPERATIONAL, PREOPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 NMT_STATES: Final = {BOOT_UP: "booting", STOPPED: "stopped", OPERATIONAL: "operational", PREOPERATIONAL: "pre-op"}
 
 NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
+NOT_IN_THIS_STATE: Final = 0x08000022
 
 
 def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:

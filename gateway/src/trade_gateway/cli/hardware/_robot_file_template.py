@@ -77,7 +77,7 @@ def _joint(one: Found) -> list[str]:
         keys.append(f"serial_number = {one.serial_number}    # any other is refused as another device")
     if one.wire == "can":
         if one.driver == "cia402":
-            keys.append("counts_per_rev = 4096   # encoder counts per motor turn: see the data sheet")
+            keys.append(_counts_per_rev(one.counts_per_rev))
         keys.append("gear = 1.0              # motor turns per joint turn")
         measures = "to be measured"
     else:
@@ -90,6 +90,12 @@ def _joint(one: Found) -> list[str]:
         "max_speed_rad_s = 1.0",
         "max_accel_rad_s2 = 10.0",
     ]
+
+
+def _counts_per_rev(said: float | None) -> str:
+    if said is None:
+        return "counts_per_rev = 4096   # encoder counts per motor turn: see the data sheet"
+    return f"counts_per_rev = {said:.12g}   # per motor turn, as the drive says"
 
 
 def _gripper(one: Found) -> list[str]:
