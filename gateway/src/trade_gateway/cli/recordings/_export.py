@@ -44,7 +44,7 @@ def export(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty folder for the dataset or the bag.")],
     form: Annotated[Form, typer.Option("--as", help="lerobot: a dataset; ros2: a bag in MCAP.")] = Form.LEROBOT,
     group: Annotated[
-        list[str] | None, typer.Option(help="Export only these joints or this arm. Repeatable. Default: all.")
+        list[str] | None, typer.Option(help="Export only these joints, arm or gripper. Repeatable. Default: all.")
     ] = None,
     fps: Annotated[
         int, typer.Option(rich_help_panel=_DATASET, min=1, max=1000, metavar="HZ", help="Frame rate, in Hz.")
@@ -69,7 +69,7 @@ def export(
     """Export a recording as a LeRobot dataset (v3.0), or as a bag of ROS 2.
 
     The dataset has the joints as Parquet tables, without pictures.
-    observation.state is the measured position in rad; action is the position measured one frame later.
+    observation.state is the measured angle in rad, or the width of a gripper in m; action is that of the next frame.
     The bag has /joint_states and the pictures of all cameras. It has neither calls nor locks nor faults.
 
     For example: trade export walk.mcap walk/ --group rosie.legs --episodes locks --fps 30

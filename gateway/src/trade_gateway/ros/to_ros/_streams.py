@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from trade import Constraint, Container, Handle, Sample, Stream, where
+from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, RobotEntry, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
@@ -74,7 +75,7 @@ class StreamsToRos:
 
 
 class LimbTopic(ABC):
-    """A topic about measured joints: old, missing or unhealthy values are not published.
+    """A topic about measured joints and grippers: old, missing or unhealthy values are not published.
 
     Args:
         entry: the joints, their names and the rate.
@@ -98,7 +99,11 @@ class LimbTopic(ABC):
         return where(group=self._entry.group, name="state") & LIMBS
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
-        for handle in limbs(found, self._entry.group, "state"):
+        group = self._entry.group
+        if not found and self._container.services(where(group=group)):
+            problem = f"nothing of it is published on {self._topic}: it has no joints, arm or gripper"
+            raise ConfigurationError(where=group, problem=problem)
+        for handle in limbs(found, group, "state"):
             yield Place("topic", self._topic), handle
 
     def open(self, place: Place, handle: Handle) -> Closes:
@@ -131,8 +136,8 @@ class JointStatesToRos(LimbTopic):
         return {
             "header": {"stamp": ros_stamp(at_s)},
             "name": list(names),
-            "position": list(now.positions_rad),
-            "velocity": list(now.velocities_rad_s),
+            "position": list(now.positions),
+            "velocity": list(now.velocities),
         }
 
 

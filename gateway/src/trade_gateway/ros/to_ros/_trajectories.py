@@ -176,7 +176,7 @@ class _Trajectories:
         if not points or points[0]["time_from_start"] == {"sec": 0, "nanosec": 0}:
             return None
         now = measured(list(self._names.trade_names.values()), self._state.with_(deadline_s=_READ_WITHIN_S)())
-        return dict(zip(now.names, now.positions_rad, strict=True))
+        return dict(zip(now.names, now.positions, strict=True))
 
     def feedback_of(self, progress: Any) -> Message:
         errors: list[float] = msgspec.to_builtins(progress)["errors_rad"]
