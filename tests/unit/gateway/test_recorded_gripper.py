@@ -2,6 +2,7 @@
 
 import json
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as parquet
@@ -37,12 +38,16 @@ def recording(tmp_path: Path) -> Path:
         path = tmp_path / "pick.mcap"
         with RecordingFile(path, {}) as file, Recorder(recorder, Wanted(groups=["rosie"]), ending) as running:
             assert running.look() == [f"{ARM}.state", f"{HAND}.state"]
-            running.run(file, 1.0, lambda: None)
-            hand.close()
-            running.run(file, 1.0, lambda: None)
-            hand.fail("jammed")
-            running.run(file, 0.5, lambda: None)
+            steps = using(hand)
+            running.run(file, 2.5, lambda: next(steps, None))
     return path
+
+
+def using(hand: FakeGripper) -> Iterator[None]:
+    hand.close()
+    yield
+    hand.fail("jammed")
+    yield
 
 
 def export(*words: str | Path) -> Result:

@@ -147,7 +147,8 @@ def _export_dataset(
         spans = [span._replace(task=task) for span in spans]
     made = list(episodes(states, spans, fps, lambda span, what: complain(f"{span.task} {what}")))
     if not made:
-        raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}")
+        why = "" if spans else ": no lock over these joints was recorded"
+        raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}{why}")
     _lerobot.write(folder, ", ".join(groups), joints, fps, made, file.name)
     frames = sum(len(episode.states) for episode in made)
     if out.as_json:
