@@ -133,15 +133,6 @@ def test_a_gripper_is_one_joint_whose_position_is_its_width_in_m(stand: Stand, g
     assert bridge.bridged().problems == []
 
 
-@pytest.mark.virtual_time
-def test_a_group_without_joints_is_a_problem_until_it_has_some(stand: Stand) -> None:
-    bridge = stand.up(JOINTS.replace("rosie.arm", "rosie.head") + JOINTS.replace("rosie.arm", "not.up"))
-    [problem] = bridge.bridged().problems
-    assert "rosie.head: nothing of it is published on /joint_states: it has no joints, arm or gripper" in problem
-    stand.robot.container.register(FakeGripper("rosie.head.hand"), "rosie.head.hand")
-    wait_until(lambda: not bridge.bridged().problems)
-
-
 def test_a_topic_ends_with_its_service(stand: Stand) -> None:
     stand.up(ANGLE)
     messages = heard(stand, "/head", "std_msgs/msg/Float64")

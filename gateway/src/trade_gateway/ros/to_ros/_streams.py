@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from trade import Constraint, Container, Handle, Sample, Stream, where
-from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, RobotEntry, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
 from trade_gateway.ros._joints import LIMBS, JointNames, Measured, joints_of, limbs, measured
-from trade_gateway.ros._mapping_sync import Place, named_services, of_name
+from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._types import Message
 
 __all__ = ["JointStatesToRos", "LimbTopic", "StreamsToRos", "Topics"]
@@ -64,6 +63,10 @@ class StreamsToRos:
     def of(self) -> Constraint:
         return of_name(self._entry.service)
 
+    @property
+    def absent(self) -> tuple[str, str]:
+        return absent_name(self._entry.service, f"topic {self._entry.topic}")
+
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):
             yield Place("topic", self._entry.topic), handle
@@ -98,12 +101,12 @@ class LimbTopic(ABC):
     def of(self) -> Constraint:
         return where(group=self._entry.group, name="state") & LIMBS
 
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, f"no joints, arm or gripper for topic {self._topic}"
+
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
-        group = self._entry.group
-        if not found and self._container.services(where(group=group)):
-            problem = f"nothing of it is published on {self._topic}: it has no joints, arm or gripper"
-            raise ConfigurationError(where=group, problem=problem)
-        for handle in limbs(found, group, "state"):
+        for handle in limbs(found, self._entry.group, "state"):
             yield Place("topic", self._topic), handle
 
     def open(self, place: Place, handle: Handle) -> Closes:

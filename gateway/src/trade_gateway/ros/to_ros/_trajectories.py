@@ -43,6 +43,10 @@ class TrajectoriesToRos:
     def of(self) -> Constraint:
         return where(group=self._entry.group, name="follow") & LIMBS
 
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, f"no joints or arm for action {self._entry.action}"
+
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in limbs(found, self._entry.group, "follow"):
             yield Place("action", self._entry.action), handle
