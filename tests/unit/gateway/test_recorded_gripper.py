@@ -16,6 +16,7 @@ from trade_drivers.testing import FakeGripper
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.recordings._replay_run import chosen
+from trade_gateway.recording._channels import JointStates, Message, encoded, joints_channel
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._motion import motions
 from trade_gateway.recording._recorder import Recorder
@@ -90,5 +91,15 @@ def test_a_gripper_is_a_joint_of_a_bag_of_ros(recording: Path, tmp_path: Path) -
 
 def test_a_replay_moves_no_gripper_and_still_finds_the_arm_beside_it(recording: Path) -> None:
     assert chosen(recording, None).group == ARM
-    with pytest.raises(UsageError, match=f"{HAND} is a gripper; only joints and arms are replayed"):
+    with pytest.raises(UsageError, match=f"{HAND} is a gripper; only joints and arms of TRADE are replayed"):
         chosen(recording, HAND)
+
+
+def test_a_replay_moves_no_joints_of_ros(tmp_path: Path) -> None:
+    states = JointStates(
+        names=["lab.arm.a"], position_rad=[0.1], velocity_rad_s=[], load=[], enabled=[], fault=[], stamp_s=[1.0]
+    )
+    with RecordingFile(tmp_path / "lab.mcap", {}) as file:
+        file.write(Message(joints_channel("lab.arm"), 10**9, 10**9, encoded(states)))
+    with pytest.raises(UsageError, match=r"lab\.arm is of ROS; only joints and arms of TRADE are replayed"):
+        chosen(tmp_path / "lab.mcap", "lab.arm")

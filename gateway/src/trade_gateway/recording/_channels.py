@@ -44,6 +44,7 @@ class JointStates(Struct, frozen=True, kw_only=True):
     position_rad: list[float]
     """Empty for a gripper."""
     velocity_rad_s: list[float]
+    """Empty for a gripper, and for joints of ROS without speeds."""
     width_m: list[float] = []
     """Of a gripper: the distance between its fingers."""
     speed_m_s: list[float] = []
@@ -51,7 +52,9 @@ class JointStates(Struct, frozen=True, kw_only=True):
     load: list[float]
     """Effort as a fraction of the motor's maximum; empty: the device does not report it."""
     enabled: list[bool]
+    """Empty: the device does not report it, as joints of ROS."""
     fault: list[str]
+    """Likewise."""
     stamp_s: list[float]
     """Times of the measurements: seconds since the epoch by the clock of their host."""
 
@@ -59,6 +62,11 @@ class JointStates(Struct, frozen=True, kw_only=True):
     def is_gripper(self) -> bool:
         """Whether positions are widths in m."""
         return bool(self.width_m)
+
+    @property
+    def is_ros(self) -> bool:
+        """Whether they are joints of ROS."""
+        return not self.enabled
 
     @property
     def positions(self) -> list[float]:

@@ -164,7 +164,9 @@ def within(label: str, groups: Iterable[str]) -> bool:
 def _moves(handle: Handle, grouped: set[str]) -> bool:
     """Whether a state is of joints, or of a gripper, that no other state includes."""
     kinds = handle.kinds
-    return bool({"JointGroup", "Arm", "Gripper"} & set(kinds)) or ("Motor" in kinds and handle.groups[0] not in grouped)
+    return bool({"JointGroup", "Arm", "Gripper", "RosJoints"} & set(kinds)) or (
+        "Motor" in kinds and handle.groups[0] not in grouped
+    )
 
 
 def _ns(at_s: float) -> int:
@@ -174,7 +176,7 @@ def _ns(at_s: float) -> int:
 def _faults(value: Any) -> list[tuple[str, str]]:
     """Joints, arms or grippers, and the faults of each."""
     states: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
-    return [(state.name, state.fault) for state in states]
+    return [(state.name, state.fault) for state in states if hasattr(state, "fault")]
 
 
 def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -> JointStates:
@@ -190,6 +192,8 @@ def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -
     if hasattr(value, "width_m"):
         return _gripper_states(value, at_s)
     motors: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
+    if any(hasattr(motor, "effort_nm") for motor in motors):
+        return _ros_states(motors, at_s)
     return JointStates(
         names=[motor.name for motor in motors],
         position_rad=[motor.position_rad for motor in motors],
@@ -210,6 +214,20 @@ def _arm_states(arm: Any, at_s: float, names: list[str]) -> JointStates:
         enabled=[arm.enabled] * len(names),
         fault=[arm.fault] * len(names),
         stamp_s=[at_s - arm.age_s] * len(names),
+    )
+
+
+def _ros_states(joints: list[Any], at_s: float) -> JointStates:
+    """Joints of ROS, which knows neither loads nor faults, and perhaps no speeds."""
+    speeds = [joint.velocity_rad_s for joint in joints]
+    return JointStates(
+        names=[joint.name for joint in joints],
+        position_rad=[joint.position_rad for joint in joints],
+        velocity_rad_s=[] if None in speeds else speeds,
+        load=[],
+        enabled=[],
+        fault=[],
+        stamp_s=[at_s - joint.age_s for joint in joints],
     )
 
 
