@@ -96,6 +96,15 @@ def test_a_move_that_the_speed_slider_slows_past_its_deadline_names_the_slider(r
     rig.comes_to_rest()
 
 
+def test_a_move_that_the_speed_slider_holds_up_names_the_slider(rig: ArmRig) -> None:
+    moving = rig.set_off()
+    rig.sim.arm.speed_fraction = 0.0  # at the teach pendant
+    error = moving.wait().error
+    assert isinstance(error, DeviceFault)
+    assert "it makes no progress; its speed slider is at 0 %" in str(error)
+    rig.comes_to_rest()
+
+
 def test_a_move_that_reaches_its_deadline_at_full_speed_names_no_slider(rig: ArmRig) -> None:
     late = Outcome(lambda: rig.arm.move_joints(FAR, SLOW), deadline_s=2.0).wait()
     assert isinstance(late.error, MotionStopped)
