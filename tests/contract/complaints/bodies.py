@@ -8,17 +8,21 @@ from math import tau
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
+
 from tests.contract.complaints.hosts import Loopback, Wifi
 from tests.support import waiting
+from tests.unit.drivers.arm_rig import ArmRig
+from tests.unit.drivers.attached_arm import ARM, attached
 from tests.unit.drivers.conftest import Rig, call
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HIP, Leg
 from tests.unit.drivers.motor_rig import KINDS as MOTOR_KINDS
 from tests.unit.drivers.tail_rig import TailRig
 from trade.errors import ConfigurationError
-from trade_drivers import AttachedRobot, Motor
-from trade_hil_sim import BadCrc, Emergency, Entry, HardwareFault, Mute, Place, Servo, Truncate, WrongModel
+from trade_drivers import AttachedRobot, Motor, Robot, parse
+from trade_hil_sim import Arm, BadCrc, Emergency, Entry, HardwareFault, Mute, Place, Servo, Truncate, UrBus, WrongModel
 
-__all__ = ["KINDS", "Body", "Call", "outcome"]
+__all__ = ["KINDS", "Body", "Call", "Controllers", "outcome"]
 
 _PATIENT = "stale_after_s = 1.0\nwatchdog_s = 1.0"
 """So that a loaded machine does not look like a fault."""
@@ -213,11 +217,42 @@ def _damiao(_: Path, undo: ExitStack) -> Body:
     return Body(rig, ways)
 
 
+class Controllers:
+    """Controllers of arms, each on an address of its own, that open only some of their ports."""
+
+    def __init__(self, undo: ExitStack) -> None:
+        self._undo = undo
+
+    def lacking(self, *services: str) -> tuple[Robot, str]:
+        """One without these services: its robot file, and its address."""
+        sim = self._undo.enter_context(UrBus(Arm(name="right"), name="ur", lacks=services))
+        return parse(ARM.replace("192.168.0.10", str(sim.port)), "arm.toml"), str(sim.port)
+
+    def attach(self, host: str) -> AttachedRobot:
+        return attached(self._undo, host)
+
+
+def _arm(_: Path, undo: ExitStack) -> ArmRig:
+    rig = ArmRig(undo)
+    rig.attach()
+    return rig
+
+
+def _with_rtde(make: Callable[[Path, ExitStack], Any]) -> Callable[[Path, ExitStack], Any]:
+    def made(tmp_path: Path, undo: ExitStack) -> Any:
+        pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
+        return make(tmp_path, undo)
+
+    return made
+
+
 KINDS: dict[str, Callable[[Path, ExitStack], Any]] = {
     "dynamixel": _dynamixel,
     "feetech": _feetech,
     "cia402": _cia402,
     "damiao": _damiao,
+    "arm": _with_rtde(_arm),
+    "controllers": _with_rtde(lambda _, undo: Controllers(undo)),
     "loopback": Loopback,
     "wifi": Wifi,
     "folder": lambda tmp_path, _: tmp_path,

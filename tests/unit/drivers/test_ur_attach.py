@@ -1,5 +1,7 @@
 """Attaching, leaving and limits of the arm driver; the judge is what the simulated controller received and did."""
 
+from contextlib import ExitStack
+
 import pytest
 
 from tests.support.waiting import wait_until
@@ -14,7 +16,8 @@ from trade.errors import (
     LimitExceeded,
     MotionStopped,
 )
-from trade_hil_sim import Absent, BrownOut, Replug, Unplug, instructions
+from trade_drivers.vendors.ur import identify
+from trade_hil_sim import Absent, Arm, BrownOut, Replug, Unplug, UrBus, instructions, motion_writes
 from trade_hil_sim.ur._kinematics import pose_between
 
 pytestmark = pytest.mark.realtime
@@ -64,6 +67,46 @@ def test_S20_of_two_drivers_of_an_arm_at_rest_one_gets_control(rig: ArmRig) -> N
     with pytest.raises(DeviceFault, match="control was not granted"):
         second.move_joints(AT_HOME)
     assert not rig.moves(mark)
+
+
+# --- services of the controller
+
+BESIDE = {
+    "dashboard": "dashboard server (port 29999)",
+    "rtde": "RTDE (port 30004)",
+    "script": "script port (port 30003)",
+}
+
+
+@pytest.mark.parametrize("lacks", [["dashboard"], ["rtde"], ["script"], ["rtde", "script"]])
+def test_a_service_that_the_controller_lacks_is_named_and_the_others_are_said_to_answer(lacks: list[str]) -> None:
+    with ExitStack() as undo:
+        sim = undo.enter_context(UrBus(Arm(name="right"), name="ur", lacks=lacks))
+        with pytest.raises(ConfigurationError, match=r"bus\.ur\.host") as wrong:
+            attached(undo, sim.port)
+        before, _, after = str(wrong.value).partition("but it has ")
+        for name, said in BESIDE.items():
+            assert said in (before if name in lacks else after)
+            assert said not in (after if name in lacks else before)
+        assert "is it switched on" not in before + after
+        assert ("PolyScope X" in after) is ("dashboard" in lacks)
+        assert not motion_writes(sim.log.entries)
+        assert not instructions(sim.log.entries, "upload")
+
+
+def test_a_controller_without_any_service_may_be_off_or_elsewhere() -> None:
+    with ExitStack() as undo:
+        sim = undo.enter_context(UrBus(Arm(name="right"), name="ur", lacks=["dashboard", "rtde", "script"]))
+        with pytest.raises(ConfigurationError, match="is it switched on, and is this its address"):
+            attached(undo, sim.port)
+
+
+def test_a_scan_of_a_controller_without_dashboard_names_it() -> None:
+    with (
+        UrBus(Arm(name="right"), name="ur", lacks=["dashboard"]) as sim,
+        pytest.raises(ConfigurationError, match=r"no dashboard server \(port 29999\).*but it has RTDE"),
+    ):
+        identify(sim.port)
 
 
 # --- S22

@@ -21,7 +21,7 @@ from trade_gateway.cli.hardware._doctor import _of_robot
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.pki._authority import Authority
-from trade_hil_sim import DynamixelBus, Mute, writes
+from trade_hil_sim import Arm, DynamixelBus, Mute, UrBus, motion_writes, writes
 
 
 def only(found: Iterable[Finding]) -> Finding:
@@ -320,3 +320,32 @@ def test_a_file_that_is_wrong_is_named_once(tmp_path: Path, text: str) -> None:
     [finding] = _of_robot(wrong)
     assert finding.about == str(wrong)
     assert str(wrong) not in finding.text
+
+
+ARM = (Path(__file__).parents[3] / "examples" / "arm.toml").read_text()
+SERVICES = {
+    "dashboard": "has no dashboard server (port 29999)",
+    "rtde": "has no RTDE (port 30004)",
+    "script": "has no script port (port 30003)",
+}
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("lacks", [(), ("dashboard",), ("rtde",), ("script",), ("rtde", "script")])
+def test_each_service_of_an_arm_that_trade_up_needs_is_checked(lacks: tuple[str, ...]) -> None:
+    with UrBus(Arm(name="right"), name="ur", lacks=lacks) as sim:
+        found = list(robots.controllers(parse(ARM.replace("192.168.0.10", str(sim.port)), "arm.toml")))
+        assert not motion_writes(sim.log.entries)
+        assert not [entry for entry in sim.log.entries if entry.name in {"upload", "stop"}]
+    assert [one.level for one in found] == (["error"] * len(lacks) or ["ok"])
+    assert {one.about for one in found} == {str(sim.port)}
+    assert all(one.text.startswith(SERVICES[name]) for one, name in zip(found, lacks, strict=False))
+    assert all("Settings, Security, Services" in one.fix for one in found if lacks)
+    assert [one for one in found if "PolyScope X" in one.fix] == (found if lacks == ("dashboard",) else [])
+
+
+@pytest.mark.realtime
+def test_an_arm_without_any_service_is_one_finding() -> None:
+    with UrBus(Arm(name="right"), name="ur", lacks=tuple(SERVICES)) as sim:
+        found = only(robots.controllers(parse(ARM.replace("192.168.0.10", str(sim.port)), "arm.toml")))
+    assert (found.level, found.text.partition(":")[0]) == ("error", "cannot be reached")

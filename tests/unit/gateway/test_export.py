@@ -227,7 +227,7 @@ def test_what_cannot_be_exported_is_named_and_nothing_is_made(tmp_path: Path) ->
     assert isinstance(no_group, UsageError)
     assert "it has rosie.head, rosie.left.arm" in str(no_group)
     no_lock = export(file, folder, "--episodes", "locks").exception
-    assert "has no episode of rosie.head, rosie.left.arm" in str(no_lock)
+    assert "has no episode of rosie.head, rosie.left.arm: no lock over these joints was recorded" in str(no_lock)
     with RecordingFile(tmp_path / "empty.mcap", {}):
         pass
     assert "has no joints" in str(export(tmp_path / "empty.mcap", folder).exception)

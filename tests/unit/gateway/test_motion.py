@@ -9,7 +9,7 @@ import pytest
 from trade.errors import ConfigurationError, LimitExceeded
 from trade_drivers import JointLimits, Tolerances, planned
 from trade_gateway.recording._channels import JointStates
-from trade_gateway.recording._motion import Motion, Track, deviation, fitted, motion_of, moving, trajectory
+from trade_gateway.recording._motion import Motion, Track, deviation, fitted, gaps, motion_of, moving, trajectory
 
 LIMITS = JointLimits(name="rosie.neck.pan", min_rad=-1.4, max_rad=1.4, max_speed_rad_s=2.5, max_accel_rad_s2=20.0)
 COUNT_RAD = math.tau / 4096
@@ -134,6 +134,26 @@ def test_a_gap_in_which_a_joint_moved_is_refused_and_one_in_which_it_rested_is_n
         motion_of("rosie.head", moved)
     stood = [state for number, state in enumerate(whole) if not 110 < number < 190]
     fitted(motion_of("rosie.head", stood), 1.0, [LIMITS])
+
+
+@pytest.mark.parametrize(("moved_m", "count"), [(0.01, 1), (0.001, 0)])
+def test_a_gripper_that_moved_unmeasured_has_a_gap_in_m(moved_m: float, count: int) -> None:
+    before, after = (_width(at_s, width_m) for at_s, width_m in ((1.0, 0.05), (1.6, 0.05 - moved_m)))
+    assert len(gaps("rosie.left.hand", [before, after])) == count
+
+
+def _width(at_s: float, width_m: float) -> JointStates:
+    return JointStates(
+        names=["rosie.left.hand"],
+        position_rad=[],
+        velocity_rad_s=[],
+        width_m=[width_m],
+        speed_m_s=[0.0],
+        load=[],
+        enabled=[True],
+        fault=[""],
+        stamp_s=[at_s],
+    )
 
 
 def test_joints_must_be_the_same_all_through_and_measured() -> None:

@@ -122,6 +122,18 @@ def test_without_power_nothing_moves() -> None:
     assert arm.q == HOME
 
 
+def test_a_speed_slider_at_zero_holds_a_move_up_until_it_is_raised() -> None:
+    arm = Arm()
+    arm.move_joints((0.5, *HOME[1:]), 1.0, 2.0)
+    let_pass(arm, 0.2)
+    arm.speed_fraction, at = 0.0, arm.q
+    let_pass(arm, 1.0)
+    assert (arm.q, arm.speeds, arm.moving) == (at, (0.0,) * 6, False)
+    arm.speed_fraction = 1.0
+    let_pass(arm, 2.0)
+    assert arm.q[0] == pytest.approx(0.5)
+
+
 def test_an_unknown_model_is_refused() -> None:
     with pytest.raises(SimulationError, match="UR5e"):
         Arm("PUMA")

@@ -1,5 +1,6 @@
 """Services, locks and sessions for nodes of ROS: they do what they may, and leave nothing behind that moves."""
 
+import time
 from pathlib import Path
 
 import pytest
@@ -7,8 +8,9 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.ros.memory_graph import MemoryRos
 from tests.unit.ros.robots import PATIENCE_S, Stand, apart
-from trade import where
+from trade import service, where
 from trade.errors import AccessDenied
+from trade_drivers.testing import FakeGripper
 from trade_gateway.ros._graph import RosRefused
 
 TRIGGERS = '[[to_ros.service]]\ngroup = "rosie"\ntype = "std_srvs/srv/Trigger"\n'
@@ -267,6 +269,54 @@ def test_what_does_not_fit_is_said_with_a_remedy(stand: Stand) -> None:
     [problem] = bridge.bridged().problems
     assert "'data' is bool, which does not fit 'angle_rad'; it is turn(angle_rad: float" in problem
     assert stand.ros.services == {}
+
+
+FLOAT, TRIGGER, GRIP = "std_msgs/msg/Float64", "std_srvs/srv/Trigger", "control_msgs/action/GripperCommand"
+ABSENT = [
+    ("joint_states", {"group": "rosie.eye"}, "no joints, arm or gripper for topic /joint_states"),
+    ("trajectory", {"group": "rosie.eye", "action": "/go"}, "no joints or arm for action /go"),
+    ("gripper", {"group": "rosie.eye", "action": "/grip"}, "no gripper for action /grip"),
+    ("lock", {"group": "rosie.eye"}, "nothing to lock"),
+    ("service", {"group": "rosie.eye", "type": "std_srvs/srv/SetBool"}, "no services that fit std_srvs/srv/SetBool"),
+    ("service", {"service": "rosie.eye.luk", "type": TRIGGER}, f"no service luk for {TRIGGER}"),
+    ("stream", {"service": "rosie.eye.luk", "topic": "/eye", "type": FLOAT}, "no service luk for topic /eye"),
+    ("command", {"service": "rosie.eye.luk", "topic": "/do", "type": FLOAT}, "no service luk for topic /do"),
+    ("action", {"service": "rosie.eye.luk", "action": "/do", "type": GRIP}, "no service luk for action /do"),
+]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(("kind", "keys", "lacks"), ABSENT)
+def test_an_entry_that_maps_nothing_in_a_group_with_services_is_a_problem(
+    stand: Stand, kind: str, keys: dict[str, str], lacks: str
+) -> None:
+    stand.robot.container.register(Eye(), "rosie.eye")
+    stand.memory.settle()
+    bridge = stand.up(f"[[to_ros.{kind}]]\n" + "".join(f'{key} = "{value}"\n' for key, value in keys.items()))
+    assert bridge.bridged().problems == []  # a robot may be starting
+    wait_until(lambda: bridge.bridged().problems == [f"rosie.eye has {lacks}"])
+    assert stand.said == [f"rosie.eye has {lacks}"]
+    assert bridge.bridged().to_ros == {}
+
+
+class Eye:
+    @service(effect="read")
+    def look(self) -> float:
+        return 0.5
+
+
+@pytest.mark.virtual_time
+def test_an_entry_that_maps_nothing_is_no_problem_before_its_robot_is_up_and_after_it_has_what_is_wanted(
+    stand: Stand,
+) -> None:
+    bridge = stand.up('[[to_ros.joint_states]]\ngroup = "rosie.eye"\n')
+    time.sleep(20)
+    assert bridge.bridged().problems == []
+    stand.robot.container.register(Eye(), "rosie.eye")
+    wait_until(lambda: bridge.bridged().problems)
+    stand.robot.container.register(FakeGripper("rosie.eye.hand"), "rosie.eye.hand")
+    wait_until(lambda: not bridge.bridged().problems)
+    assert "topic /joint_states" in bridge.bridged().to_ros
 
 
 def test_closing_the_bridge_stops_what_its_nodes_move(stand: Stand) -> None:

@@ -4,6 +4,7 @@ import threading
 import time
 from typing import Any
 
+import msgspec
 import pytest
 
 from tests.support.waiting import wait_until
@@ -11,6 +12,8 @@ from tests.unit.ros.memory_graph import MemoryGraph
 from tests.unit.ros.robots import PATIENCE_S, Stand, apart
 from trade import Handle, where
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, MotionStopped, Stopped
+from trade_gateway.recording._channels import JointStates, Message
+from trade_gateway.recording._sources import Sources, Wanted
 from trade_gateway.ros._goals import ACTION
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
 
@@ -223,6 +226,8 @@ class RosArm:
         """The states of its joints end, at once or with the next motion."""
         self.result: dict[str, Any] = {}
         self.at = (0.0, 0.0)
+        self.speeds = [0.0, 0.1]
+        """Of b and a; none: it does not tell them."""
         self._states = self.graph.advertise("/joint_states", "sensor_msgs/msg/JointState")
         self.graph.act("/arm/follow", ACTION, self._do)
         threading.Thread(target=self._publish, name="ros-arm", daemon=True).start()
@@ -235,7 +240,7 @@ class RosArm:
 
     def tell(self, *angles: float) -> None:
         self.at = angles
-        self._states.send({"name": ["b", "a"], "position": list(reversed(angles)), "velocity": [0.0, 0.1]})
+        self._states.send({"name": ["b", "a"], "position": list(reversed(angles)), "velocity": self.speeds})
 
     def _do(self, goal: Goal) -> Outcome:
         self.goals.append(goal.message["trajectory"])
@@ -274,6 +279,25 @@ def test_joints_of_ros_are_read_by_their_names(stand: Stand, arm: RosArm) -> Non
     wait_until(lambda: _state(stand) == [0.1, 0.2])
     [a, _] = found(stand, "lab.arm", "state")()
     assert (a.velocity_rad_s, a.effort_nm) == (0.1, None)
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("speeds", [[0.3, 0.1], []])
+def test_joints_of_ros_are_recorded_with_what_ros_knows_of_them(stand: Stand, arm: RosArm, speeds: list[float]) -> None:
+    arm.speeds = speeds
+    arm.tell(0.1, 0.2)
+    wait_until(lambda: _state(stand) == [0.1, 0.2])
+    sources = Sources(stand.robot.container, Wanted(groups=["lab"]), threading.Event())
+    sources.look()
+    assert sources.labels() == ["lab.arm.state"]
+    messages: list[Message] = []
+    wait_until(lambda: messages.extend(sources.take()) or messages)
+    sources.close()
+    recorded = msgspec.json.decode(messages[0].data, type=JointStates)
+    assert (messages[0].channel.topic, recorded.names) == ("/lab.arm/joints", ["lab.arm.a", "lab.arm.b"])
+    assert recorded.position_rad == [0.1, 0.2]
+    assert recorded.velocity_rad_s == speeds[::-1]
+    assert (recorded.load, recorded.enabled, recorded.fault) == ([], [], [])
 
 
 def test_joints_of_ros_move_no_quicker_than_they_may(stand: Stand, arm: RosArm) -> None:

@@ -11,6 +11,7 @@ from tests.support.waiting import wait_until
 from tests.unit.ros.arms import FakeJoints
 from tests.unit.ros.robots import Stand
 from trade.errors import ConfigurationError
+from trade_drivers.testing import FakeGripper
 from trade_gateway.ros._urdf import read_urdf
 
 URDF = """<?xml version="1.0"?>
@@ -110,6 +111,22 @@ def test_transforms_follow_the_joints(stand: Stand, arm: FakeJoints) -> None:
     arm.at = [0.7, 1.0]
     x = math.sin(0.5)
     wait_until(lambda: abs(heard.links["lower"]["transform"]["rotation"]["x"] - x) < 1e-9)
+
+
+@pytest.mark.virtual_time
+def test_a_gripper_shifts_a_prismatic_joint_and_turns_none(stand: Stand, arm: FakeJoints) -> None:
+    """Its width is in m, so a revolute joint of its name would turn by a width."""
+    for name in ("left.hand", "right.free"):
+        stand.robot.container.register(FakeGripper(f"rosie.arm.{name}"), f"rosie.arm.{name}")
+    stand.memory.settle()
+    mimic = '    <mimic joint="b" multiplier="0.02" offset="0.01"/>\n'
+    (stand.folder / "arm.urdf").write_text(URDF.replace('"slide"', '"hand"').replace(mimic, ""))
+    stand.up(ROBOT)
+    heard = Listener(stand)
+    wait_until(lambda: {"upper", "lower", "finger"} <= set(heard.links))
+    shift = heard.links["finger"]["transform"]["translation"]
+    assert [shift[name] for name in "xyz"] == pytest.approx((0.0, 0.085, 0.0))
+    assert "thumb" not in heard.links
 
 
 @pytest.mark.parametrize(

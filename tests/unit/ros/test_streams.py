@@ -3,9 +3,12 @@
 import threading
 from typing import Any
 
+import pytest
+
 from tests.support.waiting import wait_until
 from tests.unit.ros.arms import FakeJoints
 from tests.unit.ros.robots import Stand
+from trade_drivers.testing import FakeGripper
 
 ANGLE = (
     '[[to_ros.stream]]\nservice = "rosie.head.angle_rad"\ntopic = "/head"\ntype = "std_msgs/msg/Float64"\nhz = 100\n'
@@ -106,6 +109,28 @@ def test_names_are_full_or_as_the_file_says_and_never_twice(stand: Stand) -> Non
     wait_until(lambda: messages)
     assert messages[0]["name"] == ["shoulder", "rosie.arm.b"]
     assert "two of left.arm.a, right.arm.a would have one name" in bridge.bridged().problems[0]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("group", ["rosie.left", "rosie.left.hand", "rosie"])
+def test_a_gripper_is_one_joint_whose_position_is_its_width_in_m(stand: Stand, group: str) -> None:
+    hand, arm = FakeGripper("rosie.left.hand"), FakeJoints("rosie.left.a", "rosie.left.b")
+    arm.at = [0.1, 0.2]
+    stand.robot.container.register(hand, "rosie.left.hand")
+    stand.robot.container.register(arm, "rosie.left")
+    stand.memory.settle()
+    bridge = stand.up(JOINTS.replace("rosie.arm", group))
+    messages = heard(stand, "/joint_states", "sensor_msgs/msg/JointState")
+    wait_until(lambda: any(message["name"] == ["hand"] for message in messages))
+    hand.activate()
+    hand.close()
+    wait_until(lambda: any(one["name"] == ["hand"] and one["position"] == [0.0] for one in messages))
+    widths = [one["position"] for one in messages if one["name"] == ["hand"]]
+    assert widths[0] == [0.085]
+    arms = [one["position"] for one in messages if one["name"] == ["a", "b"]]
+    assert all(one == [0.1, 0.2] for one in arms)
+    assert bool(arms) is (group == "rosie.left")
+    assert bridge.bridged().problems == []
 
 
 def test_a_topic_ends_with_its_service(stand: Stand) -> None:

@@ -741,10 +741,13 @@ class ToleranceExceeded(DeviceError, RuntimeError):
     what: TrajectoryPart
     error_rad: float
     tolerance_rad: float
+    cause: str = ""
+    """What slows it by order, if the driver knows that, such as a speed slider."""
 
     def describe(self) -> str:
         off = f"{self.device} is {abs(self.error_rad):.3g} rad off the {self.what} of its trajectory"
-        remedy = "It holds. Check whether it is blocked or overloaded, give it more time, or allow more"
+        cause = f"Probably {self.cause}: undo that" if self.cause else "Check whether it is blocked or overloaded"
+        remedy = f"It holds. {cause}, give it more time, or allow more"
         if self.what == "start":
             remedy = "Nothing was sent. Begin where it is"
         return f"{off}; {self.tolerance_rad:.3g} rad is allowed. {remedy}"

@@ -38,17 +38,45 @@ Index = Annotated[int, Meta(ge=0)]
 
 
 class JointStates(Struct, frozen=True, kw_only=True):
-    """The measurements at the joints of a group; all lists are in the order of the names."""
+    """The measurements at the joints of a group, or at a gripper; all lists are in the order of the names."""
 
     names: list[str]
     position_rad: list[float]
+    """Empty for a gripper."""
     velocity_rad_s: list[float]
+    """Empty for a gripper, and for joints of ROS without speeds."""
+    width_m: list[float] = []
+    """Of a gripper: the distance between its fingers."""
+    speed_m_s: list[float] = []
+    """Of a gripper: the rate of change of its width."""
     load: list[float]
     """Effort as a fraction of the motor's maximum; empty: the device does not report it."""
     enabled: list[bool]
+    """Empty: the device does not report it, as joints of ROS."""
     fault: list[str]
+    """Likewise."""
     stamp_s: list[float]
     """Times of the measurements: seconds since the epoch by the clock of their host."""
+
+    @property
+    def is_gripper(self) -> bool:
+        """Whether positions are widths in m."""
+        return bool(self.width_m)
+
+    @property
+    def is_ros(self) -> bool:
+        """Whether they are joints of ROS."""
+        return not self.enabled
+
+    @property
+    def positions(self) -> list[float]:
+        """Angles in rad, or the width of a gripper in m."""
+        return self.width_m or self.position_rad
+
+    @property
+    def velocities(self) -> list[float]:
+        """Speeds in rad/s, or of a gripper in m/s."""
+        return self.speed_m_s or self.velocity_rad_s
 
 
 class Call(Struct, frozen=True, kw_only=True):

@@ -31,7 +31,7 @@ class Episode(NamedTuple):
 
     task: str
     states: Sequence[Sequence[float]]
-    """For each frame, the angle of each joint in rad."""
+    """For each frame, the angle of each joint in rad; the width of a gripper in m."""
     actions: Sequence[Sequence[float]]
     """For each frame, the state one frame later, as recordings contain no commands."""
 

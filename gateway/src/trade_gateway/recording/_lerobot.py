@@ -34,7 +34,7 @@ configs:
 - config_name: default
   data_files: data/*/*.parquet
 ---
-Joint angles in rad of {robot}, exported by `trade export` from {source}.
+Joint angles in rad, and widths of grippers in m, of {robot}, exported by `trade export` from {source}.
 `observation.state` is what was measured; `action` is what was measured one frame later, not what was commanded.
 """
 

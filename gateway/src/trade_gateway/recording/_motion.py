@@ -45,6 +45,8 @@ _SAME_S: Final = 0.002
 _GAP_S: Final = 0.5
 _STILL_RAD: Final = 0.02
 """A joint with a smaller change over a gap has not moved meanwhile."""
+_STILL_M: Final = 0.002
+"""The same for a gripper's width."""
 _REST_S: Final = 0.5
 """Rest that is kept before and after the motion, in seconds."""
 
@@ -114,7 +116,7 @@ class Deviation(NamedTuple):
 
 
 def motions(path: Path) -> dict[str, list[JointStates]]:
-    """Reads the joint states of a recording, by group.
+    """Reads the states of joints and grippers of a recording, by group.
 
     Raises:
         ConfigurationError: the recording cannot be read.
@@ -133,13 +135,13 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
     Raises:
         ConfigurationError: its joints change, or were not measured during a motion.
     """
-    joints, measured = _measured(group, states)
+    joints, measured, still = _measured(group, states)
     if not measured or any(len(track) < 3 for track in measured):
         raise ConfigurationError(where="recording", problem=f"{group} has fewer than three measurements")
     began = max(track[0][0] for track in measured)
     tracks: list[Track] = []
     for joint, track in zip(joints, measured, strict=True):
-        for gap in _gaps(joint, track):
+        for gap in _gaps(joint, track, still):
             at = f"from {gap.from_s - began:.1f} to {gap.until_s - began:.1f} s"
             problem = f"{joint} was not measured {at}, while it moved"
             raise ConfigurationError(where="recording", problem=problem)
@@ -153,28 +155,31 @@ def gaps(group: str, states: Iterable[JointStates]) -> list[Gap]:
     Raises:
         ConfigurationError: its joints change.
     """
-    return [gap for joint, track in zip(*_measured(group, states), strict=True) for gap in _gaps(joint, track)]
+    joints, measured, still = _measured(group, states)
+    return [gap for joint, track in zip(joints, measured, strict=True) for gap in _gaps(joint, track, still)]
 
 
-def _measured(group: str, states: Iterable[JointStates]) -> tuple[list[str], list[list[tuple[float, float]]]]:
-    """The joints, and the times and angles of their measurements."""
+def _measured(group: str, states: Iterable[JointStates]) -> tuple[list[str], list[list[tuple[float, float]]], float]:
+    """The joints, the times and positions of their measurements, and the change of a joint at rest, in rad or m."""
     joints: list[str] = []
     measured: list[list[tuple[float, float]]] = []
+    still = _STILL_RAD
     for each in states:
         joints = joints or each.names
+        still = _STILL_M if each.is_gripper else _STILL_RAD
         measured = measured or [[] for _ in joints]
         if each.names != joints:
             problem = f"{group} has other joints later: {', '.join(each.names)} instead of {', '.join(joints)}"
             raise ConfigurationError(where="recording", problem=problem)
-        for track, at_s, position in zip(measured, each.stamp_s, each.position_rad, strict=True):
+        for track, at_s, position in zip(measured, each.stamp_s, each.positions, strict=True):
             if not track or at_s > track[-1][0] + _SAME_S:
                 track.append((at_s, position))
-    return joints, measured
+    return joints, measured, still
 
 
-def _gaps(joint: str, track: Sequence[tuple[float, float]]) -> Iterator[Gap]:
+def _gaps(joint: str, track: Sequence[tuple[float, float]], still: float) -> Iterator[Gap]:
     for (before_s, before), (after_s, after) in pairwise(track):
-        if after_s - before_s > _GAP_S and abs(after - before) > _STILL_RAD:
+        if after_s - before_s > _GAP_S and abs(after - before) > still:
             yield Gap(before_s, after_s, joint)
 
 

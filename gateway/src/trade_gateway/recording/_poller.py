@@ -86,13 +86,18 @@ class Watch:
             self._put(CALLS, span.began + span.took_s, _call(span))
 
     def _look_at_locks(self) -> None:
-        known = self._container.locking.known()
-        locks = [_lock(info) for info in known.locks if self._about(info.resources)]
+        known, used = self._container.locking.known(), self._used()
+        locks = [_lock(info) for info in known.locks if self._about(info.resources) or used & set(info.resources)]
         locks += [lock for lock in self._locks or () if known.still(lock.container)]
         now = time.monotonic()
         if locks != self._locks or now - self._locks_at >= _LOCKS_AGAIN_S:
             self._locks, self._locks_at = locks, now
             self._put(LOCKS, time.time(), Locks(locks=locks))
+
+    def _used(self) -> set[str]:
+        """The resources of the recorded services: those of a joint group have names of other groups."""
+        found = self._container.services(~where(group="trade"))
+        return {name for handle in found if within(handle.label, self._groups) for name in handle.resources}
 
     def _about(self, resources: tuple[str, ...]) -> bool:
         return any(within(resource, self._groups) or _above(resource, self._groups) for resource in resources)

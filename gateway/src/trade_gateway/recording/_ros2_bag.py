@@ -86,8 +86,8 @@ def _states(entry: Entry, name_of: Callable[[str], str]) -> Message:
     return {
         "header": _header(Time.of(entry.stamp_ns), ""),
         "name": [name_of(name) for name in states.names],
-        "position": states.position_rad,
-        "velocity": states.velocity_rad_s,
+        "position": states.positions,
+        "velocity": states.velocities,
     }
 
 

@@ -1,4 +1,4 @@
-"""The subscriptions of a recording: joints, arms, cameras and other services, as they come and go."""
+"""The subscriptions of a recording: joints, arms, grippers, cameras and other services, as they come and go."""
 
 import threading
 import time
@@ -111,6 +111,7 @@ class Sources:
         while True:
             try:
                 sample = source.stream.take()
+                message = None if sample is None else source.read(handle, sample)
             except ServiceGone:  # the registry reports that too
                 return
             except Exception as bad:  # noqa: BLE001 - any exception of the service itself
@@ -118,14 +119,14 @@ class Sources:
                 if bad is source.stream.why_ended:
                     return
                 continue
-            if sample is None:
+            if sample is None or message is None:
                 return
             self.dropped += sample.dropped
             yield from self._noted(handle.label, "unreadable", "")
             if source.read is not _image and source.read is not _answer:
                 for joint, fault in _faults(sample.value):
                     yield from self._noted(joint, "joint", fault)
-            yield source.read(handle, sample)
+            yield message
 
     def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
         """Yields a message if a fault has changed; compares ``what``, because the whole text may contain times."""
@@ -161,9 +162,11 @@ def within(label: str, groups: Iterable[str]) -> bool:
 
 
 def _moves(handle: Handle, grouped: set[str]) -> bool:
-    """Whether a state is of joints that no other state includes."""
+    """Whether a state is of joints, or of a gripper, that no other state includes."""
     kinds = handle.kinds
-    return "JointGroup" in kinds or "Arm" in kinds or ("Motor" in kinds and handle.groups[0] not in grouped)
+    return bool({"JointGroup", "Arm", "Gripper", "RosJoints"} & set(kinds)) or (
+        "Motor" in kinds and handle.groups[0] not in grouped
+    )
 
 
 def _ns(at_s: float) -> int:
@@ -171,13 +174,13 @@ def _ns(at_s: float) -> int:
 
 
 def _faults(value: Any) -> list[tuple[str, str]]:
-    """Joints, or arms, and the faults of each."""
+    """Joints, arms or grippers, and the faults of each."""
     states: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
-    return [(state.name, state.fault) for state in states]
+    return [(state.name, state.fault) for state in states if hasattr(state, "fault")]
 
 
 def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -> JointStates:
-    """Converts the state of a motor, of a group of joints or of an arm.
+    """Converts the state of a motor, of a group of joints, of an arm or of a gripper.
 
     Args:
         value: the result of its ``state``.
@@ -186,7 +189,11 @@ def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -
     """
     if arm_joints is not None:
         return _arm_states(value, at_s, arm_joints)
+    if hasattr(value, "width_m"):
+        return _gripper_states(value, at_s)
     motors: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
+    if any(hasattr(motor, "effort_nm") for motor in motors):
+        return _ros_states(motors, at_s)
     return JointStates(
         names=[motor.name for motor in motors],
         position_rad=[motor.position_rad for motor in motors],
@@ -207,6 +214,34 @@ def _arm_states(arm: Any, at_s: float, names: list[str]) -> JointStates:
         enabled=[arm.enabled] * len(names),
         fault=[arm.fault] * len(names),
         stamp_s=[at_s - arm.age_s] * len(names),
+    )
+
+
+def _ros_states(joints: list[Any], at_s: float) -> JointStates:
+    """Joints of ROS, which knows neither loads nor faults, and perhaps no speeds."""
+    speeds = [joint.velocity_rad_s for joint in joints]
+    return JointStates(
+        names=[joint.name for joint in joints],
+        position_rad=[joint.position_rad for joint in joints],
+        velocity_rad_s=[] if None in speeds else speeds,
+        load=[],
+        enabled=[],
+        fault=[],
+        stamp_s=[at_s - joint.age_s for joint in joints],
+    )
+
+
+def _gripper_states(gripper: Any, at_s: float) -> JointStates:
+    return JointStates(
+        names=[gripper.name],
+        position_rad=[],
+        velocity_rad_s=[],
+        width_m=[gripper.width_m],
+        speed_m_s=[gripper.speed_m_s],
+        load=[],
+        enabled=[gripper.activated],
+        fault=[gripper.fault],
+        stamp_s=[at_s - gripper.age_s],
     )
 
 

@@ -135,7 +135,7 @@ class StreamEntry(_Strict, frozen=True, kw_only=True):
 
 
 class JointStates(_Strict, frozen=True, kw_only=True):
-    """``[[to_ros.joint_states]]``: motors, joints or an arm as ``sensor_msgs/msg/JointState``."""
+    """``[[to_ros.joint_states]]``: motors, joints, arms and grippers as ``sensor_msgs/msg/JointState``."""
 
     group: _Text
     topic: _RosName = "/joint_states"

@@ -11,13 +11,15 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import failure
 from trade_gateway.ros._graph import Closes
 
-__all__ = ["Following", "Mapping", "Place", "named_services", "of_name"]
+__all__ = ["Following", "Mapping", "Place", "absent_name", "named_services", "of_name"]
 
 _logger = logging.getLogger("trade")
 
 _OWN: Final = "trade"
 """Group of the middleware's own services, which are never mapped."""
 _LOOK_EVERY_S: Final = 1.0
+_ABSENT_S: Final = 5.0
+"""The time after which a mapping without services is a problem, in seconds: a robot registers them one by one."""
 _AGAIN_S: Final = 2.0
 """Pause before a failed mapping is retried, in seconds."""
 
@@ -38,6 +40,11 @@ class Mapping(Protocol):
     @property
     def of(self) -> Constraint:
         """The constraint of the services that it selects from."""
+        ...
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        """Its group, and what that lacks if no service is selected: ``no gripper for action /grip``."""
         ...
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
@@ -76,6 +83,8 @@ class Following:
         self._open: dict[_Key, Closes] = {}
         self._failed: dict[tuple[int, Place | None, Handle | None], tuple[str, float]] = {}
         """The reason and the time of each failure, by mapping."""
+        self._absent: dict[int, float] = {}
+        """Since when a mapping has found nothing in a group with services."""
         self._look_now = threading.Event()
         self._closing = False
         self._first = threading.Event()
@@ -125,7 +134,7 @@ class Following:
             found = [one for one in self._container.services(mapping.of) if self._is_for_ros(one)]
             try:
                 places = list(mapping.places(found))
-                self._failed.pop((number, None, None), None)
+                self._note_absent(number, mapping, found=bool(places))
             except ConfigurationError as unclear:
                 self._note((number, None, None), str(unclear))
                 continue
@@ -139,6 +148,17 @@ class Following:
                     claimed[place[:2]] = key
                 wanted[key] = None
         return wanted
+
+    def _note_absent(self, number: int, mapping: Mapping, *, found: bool) -> None:
+        """Notes a mapping that selects nothing, although its group has services: its kind or name may be wrong."""
+        key, (group, what) = (number, None, None), mapping.absent
+        if found or not group or not any(map(self._is_for_ros, self._container.services(where(group=group)))):
+            self._absent.pop(number, None)
+            self._failed.pop(key, None)
+        elif time.monotonic() - self._absent.setdefault(number, time.monotonic()) >= _ABSENT_S:
+            self._note(key, f"{group} has {what}")
+        elif key in self._failed:
+            del self._failed[key]
 
     def _is_for_ros(self, handle: Handle) -> bool:
         """Whether a service is not the bridge's own, as those came from ROS."""
@@ -184,6 +204,12 @@ class _Heard:
 
     def came(self, _: Handle) -> None:
         self._look()
+
+
+def absent_name(service: str, place: str) -> tuple[str, str]:
+    """The group of a mapped service, and that it lacks this service."""
+    group, _, name = service.rpartition(".")
+    return group, f"no service {name} for {place}"
 
 
 def of_name(service: str) -> Constraint:

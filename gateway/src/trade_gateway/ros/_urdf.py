@@ -54,10 +54,15 @@ class UrdfJoint(NamedTuple):
         """Whether it never moves."""
         return self.kind == "fixed"
 
+    @property
+    def turns(self) -> bool:
+        """Whether its position is an angle in rad."""
+        return self.kind in _TURNS
+
     def at(self, position: float) -> Transform:
         """The transform of its child at a position in rad or m."""
         xyz, rotation = self.origin
-        if self.kind in _TURNS:
+        if self.turns:
             sine = math.sin(position / 2)
             x, y, z = self.axis
             return Transform(xyz, _product(rotation, (x * sine, y * sine, z * sine, math.cos(position / 2))))

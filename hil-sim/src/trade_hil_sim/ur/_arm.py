@@ -105,7 +105,7 @@ class Arm:
     @property
     def speeds(self) -> Six:
         """How fast the joints turn, in rad/s."""
-        return self.qd if self._pace else (0.0,) * 6
+        return (0.0,) * 6 if not self._pace or self._held_up else self.qd
 
     def pose(self, q: Sequence[float] | None = None) -> Six:
         """The pose of the flange: x, y, z in m, and a rotation vector in rad."""
@@ -126,7 +126,7 @@ class Arm:
             self._strain(dt)
             return
         self._pace = self._paced(dt)
-        if not self._pace:
+        if not self._pace or self._held_up:
             self._rest()
             return
         dt *= self._pace
@@ -143,6 +143,11 @@ class Arm:
         self.q, was, self._moving = q, self._moving, turned or any(abs(speed) > 1e-6 for speed in self.qd)
         if was and not self._moving:
             self.note("at_rest")
+
+    @property
+    def _held_up(self) -> bool:
+        """Whether the speed slider is at zero."""
+        return self.ready and not self.speed_fraction
 
     def _paced(self, dt: float) -> float:
         change = -dt / _PAUSING_S if self.safety_mode is SafetyMode.SAFEGUARD_STOP else dt / _PAUSING_S

@@ -3,7 +3,7 @@
 import random
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -50,6 +50,7 @@ class UrBus(BusThread):
         name: of the bus, in the log.
         rate_hz: cycles a second; default: 500, or 125 for the arms of a CB3.
         remote: whether it is in remote control.
+        lacks: ports that it does not open: ``dashboard`` as with PolyScope X, ``rtde`` or ``script`` as switched off.
         log: where to record; default: a log in memory, at `log`.
     """
 
@@ -61,6 +62,7 @@ class UrBus(BusThread):
         name: str = "bus",
         rate_hz: float | None = None,
         remote: bool = True,
+        lacks: Collection[str] = (),
         log: ByteLog | None = None,
     ) -> None:
         super().__init__(name, ANSWER_S)
@@ -74,6 +76,7 @@ class UrBus(BusThread):
         self._rtde = Rtde(self._program, rate_hz)
         self._dashboard = Dashboard(self._program, remote=remote)
         self._period_s = 1 / rate_hz
+        self._lacks = lacks
         self._faults = ActiveFaults()
         self._absent = False
         self._listeners: dict[str, socket.socket] = {}
@@ -166,7 +169,7 @@ class UrBus(BusThread):
         for _ in range(_TRIES):
             host = self.port or f"127.{random.randint(64, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"  # noqa: S311 - no secret
             try:
-                self._listeners = listeners(host)
+                self._listeners = listeners(host, self._lacks)
             except OSError as problem:
                 if self.port:
                     raise SimulationError(f"cannot listen on {host}: {problem}; is another simulator there?") from None

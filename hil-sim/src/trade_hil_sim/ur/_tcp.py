@@ -3,7 +3,7 @@
 import socket
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -93,12 +93,12 @@ class Client:
         self.connection.close()
 
 
-def listeners(host: str) -> dict[str, socket.socket]:
-    """A listening socket for each port; raises OSError when one is in use."""
+def listeners(host: str, lacks: Collection[str] = ()) -> dict[str, socket.socket]:
+    """A listening socket for each port but those that it lacks; raises OSError when one is in use."""
     made: dict[str, socket.socket] = {}
     try:
-        for name, number in PORTS.items():
-            made[name] = listener(host, number)
+        for name in PORTS.keys() - set(lacks):
+            made[name] = listener(host, PORTS[name])
     except OSError:
         for opened in made.values():
             opened.close()

@@ -112,6 +112,16 @@ class ArmStatus(BusDevice[Sample]):
             return "call power_on() and release_brakes()"
         return "try again, or look at the controller's log" if self.enabled else "call release_brakes()"
 
+    @property
+    def slowed(self) -> str:
+        """What slows its motions by order; empty if nothing does."""
+        fraction = 1.0 if self.sample is None else self.sample.speed_fraction
+        return f"its speed slider is at {100 * fraction:.3g} %" if fraction < 1 else ""
+
+    def lagging(self, fault: str) -> DeviceFault:
+        """Returns the error of an arm that is behind, with what slows it."""
+        return self.faulty(f"{fault}; {self.slowed}" if self.slowed else fault)
+
     def faulty(self, fault: str = "") -> DeviceFault:
         """Returns the error of an arm that does not follow a command; by default with its current fault."""
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=self.remedy)

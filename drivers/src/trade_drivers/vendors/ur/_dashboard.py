@@ -1,4 +1,4 @@
-"""A client of a controller's dashboard server: one connection per request, with a deadline, on plain sockets."""
+"""A client of a controller's dashboard server, and a check of its other services; on plain sockets, with deadlines."""
 
 import socket
 import struct
@@ -7,11 +7,19 @@ import time
 from contextlib import suppress
 from typing import Final
 
-__all__ = ["DashboardError", "ask", "commanded", "probe", "tell"]
+__all__ = ["SERVICES", "DashboardError", "ask", "commanded", "lacking", "probe", "remedy", "tell"]
 
 _PORT: Final = 29999
 _RTDE: Final = 30004
 _SCRIPT: Final = 30003
+SERVICES: Final = {
+    "dashboard server": f"dashboard server (port {_PORT})",
+    "RTDE": f"RTDE (port {_RTDE})",
+    "script port": f"script port (port {_SCRIPT})",
+}
+"""What the driver needs of a controller."""
+_POLYSCOPE_X: Final = "A controller with PolyScope X has no dashboard server, and this driver cannot use it"
+_SERVICES_ON: Final = "On its screen, enable it: Settings, Security, Services"
 _GREETING: Final = "Universal Robots Dashboard Server"
 _HELLO: Final = bytes.fromhex("0005560002")
 """RTDE: protocol version 2, please."""
@@ -57,12 +65,43 @@ def tell(host: str, line: str, timeout_s: float) -> threading.Thread:
 
 
 def probe(host: str, timeout_s: float) -> None:
-    """Checks that all ports of the controller answer, because the library waits without a timeout.
+    """Checks that all services of the controller answer, because the library waits without a timeout.
 
     Raises:
-        DashboardError: a port does not answer.
+        DashboardError: a service does not answer; the error names it, and those that do.
     """
+    if not (problems := lacking(host, timeout_s)):
+        return
+    present = [text for name, text in SERVICES.items() if name not in problems]
+    if not present:
+        raise DashboardError(f"{next(iter(problems.values()))}; is it switched on, and is this its address?")
+    absent = ", ".join(SERVICES[name] for name in problems)
+    fixes = dict.fromkeys(remedy(name) for name in problems)
+    why = "; ".join(problems.values())
+    raise DashboardError(f"{host} has no {absent}, but it has {' and '.join(present)}. {'. '.join(fixes)}. ({why})")
+
+
+def remedy(name: str) -> str:
+    """Returns what to do about a service that does not answer."""
+    return f"{_SERVICES_ON}. {_POLYSCOPE_X}" if name == "dashboard server" else _SERVICES_ON
+
+
+def lacking(host: str, timeout_s: float) -> dict[str, str]:
+    """Returns the services that do not answer, and why. Each has this time. Changes nothing."""
+    problems: dict[str, str] = {}
+    for name, check in (("dashboard server", _greets), ("RTDE", _speaks_rtde), ("script port", _takes_scripts)):
+        try:
+            check(host, timeout_s)
+        except DashboardError as problem:
+            problems[name] = str(problem)
+    return problems
+
+
+def _greets(host: str, timeout_s: float) -> None:
     ask(host, "robotmode", timeout_s)
+
+
+def _speaks_rtde(host: str, timeout_s: float) -> None:
     until = time.monotonic() + timeout_s
     try:
         with socket.create_connection((host, _RTDE), timeout_s) as connection:
@@ -72,6 +111,9 @@ def probe(host: str, timeout_s: float) -> None:
         raise DashboardError(f"{host}:{_RTDE}: {problem or 'no answer'}") from None
     if answer != _WELCOME:
         raise DashboardError(f"{host}:{_RTDE} answers {answer.hex()}; RTDE of version 2 is needed")
+
+
+def _takes_scripts(host: str, timeout_s: float) -> None:
     try:
         socket.create_connection((host, _SCRIPT), timeout_s).close()
     except OSError as problem:

@@ -102,7 +102,7 @@ class UrDriver(Driver):
                 _refuse_company(port, where)
                 _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
             except (PortLost, DashboardError) as problem:
-                _wrong(f"{where}.host", f"{problem}; is it switched on, and is this its address?")
+                _wrong(f"{where}.host", str(problem))
             exchange = Exchange(link, bus, limb)
             exchange.listen()
             _stop_if_moving(exchange)

@@ -5,7 +5,7 @@ from typing import Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.commissioning._commissioner import Found
-from trade_drivers.vendors.ur._dashboard import DashboardError, ask
+from trade_drivers.vendors.ur._dashboard import DashboardError, ask, probe
 
 __all__ = ["identify"]
 
@@ -22,6 +22,7 @@ def identify(host: str) -> Found:
         ConfigurationError: nothing answers, or it is not a controller.
     """
     try:
+        probe(host, _ASK_S)
         model = ask(host, "get robot model", _ASK_S)
         version = _VERSION.search(ask(host, "PolyscopeVersion", _ASK_S))
         serial_number = ask(host, "get serial number", _ASK_S)

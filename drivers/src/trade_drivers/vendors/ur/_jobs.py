@@ -82,7 +82,9 @@ class Motion(ArmCommand):
         except TradeError as problem:
             return problem
         if until_ns is not None and now_ns >= until_ns:
-            return MotionStopped(device=self.limb.name, reason="its call reached its deadline; give it a longer one")
+            reason = "its call reached its deadline; give it a longer one"
+            slowed = self.limb.slowed
+            return MotionStopped(device=self.limb.name, reason=f"{reason}; {slowed}" if slowed else reason)
         return None
 
     def astray(self, sample: Sample) -> LimitExceeded | None:
@@ -183,7 +185,7 @@ class Move(Motion):
         """Returns the fault for measurements without any change: the arm is blocked or paused, or values are old."""
         if sample.positions != self._place or not self._moved_ns:
             self._place, self._moved_ns = sample.positions, sample.at_ns
-        return self.limb.faulty("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
+        return self.limb.lagging("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
 
 
 class LineMove(Move):
@@ -329,7 +331,7 @@ class Follow(Motion):
             self.exchange.release(self, None)
             return
         if late_s > tolerances.goal_time_s:
-            raise self.limb.faulty("it does not come to rest at the end of its trajectory")
+            raise self.limb.lagging("it does not come to rest at the end of its trajectory")
         self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
         self._sent_ns = now_ns
 
@@ -340,5 +342,10 @@ class Follow(Motion):
             self._plan.course.note(track.limits.name, error)
             if abs(error) > tolerance_rad:
                 raise ToleranceExceeded(
-                    device=name, bus=self.limb.bus, what=what, error_rad=error, tolerance_rad=tolerance_rad
+                    device=name,
+                    bus=self.limb.bus,
+                    what=what,
+                    error_rad=error,
+                    tolerance_rad=tolerance_rad,
+                    cause=self.limb.slowed,
                 )

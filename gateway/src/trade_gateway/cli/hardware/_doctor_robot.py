@@ -1,6 +1,5 @@
 """Checks of ``trade doctor`` on a robot: its lines, its devices, and their watchdogs."""
 
-import socket
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,7 +31,6 @@ __all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasu
 
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
-_DASHBOARD: Final = 29999
 _PATIENCE_S: Final = 3.0
 _BAD_LINE: Final = (
     "check the cable, its length and its ends: a long line needs a termination (120 ohm) at both ends only, "
@@ -182,14 +180,21 @@ def _identity(about: str, device: Joint | Gripper, found: Found) -> Finding:
 
 
 def controllers(robot: Robot) -> Iterator[Finding]:
-    """Checks whether the controllers of arms are reachable."""
+    """Checks whether the controllers of arms are reachable, with each service that `trade up` needs."""
     for bus in robot.buses:
-        if not isinstance(bus, UrBus):
-            continue
-        try:
-            socket.create_connection((bus.host, _DASHBOARD), _PATIENCE_S).close()
-        except OSError as bad:
-            fix = "switch it on and connect it to this network; on its screen: Settings, System, Network"
-            yield Finding(level="error", about=bus.host, text=f"cannot be reached: {bad}", fix=fix)
-        else:
-            yield Finding(level="ok", about=bus.host, text="can be reached")
+        if isinstance(bus, UrBus):
+            yield from _services(bus.host)
+
+
+def _services(host: str) -> Iterator[Finding]:
+    from trade_drivers.vendors.ur import SERVICES, lacking, remedy  # noqa: PLC0415 - loads what others do not need
+
+    problems = lacking(host, _PATIENCE_S)
+    if problems.keys() == SERVICES.keys():
+        fix = "switch it on and connect it to this network; on its screen: Settings, System, Network"
+        yield Finding(level="error", about=host, text=f"cannot be reached: {next(iter(problems.values()))}", fix=fix)
+        return
+    for name, why in problems.items():
+        yield Finding(level="error", about=host, text=f"has no {SERVICES[name]}: {why}", fix=remedy(name))
+    if not problems:
+        yield Finding(level="ok", about=host, text=f"can be reached: {', '.join(SERVICES.values())}")

@@ -44,7 +44,7 @@ def export(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New or empty folder for the dataset or the bag.")],
     form: Annotated[Form, typer.Option("--as", help="lerobot: a dataset; ros2: a bag in MCAP.")] = Form.LEROBOT,
     group: Annotated[
-        list[str] | None, typer.Option(help="Export only these joints or this arm. Repeatable. Default: all.")
+        list[str] | None, typer.Option(help="Export only these joints, arm or gripper. Repeatable. Default: all.")
     ] = None,
     fps: Annotated[
         int, typer.Option(rich_help_panel=_DATASET, min=1, max=1000, metavar="HZ", help="Frame rate, in Hz.")
@@ -69,7 +69,7 @@ def export(
     """Export a recording as a LeRobot dataset (v3.0), or as a bag of ROS 2.
 
     The dataset has the joints as Parquet tables, without pictures.
-    observation.state is the measured position in rad; action is the position measured one frame later.
+    observation.state is the measured angle in rad, or the width of a gripper in m; action is that of the next frame.
     The bag has /joint_states and the pictures of all cameras. It has neither calls nor locks nor faults.
 
     For example: trade export walk.mcap walk/ --group rosie.legs --episodes locks --fps 30
@@ -147,7 +147,8 @@ def _export_dataset(
         spans = [span._replace(task=task) for span in spans]
     made = list(episodes(states, spans, fps, lambda span, what: complain(f"{span.task} {what}")))
     if not made:
-        raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}")
+        why = "" if spans else ": no lock over these joints was recorded"
+        raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}{why}")
     _lerobot.write(folder, ", ".join(groups), joints, fps, made, file.name)
     frames = sum(len(episode.states) for episode in made)
     if out.as_json:

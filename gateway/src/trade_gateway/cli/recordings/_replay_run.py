@@ -47,9 +47,13 @@ def chosen(file: Path, group: str | None) -> Motion:
 
     Raises:
         ConfigurationError: the recording has no motion, or the motion has gaps.
-        UsageError: the recording has several motions, or not this one.
+        UsageError: the recording has several motions, or not this one, or this is of a gripper or of ROS.
     """
-    found = motions(file)
+    recorded = motions(file)
+    found = {name: states for name, states in recorded.items() if not (states[0].is_gripper or states[0].is_ros)}
+    if group in recorded and group not in found:
+        what = "a gripper" if recorded[group][0].is_gripper else "of ROS"
+        raise UsageError(where="--group", problem=f"{group} is {what}; only joints and arms of TRADE are replayed")
     if not found:
         raise ConfigurationError(where=str(file), problem="has no joints")
     if group is None and len(found) > 1:

@@ -13,7 +13,7 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import RequestMapping, ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import ActionEntry, GripperEntry
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
-from trade_gateway.ros._mapping_sync import Place, named_services, of_name
+from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.from_ros._sent_goals import TEXTS
@@ -41,6 +41,10 @@ class ActionsToRos:
     @property
     def of(self) -> Constraint:
         return of_name(self._entry.service)
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        return absent_name(self._entry.service, f"action {self._entry.action}")
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):
@@ -101,6 +105,10 @@ class GrippersToRos:
     @property
     def of(self) -> Constraint:
         return where(group=self._entry.group, name="move_to", kind="Gripper")
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, f"no gripper for action {self._entry.action}"
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(f"{self._entry.group}.move_to", found):

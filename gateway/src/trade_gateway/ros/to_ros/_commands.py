@@ -17,7 +17,7 @@ from trade_gateway.clients._clients import Client
 from trade_gateway.ros._conversion import RequestMapping, failure
 from trade_gateway.ros._file import Command
 from trade_gateway.ros._graph import Closes, Graph
-from trade_gateway.ros._mapping_sync import Place, named_services, of_name
+from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._nodes import Guest, Nodes
 from trade_gateway.ros._types import Message
 
@@ -48,6 +48,10 @@ class CommandsToRos:
     @property
     def of(self) -> Constraint:
         return of_name(self._entry.service)
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        return absent_name(self._entry.service, f"topic {self._entry.topic}")
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):

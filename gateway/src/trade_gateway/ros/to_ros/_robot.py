@@ -41,15 +41,18 @@ class Description:
 
 
 class TransformsToRos(LimbTopic):
-    """``[[to_ros.robot]]``: the transforms of the joints that are measured."""
+    """``[[to_ros.robot]]``: the transforms of the joints that are measured; a gripper moves a prismatic one."""
 
     def __init__(self, entry: RobotEntry, topics: Topics, container: Container) -> None:
         """Raises ConfigurationError: the description is invalid."""
         super().__init__(entry, "/tf", _TF, topics, container)
         self._moving = [one for one in read_urdf(Path(entry.urdf).read_text("utf-8"), entry.urdf) if not one.fixed]
+        self._turning = {joint.name for joint in self._moving if joint.turns}
 
     def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:
-        positions = dict(zip(names, now.positions_rad, strict=True))
+        positions = dict(zip(names, now.positions, strict=True))
+        if now.is_width:  # in m, which is no angle
+            positions = {name: width_m for name, width_m in positions.items() if name not in self._turning}
         return {"transforms": list(self._transforms(positions, at_s))}
 
     def _transforms(self, positions: Mapping[str, float], at_s: float) -> Iterable[Message]:

@@ -9,7 +9,7 @@ from trade_gateway.clients._clients import Client
 from trade_gateway.ros._conversion import RequestMapping, ResponseMapping, ros_path
 from trade_gateway.ros._file import LockService, ServiceEntry
 from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
-from trade_gateway.ros._mapping_sync import Place, named_services
+from trade_gateway.ros._mapping_sync import Place, absent_name, named_services
 from trade_gateway.ros._nodes import UNKNOWN, Nodes
 from trade_gateway.ros._types import Message
 
@@ -43,6 +43,13 @@ class ServicesToRos:
     def of(self) -> Constraint:
         group, _, name = self._entry.service.rpartition(".")
         return where(group=self._entry.group or group or None, name=name or None)
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        entry = self._entry
+        if entry.service:
+            return absent_name(entry.service, f"{entry.type} {entry.name}".strip())
+        return entry.group, f"no services that fit {entry.type}"
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         entry = self._entry
@@ -94,6 +101,10 @@ class LocksToRos:
     @property
     def of(self) -> Constraint:
         return where(group=self._entry.group)
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, "nothing to lock"
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         first = next((handle for handle in found if handle.effect == "actuate"), None)

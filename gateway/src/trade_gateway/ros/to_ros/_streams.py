@@ -11,7 +11,7 @@ from trade_gateway.ros._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, RobotEntry, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
 from trade_gateway.ros._joints import LIMBS, JointNames, Measured, joints_of, limbs, measured
-from trade_gateway.ros._mapping_sync import Place, named_services, of_name
+from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._types import Message
 
 __all__ = ["JointStatesToRos", "LimbTopic", "StreamsToRos", "Topics"]
@@ -63,6 +63,10 @@ class StreamsToRos:
     def of(self) -> Constraint:
         return of_name(self._entry.service)
 
+    @property
+    def absent(self) -> tuple[str, str]:
+        return absent_name(self._entry.service, f"topic {self._entry.topic}")
+
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in named_services(self._entry.service, found):
             yield Place("topic", self._entry.topic), handle
@@ -74,7 +78,7 @@ class StreamsToRos:
 
 
 class LimbTopic(ABC):
-    """A topic about measured joints: old, missing or unhealthy values are not published.
+    """A topic about measured joints and grippers: old, missing or unhealthy values are not published.
 
     Args:
         entry: the joints, their names and the rate.
@@ -96,6 +100,10 @@ class LimbTopic(ABC):
     @property
     def of(self) -> Constraint:
         return where(group=self._entry.group, name="state") & LIMBS
+
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, f"no joints, arm or gripper for topic {self._topic}"
 
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in limbs(found, self._entry.group, "state"):
@@ -131,8 +139,8 @@ class JointStatesToRos(LimbTopic):
         return {
             "header": {"stamp": ros_stamp(at_s)},
             "name": list(names),
-            "position": list(now.positions_rad),
-            "velocity": list(now.velocities_rad_s),
+            "position": list(now.positions),
+            "velocity": list(now.velocities),
         }
 
 

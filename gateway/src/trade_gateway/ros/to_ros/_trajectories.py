@@ -43,6 +43,10 @@ class TrajectoriesToRos:
     def of(self) -> Constraint:
         return where(group=self._entry.group, name="follow") & LIMBS
 
+    @property
+    def absent(self) -> tuple[str, str]:
+        return self._entry.group, f"no joints or arm for action {self._entry.action}"
+
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         for handle in limbs(found, self._entry.group, "follow"):
             yield Place("action", self._entry.action), handle
@@ -176,7 +180,7 @@ class _Trajectories:
         if not points or points[0]["time_from_start"] == {"sec": 0, "nanosec": 0}:
             return None
         now = measured(list(self._names.trade_names.values()), self._state.with_(deadline_s=_READ_WITHIN_S)())
-        return dict(zip(now.names, now.positions_rad, strict=True))
+        return dict(zip(now.names, now.positions, strict=True))
 
     def feedback_of(self, progress: Any) -> Message:
         errors: list[float] = msgspec.to_builtins(progress)["errors_rad"]
