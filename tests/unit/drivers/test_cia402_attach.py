@@ -60,6 +60,16 @@ def test_a_setting_that_the_driver_cannot_use_is_named(rig: Leg, values: dict[st
     assert not rig.frames("rpdo1")
 
 
+@pytest.mark.parametrize(("limit", "fits"), [(32_595, True), (32_594, False)])
+def test_a_range_may_be_that_of_the_drive_as_rounded_as_it_is_printed(rig: Leg, limit: int, fits: bool) -> None:
+    rig.configure(("min_rad = -1.0\nmax_rad = 1.0", "min_rad = -1.000003\nmax_rad = 1.000003"))  # 32 595.03 counts
+    rig.plug(prepare=objects(position_limit_min=-limit, position_limit_max=limit))
+    if fits:
+        assert rig.attach().motor("leg.hip")
+    else:
+        assert "more than the drive's own range (607Dh)" in refused(rig)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "complaint"),
     [

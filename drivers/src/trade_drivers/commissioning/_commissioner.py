@@ -34,6 +34,8 @@ class Found(Struct, frozen=True, kw_only=True):
     firmware: str = ""
     serial_number: int | None = None
     """None if the device reports none."""
+    homing_counts: int = 0
+    """The homing offset that the device applies itself, in counts."""
     torque: bool | None = None
     """None if the device has no torque, or cannot report it."""
     problem: str = ""
