@@ -9,7 +9,7 @@ import pytest
 
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.legs import HIP, KNEE, Leg, leg, rig
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceAbsent
 from trade_drivers import load
 from trade_hil_sim import Mute, Unplug
 from trade_hil_sim.cia402 import Cia402Bus
@@ -125,5 +125,5 @@ def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
 
 
 def test_on_an_empty_virtual_bus_the_drive_is_absent(rig: Leg) -> None:
-    with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:empty"):
+    with pytest.raises(DeviceAbsent, match="no drive answers as node 1 on virtual:empty"):
         rig.attach(ports={"legs": "virtual:empty"})
