@@ -65,7 +65,8 @@ def test_a_dynamixel_servo_whose_zero_was_moved_is_refused_and_both_are_named(ri
     rig.sim.devices[0].write(20, counts.to_bytes(4, "little", signed=True), time.monotonic())
     wrong = refused(rig)
     assert (wrong.key, wrong.expected, wrong.found) == ("homing_counts", "7", str(counts))
-    assert f"its homing offset (register 20) is {counts}, but 7 in the robot file" in str(wrong)
+    said = f"its homing offset (register 20) is {counts}, but 7 in the robot file: its zero has moved"
+    assert f"{said}, or this is the calibration of another arm" in str(wrong)
 
 
 def test_a_feetech_servo_whose_zero_was_moved_is_refused_and_both_are_named(tail: TailRig) -> None:
