@@ -109,7 +109,7 @@ def _import(
 class Ends(Struct, frozen=True):
     """The ends that a device was moved to, in its own direction.
 
-    A device that passes the end of its encoder goes on counting here: ``low`` or ``high`` is then beyond half a turn.
+    A device that passes the end of its encoder counts further here: ``low`` or ``high`` is then beyond half a turn.
     """
 
     low: float
