@@ -65,3 +65,14 @@ def test_a_range_that_is_one_count_wider_is_refused(
     with pytest.raises(ConfigurationError, match="more than the device's own range"):
         rig.attach()
     assert not motion_writes(rig.log)
+
+
+@pytest.mark.parametrize(("high_rad", "fits"), [(3.1402, True), (3.1416, False)])
+def test_a_range_of_a_whole_turn_may_be_rounded_as_well(
+    limited: Callable[[float, float], Any], high_rad: float, fits: bool
+) -> None:
+    rig = limited(-3.1416, high_rad)  # 0 and 4095 are -3.14159 and 3.14006 rad
+    with pytest.raises(ConfigurationError) as refusal:
+        rig.attach()
+    assert ("more than the device's own range" if fits else "is outside the range of an") in str(refusal.value)
+    assert not motion_writes(rig.log)
