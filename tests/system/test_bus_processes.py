@@ -152,7 +152,7 @@ def test_a_bus_that_cannot_be_attached_ends_the_start_with_its_reason_and_moves_
         copy = at_ports(file, sim, tmp_path)
         copy.write_text(copy.read_text().replace('bus = "left"\nid = 1', 'bus = "left"\nid = 7'))
         up = run("-m", "trade_gateway", "up", copy, "--json")
-        assert up.wait() == 1
+        assert up.wait() == 75  # so that a gateway waits for it
         said = "".join(up.errors)
         assert "rosie-left" in said
         assert "id 7" in said

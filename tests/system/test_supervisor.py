@@ -1,6 +1,7 @@
 """Children of a gateway: up in order, up again after whatever ends or hangs them, given up when that is no use."""
 
 import os
+import re
 import signal
 import socket
 import time
@@ -20,7 +21,7 @@ from tests.system.supervised import COUNTER, MODULE, Keeping, call
 from trade import Container, where
 from trade.errors import ConfigurationError
 from trade_gateway.http import add_token
-from trade_hil_sim import SimProcess, events, writes
+from trade_hil_sim import Absent, SimProcess, events, motion_writes, writes
 
 
 def test_children_start_in_order_and_end_in_the_other_one(keeping: Callable[..., Keeping]) -> None:
@@ -104,12 +105,14 @@ def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_agai
     [
         ('providers = [{ class = "tiny:Dies" }]', "ended (exit code 3)"),
         ('providers = [{ class = "tiny:Missing" }]', "it came up, but: "),
-        (f'robot = "{ROSIES_HEAD}"', "ended (exit code 1: ConfigurationError: "),
+        ('robot = "wrong.toml"', "ended (exit code 1: ConfigurationError: "),
     ],
 )
 def test_a_child_that_always_fails_is_given_up_with_its_reason_until_its_file_changes(
-    keeping: Callable[..., Keeping], wanted: str, why: str
+    keeping: Callable[..., Keeping], wanted: str, why: str, tmp_path: Path
 ) -> None:
+    head = Path(ROSIES_HEAD).read_text()
+    (tmp_path / "wrong.toml").write_text(re.sub(r'port = ".*"', 'port = "/dev/null"', head))  # it is no serial port
     kept = keeping(f"[container.a]\nrestarts = 2\n{wanted}\n")
     given_up = kept.become("a", "given up")
     assert (given_up.restarts, given_up.pid) == (2, 0)
@@ -119,6 +122,23 @@ def test_a_child_that_always_fails_is_given_up_with_its_reason_until_its_file_ch
     kept.go_by(f"[container.a]\nrestarts = 2\n{COUNTER}")
     kept.become("a", "up")
     assert call("count") == 1
+
+
+def test_a_robot_whose_servos_get_power_later_than_the_computer_comes_up_with_them(
+    keeping: Callable[..., Keeping], sim: SimProcess, tmp_path: Path
+) -> None:
+    sim.control.do(Absent(ids=(1,)))
+    kept = keeping(f'[container.a]\nrestarts = 1\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    waiting = kept.become("a", "waiting", restarts=3)  # two crashes would have ended it
+    assert waiting.absent
+    assert "ended (exit code 75: DeviceAbsent: " in waiting.why
+    assert "no device answers to id 1" in waiting.why
+    sim.control.do(Absent(ids=(1,), on=False))
+    back = kept.become("a", "up")
+    assert not back.absent
+    told = kept.texts()
+    assert [text for text in told if "waits for its device" in text] == told[:1]  # once, however long it takes
+    assert not motion_writes(sim.entries())
 
 
 def test_a_child_that_leaks_is_saved_and_started_again(keeping: Callable[..., Keeping]) -> None:

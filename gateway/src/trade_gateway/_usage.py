@@ -1,10 +1,13 @@
 """Checks command-line words: the usage error, and the services that the words name."""
 
-from typing import cast
+from typing import Final, cast
 
 from trade import Constraint, Container, Handle, where
 from trade._calls.picking import Pick
 from trade.errors import ConfigurationError
+
+ABSENT: Final = 75
+"""The exit code if a device of the robot file does not answer yet: EX_TEMPFAIL of sysexits.h, try again later."""
 
 
 class UsageError(ConfigurationError):

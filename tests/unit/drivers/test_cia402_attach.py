@@ -9,7 +9,7 @@ import pytest
 
 from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.legs import HIP, KNEE, Leg, leg, rig
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceAbsent
 from trade_drivers import load
 from trade_hil_sim import Mute, Unplug
 from trade_hil_sim.cia402 import Cia402Bus
@@ -58,6 +58,16 @@ def test_a_setting_that_the_driver_cannot_use_is_named(rig: Leg, values: dict[st
     objects(**values)(rig.sim)
     assert complaint in refused(rig)
     assert not rig.frames("rpdo1")
+
+
+@pytest.mark.parametrize(("limit", "fits"), [(32_595, True), (32_594, False)])
+def test_a_range_may_be_that_of_the_drive_as_rounded_as_it_is_printed(rig: Leg, limit: int, fits: bool) -> None:
+    rig.configure(("min_rad = -1.0\nmax_rad = 1.0", "min_rad = -1.000003\nmax_rad = 1.000003"))  # 32 595.03 counts
+    rig.plug(prepare=objects(position_limit_min=-limit, position_limit_max=limit))
+    if fits:
+        assert rig.attach().motor("leg.hip")
+    else:
+        assert "more than the drive's own range (607Dh)" in refused(rig)
 
 
 @pytest.mark.parametrize(
@@ -115,5 +125,5 @@ def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
 
 
 def test_on_an_empty_virtual_bus_the_drive_is_absent(rig: Leg) -> None:
-    with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:empty"):
+    with pytest.raises(DeviceAbsent, match="no drive answers as node 1 on virtual:empty"):
         rig.attach(ports={"legs": "virtual:empty"})

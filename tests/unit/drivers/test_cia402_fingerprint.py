@@ -34,6 +34,16 @@ def test_the_drive_that_the_file_means_is_attached(leg: Leg) -> None:
     assert leg.attach().motor("leg.hip")
 
 
+def test_the_simulator_of_a_file_is_the_drive_that_it_means(rig: Leg) -> None:
+    rig.configure(("id = 1\n", 'id = 1\nfirmware = "2.11b"\nserial_number = 4711\n'))
+    rig.plug()
+    hip = rig.attach().motor("leg.hip")
+    hip.enable()
+    hip.move_to(0.3)
+    truth = next(device for device in rig.sim.state().devices if device.device_id == HIP)
+    assert truth.position_rad == pytest.approx(0.3, abs=1e-3)
+
+
 def test_a_homing_offset_is_for_servos(leg: Leg) -> None:
     leg.configure(("id = 1\n", "id = 1\nhoming_counts = 7\n"))
     with pytest.raises(ConfigurationError, match="homing_counts: is for servos; leave this key out"):

@@ -30,8 +30,8 @@ def refused(rig: Any) -> WrongDevice:
 
 
 def test_a_dynamixel_servo_with_another_firmware_is_refused_and_both_are_named(rig: Rig) -> None:
-    rig.configure(("id = 1\n", 'id = 1\nfirmware = "44"\n'))
     rig.plug()
+    rig.configure(("id = 1\n", 'id = 1\nfirmware = "44"\n'))
     wrong = refused(rig)
     assert (wrong.key, wrong.expected, wrong.found) == ("firmware", "44", "45")
     assert 'joint."neck.pan".firmware: the robot file says 44, but the device says 45' in str(wrong)
@@ -45,8 +45,8 @@ def test_a_dynamixel_servo_with_the_firmware_of_the_file_is_attached(rig: Rig) -
 
 
 def test_a_feetech_servo_with_another_firmware_is_refused_and_both_are_named(tail: TailRig) -> None:
-    tail.configure(("id = 1\n", 'id = 1\nfirmware = "3.9"\n'))
     tail.plug()
+    tail.configure(("id = 1\n", 'id = 1\nfirmware = "3.9"\n'))
     wrong = refused(tail)
     assert (wrong.key, wrong.expected, wrong.found) == ("firmware", "3.9", "3.10")
 
@@ -65,7 +65,8 @@ def test_a_dynamixel_servo_whose_zero_was_moved_is_refused_and_both_are_named(ri
     rig.sim.devices[0].write(20, counts.to_bytes(4, "little", signed=True), time.monotonic())
     wrong = refused(rig)
     assert (wrong.key, wrong.expected, wrong.found) == ("homing_counts", "7", str(counts))
-    assert f"its homing offset (register 20) is {counts}, but 7 in the robot file" in str(wrong)
+    said = f"its homing offset (register 20) is {counts}, but 7 in the robot file: its zero has moved"
+    assert f"{said}, or this is the calibration of another arm" in str(wrong)
 
 
 def test_a_feetech_servo_whose_zero_was_moved_is_refused_and_both_are_named(tail: TailRig) -> None:
@@ -83,8 +84,8 @@ def test_a_servo_with_the_homing_offset_of_the_file_is_attached_and_enabled(tail
 
 
 def test_a_homing_offset_lost_without_power_is_noticed_before_torque_is_on(tail: TailRig) -> None:
-    tail.configure(("id = 1\n", "id = 1\nhoming_counts = 100\n"))
     tail.plug()
+    tail.configure(("id = 1\n", "id = 1\nhoming_counts = 100\n"))
     tail.poke(55, 1)  # the lock: what is written now is not kept
     tail.poke(31, 100, 0)
     root = tail.root()

@@ -10,6 +10,7 @@ from tests.unit.drivers.attached_arm import AT_HOME, attached
 from tests.unit.drivers.conftest import Outcome, written_now
 from trade.errors import (
     ConfigurationError,
+    DeviceAbsent,
     DeviceFault,
     DeviceSilent,
     InvalidArgument,
@@ -58,6 +59,11 @@ def test_S20_a_second_driver_is_refused_and_the_arm_continues(rig: ArmRig) -> No
     assert not rig.moves(mark)
     assert not [entry for entry in instructions(rig.log, since=mark) if entry.name == "stop"]
     assert moving.wait().result == pytest.approx(NEAR, abs=0.01)
+
+
+def test_a_controller_that_does_not_answer_is_absent() -> None:
+    with ExitStack() as undo, pytest.raises(DeviceAbsent, match="is it switched on"):
+        attached(undo, "127.99.99.99")
 
 
 def test_S20_of_two_drivers_of_an_arm_at_rest_one_gets_control(rig: ArmRig) -> None:

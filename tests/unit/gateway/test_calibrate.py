@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from math import inf, pi
+from math import inf, pi, tau
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +97,46 @@ def test_a_device_that_stops_answering_is_named_once_with_its_port() -> None:
     assert str(gone.value) == said
 
 
-@pytest.mark.parametrize("beyond", [[3.0, -3.0], [3.0, pi + 0.1]])
-def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[float]) -> None:
-    with pytest.raises(ConfigurationError, match="mount its horn"):
-        Sweep(Hand(beyond), 1, PLACE).until(done_after(1), 60.0)  # type: ignore[arg-type]
+def angles(*counts: int) -> list[float]:
+    return [(count - 2048) * tau / 4096 for count in counts]
+
+
+@pytest.mark.parametrize(
+    ("counts", "wide"),
+    [
+        ([3900, 4095, 0, 200], 396),
+        ([200, 0, 4095, 3900, 4095, 0, 100], 396),
+        ([3900, 4000, 4095], 195),
+        ([2048, 3900, 4095, 0, 200, 0, 4095, 3900, 2048], 2248),
+    ],
+)
+def test_a_sweep_past_the_end_of_the_encoder_is_as_wide_as_it_is(counts: list[int], wide: int) -> None:
+    ends = Sweep(Hand(angles(*counts)), 1, PLACE).until(done_after(len(counts) - 1), 60.0)  # type: ignore[arg-type]
+    assert ends.high - ends.low == pytest.approx(wide * tau / 4096)
+    assert ends.last == pytest.approx(angles(counts[-1])[0])
+
+
+@pytest.mark.parametrize("beyond", [angles(3900, 4095, 0, 200), angles(200, 0, 4095, 3900), [3.0, pi + 0.1]])
+def test_a_range_past_the_end_of_the_encoder_is_refused_with_its_width(beyond: list[float]) -> None:
+    ends = Sweep(Hand(beyond), 1, PLACE).until(done_after(len(beyond) - 1), 60.0)  # type: ignore[arg-type]
+    wide = "0.607" if len(beyond) > 2 else "0.242"
+    with pytest.raises(ConfigurationError, match=rf"{wide} rad wide, but passes .*mount its horn"):
+        measured(joint(), None, ends)
+
+
+def test_a_zero_and_a_range_beside_the_end_of_the_encoder_are_measured() -> None:
+    sweep: Any = Sweep(Hand(angles(200, 0, 4095, 3950, 3950, 3900, 4095)), 1, PLACE)  # type: ignore[arg-type]
+    zero = sweep.until(done_after(3), 60.0).last
+    assert measured(joint(), zero, sweep.until(done_after(2), 60.0)) == {
+        "offset_rad": -2.9176,
+        "min_rad": -0.0567,
+        "max_rad": 0.2024,
+    }
+
+
+def test_a_joint_that_turns_round_and_round_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="more than a whole turn"):
+        Sweep(Hand(angles(0, 1500, 3000, 100, 1500)), 1, PLACE).until(done_after(4), 60.0)  # type: ignore[arg-type]
 
 
 def test_a_prompt_without_an_answer_ends_the_measurement() -> None:

@@ -193,3 +193,47 @@ def test_a_child_that_takes_too_much_memory_is_saved_ended_and_started_again() -
     child.saved(20.0)
     child.ended(21.0, "ended (exit code 0)")
     assert (child.state, child.why) == (State.WAITING, "it took 600 MB of memory; it ended (exit code 0)")
+
+
+def launched(child: Life, now: float) -> float:
+    """Starts it as soon as it is due; returns the time."""
+    if child.state is State.WAITING:
+        now = child.deadline
+        assert child.due(now) is Transition.LAUNCH
+    assert child.state is State.STARTING
+    return now
+
+
+def test_a_child_whose_device_is_absent_is_started_again_without_limit() -> None:
+    child, now, waits = life(), 0.0, list[float]()
+    child.start(now)
+    for _ in range(500):
+        now = launched(child, now) + 1.0
+        child.ended(now, "ended (exit code 75)", absent=True)
+        assert child.state is State.WAITING
+        waits.append(child.wait_s)
+    assert waits[:3] == [0.1, 0.2, 0.4]
+    assert set(waits[9:]) == {30.0}
+    launched(child, now)
+    child.up(child.deadline)
+    assert child.state is State.UP
+
+
+@pytest.mark.parametrize("absences", [0, 20])
+def test_crashes_end_a_child_as_before_and_absences_are_none_of_them(absences: int) -> None:
+    child, now = life(window_s=1e6), 0.0
+    child.start(now)
+    for _ in range(absences):
+        now = launched(child, now)
+        child.ended(now, "ended (exit code 75)", absent=True)
+    for crash in range(4):
+        assert child.state is not State.GIVEN_UP, crash
+        now = launched(child, now)
+        child.ended(now, "crashed (signal 11)")
+    assert child.state is State.GIVEN_UP
+
+
+def test_a_child_that_was_up_and_ends_with_that_code_has_crashed() -> None:
+    child = up(restarts=0)
+    child.ended(20.0, "ended (exit code 75)", absent=True)
+    assert (child.state, child.absences) == (State.GIVEN_UP, 0)

@@ -11,13 +11,15 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError
-from trade_drivers import Found, parse
+from trade_drivers import Found, attach, load, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.cli.hardware._scan import _numbers
-from trade_hil_sim import Arm, DynamixelBus, Mute, Servo, UrBus, writes
+from trade_hil_sim import Arm, DynamixelBus, Mute, Servo, UrBus, motion_writes, writes
 from trade_hil_sim.damiao import DamiaoBus, Motor
+from trade_hil_sim.feetech import FeetechBus
+from trade_hil_sim.feetech import Servo as FeetechServo
 from trade_hil_sim.odrive import Axis, OdriveBus
 
 pytestmark = pytest.mark.realtime
@@ -55,6 +57,23 @@ def test_a_scan_shows_a_line_for_each_device(line: DynamixelBus) -> None:
         ["1000000", "1", "XL430-W250"],
         ["1000000", "2", "XL430-W250"],
     ]
+
+
+@pytest.mark.parametrize(("homing", "written"), [(-85, True), (0, False)])
+def test_a_robot_file_of_servos_that_another_program_has_homed_comes_up(
+    tmp_path: Path, homing: int, written: bool
+) -> None:
+    servo = FeetechServo(3)
+    servo.memory.set("homing_offset", homing)
+    with FeetechBus([servo], tmp_path / "line", paced=False) as sim:
+        file = tmp_path / "arm.toml"
+        said = trade(
+            "scan", "--port", sim.port, "--driver", "feetech", "--bauds", 1_000_000, "--ids", 3, "--write", file
+        )
+        assert said.exit_code == 0, said.output
+        assert (f"homing_counts = {homing}" in file.read_text()) == written
+        attach(load(file), register=lambda *_: None, deregister=lambda _: None).close()
+        assert not motion_writes(list(sim.log.entries))
 
 
 def test_a_program_gets_them_as_json(line: DynamixelBus) -> None:

@@ -41,7 +41,7 @@ class Body:
         self.name = name
         self.pid = next(self.pids)
         self.reported: list[str] = []
-        self.said = self.dead = False
+        self.said = self.dead = self.absent = False
         self.end, self._end = os.pipe()
         self.output, self._mouth = os.pipe()
         os.set_blocking(self.output, False)
@@ -111,7 +111,7 @@ class Kept:
         self.then = ""
         """What its end will mean, while it is asked to leave."""
         self.begun = self.been_up = self.leaving = self.asking = False
-        self.launches = self.missed = 0
+        self.launches = self.missed = self.absences = 0
         self.asked = -math.inf
         self.ends: list[float] = []
         self.reported: list[str] = []
@@ -257,13 +257,16 @@ class Model(RuleBasedStateMachine):
             case _:
                 child.asking, child.asked, child.until = True, self.now, math.inf
 
-    def _ended(self, child: Kept) -> None:
+    def _ended(self, child: Kept, *, absent: bool = False) -> None:
         then, child.until = child.then or "fail", math.inf
+        child.absences = child.absences + 1 if absent and child.state == "starting" else 0
         child.then = ""
         if then == "start":
             self._launch(child)
         elif then == "stop" or child is self.kept.get(NEVER):
             child.state = "stopped"
+        elif child.absences:  # no crash: without limit
+            child.state, child.until = "waiting", self.now + min(30.0, 0.1 * 2 ** (child.absences - 1))
         else:
             child.ends = [*(at for at in child.ends if at > self.now - WINDOW_S), self.now]
             child.state = "waiting" if len(child.ends) <= RESTARTS else "given up"
@@ -317,6 +320,7 @@ class Model(RuleBasedStateMachine):
         if child.state == "starting":
             if what == "up":
                 child.state, child.been_up, child.missed, child.until = "up", True, 0, self._next_question()
+                child.absences = 0
             else:
                 self._end(child, "fail")
         self._settle()
@@ -330,9 +334,23 @@ class Model(RuleBasedStateMachine):
     def dies(self, data: st.DataObject) -> None:
         self._dies(self._named(data, self._alive()))
 
-    def _dies(self, name: str) -> None:
+    @precondition(lambda self: self._alive())
+    @rule(data=st.data(), times=st.integers(1, 2 * RESTARTS))
+    def has_no_device(self, data: st.DataObject, times: int) -> None:
+        """As often as it is started; it may be up already the first time, and only crashes then."""
+        name = self._named(data, self._alive())
+        for _ in range(times):
+            if name in self._alive():
+                self._dies(name, absent=True)
+                self.it_agrees()
+            if name in self.kept and self.kept[name].state == "waiting":
+                self._advance(self.kept[name].until)
+                self.it_agrees()
+
+    def _dies(self, name: str, *, absent: bool = False) -> None:
         body = self._body(name)
-        self._ended(self.kept[name])
+        body.absent = absent
+        self._ended(self.kept[name], absent=absent)
         self._settle()
         body.die()
 

@@ -21,7 +21,7 @@
     |       `-- BusGone, NotStopped
     `-- SetupError             the installation or the configuration must change
         |-- ConfigurationError
-        |   `-- WrongDevice
+        |   `-- WrongDevice, DeviceAbsent
         `-- CannotConnect, NoContainerFound, CannotStart, LinkStays
 
 Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
@@ -52,6 +52,7 @@ __all__ = [
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
+    "DeviceAbsent",
     "DeviceError",
     "DeviceFault",
     "DeviceSilent",
@@ -786,6 +787,11 @@ class WrongDevice(ConfigurationError):
         says = self.problem or f"the robot file says {self.expected}, but the device says {self.found}"
         remedy = f"Attach that device, or, if this one has replaced it, correct {self.key} and calibrate it"
         return f"{self.where}.{self.key}: {says}. {remedy}"
+
+
+@dataclass(kw_only=True, eq=False)
+class DeviceAbsent(ConfigurationError):
+    """No device answers where the robot file has one: it has no power yet, or is not plugged in. Try again later."""
 
 
 @dataclass(kw_only=True, eq=False)

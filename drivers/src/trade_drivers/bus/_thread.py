@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade import Measure
-from trade.errors import BusGone, ConfigurationError, TradeError
+from trade.errors import BusGone, ConfigurationError, DeviceAbsent, TradeError
 from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._fault_detector import FaultDetector
 from trade_drivers.bus._jobs import Device, PortLost, PortOpening, WireError
@@ -233,6 +233,7 @@ def opening(wire: Port, port: str, where: str) -> Generator[None, None, None]:
     """Opens a serial line for a block that checks its devices; closes the line if that fails.
 
     Raises:
+        DeviceAbsent: there is no such port.
         ConfigurationError: the port cannot be opened, or exchanges fail.
     """
     with ExitStack() as undo:
@@ -242,7 +243,7 @@ def opening(wire: Port, port: str, where: str) -> Generator[None, None, None]:
             yield
         except PortLost as lost:
             problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` lists the ports"
-            raise ConfigurationError(where=f"{where}.port", problem=problem) from None
+            raise DeviceAbsent(where=f"{where}.port", problem=problem) from None
         except WireError as bad:
             problem = f"the bus does not work reliably: {bad}; check cable and power"
             raise ConfigurationError(where=f"{where}.port", problem=problem) from bad

@@ -36,6 +36,8 @@ class Found(Struct, frozen=True, kw_only=True):
     """None if the device reports none."""
     counts_per_rev: float | None = None
     """Counts of a position for one turn of the motor; None if the device does not report them."""
+    homing_counts: int = 0
+    """The homing offset that the device applies itself, in counts."""
     torque: bool | None = None
     """None if the device has no torque, or cannot report it."""
     problem: str = ""

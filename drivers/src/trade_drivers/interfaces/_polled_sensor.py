@@ -6,7 +6,7 @@ import time
 from abc import abstractmethod
 from typing import Final, Literal, NamedTuple, TypeVar
 
-from trade.errors import BusGone, ConfigurationError, DeviceSilent
+from trade.errors import BusGone, ConfigurationError, DeviceAbsent, DeviceSilent
 from trade_drivers.interfaces._sensing import Reading, Sensor, SensorInfo
 
 __all__ = ["Measured", "PolledSensor"]
@@ -65,14 +65,16 @@ class PolledSensor(Sensor):
         """Measures once, then starts the polling thread.
 
         Raises:
-            ConfigurationError: the first measurement failed; the message names ``where``.
+            DeviceAbsent: the sensor does not answer, or has no port; the message names ``where``.
+            ConfigurationError: the first measurement failed in another way.
         """
         try:
             self.open()
             self._take()
         except Exception as bad:
             self.hang_up()
-            raise ConfigurationError(where=where, problem=f"{self.port}: {_text(bad)}") from bad
+            kind = DeviceAbsent if isinstance(bad, OSError) else ConfigurationError
+            raise kind(where=where, problem=f"{self.port}: {_text(bad)}") from bad
         self._thread.start()
         return self
 

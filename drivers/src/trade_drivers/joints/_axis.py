@@ -110,7 +110,7 @@ class Axis(BusDevice[Sample]):
         self.grain = grain
         self.scale = Scale(joint, grain)
         ends = sorted((self.scale.counts(joint.min_rad), self.scale.counts(joint.max_rad)))
-        self.low, self.high = floor(ends[0]), ceil(ends[1])
+        self.low, self.high = ceil(ends[0] - 0.5), floor(ends[1] + 0.5)  # nearest counts: a file has fewer digits
         self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
         self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 

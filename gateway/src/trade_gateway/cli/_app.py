@@ -10,7 +10,7 @@ import typer
 
 from trade import errors
 from trade.errors import TradeError
-from trade_gateway._usage import UsageError
+from trade_gateway._usage import ABSENT, UsageError
 from trade_gateway.cli._output import NOT_FOUND, say_error
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.process._parent_watch import end_with_stdin
@@ -94,6 +94,8 @@ _MISSING: Final = (
     errors.NoSuchClass,
 )
 """What a command was asked for does not exist."""
+_CODES: Final = {UsageError: _USAGE, _MISSING: NOT_FOUND, errors.DeviceAbsent: ABSENT}
+"""The exit codes of kinds of errors; of others it is `_FAILED`."""
 _WITH_VALUE: Final = ("--system", "--connect")
 """Options before the command that take a value."""
 
@@ -186,6 +188,6 @@ def main() -> None:
         build(_asked_for(words))()
     except TradeError as error:
         say_error(error, as_json="--json" in words)
-        sys.exit(_USAGE if isinstance(error, UsageError) else NOT_FOUND if isinstance(error, _MISSING) else _FAILED)
+        sys.exit(next((code for kinds, code in _CODES.items() if isinstance(error, kinds)), _FAILED))
     except KeyboardInterrupt:
         sys.exit(130)

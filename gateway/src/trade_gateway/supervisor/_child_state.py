@@ -27,6 +27,8 @@ class ChildInfo(Struct, frozen=True):
     why: str
     """Why it ended or is being ended; empty while it is up."""
     rss_mb: float = 0.0
+    absent: bool = False
+    """Whether it waits for a device that does not answer yet."""
     saved_at: float = 0.0
     """When the state of all its objects was last saved, in seconds since the Unix epoch; 0: not yet."""
 
@@ -113,5 +115,6 @@ class Unit:
             pid=self.process.pid if self.process else 0,
             restarts=life.restarts,
             why=lease.why if lease is not None and away else life.why or self.leaving,
+            absent=life.absences > 0,
             saved_at=self.saved_at,
         )

@@ -15,6 +15,7 @@ from trade import Settings
 from trade._remote.error_output import last_line
 from trade._transport.credentials import user_secret
 from trade.starting import Started
+from trade_gateway._usage import ABSENT
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.process._program import order
@@ -47,6 +48,8 @@ class Process:
         self._is_program = child.part.entry.program is not None
         self._said = b""
         self._mark = secrets.token_hex(8)
+        self.absent = False
+        """Whether it ended since a device of its robot file did not answer."""
         self._pid = 0
         """The process id of a program that was started; `_process` watches it."""
         errors = _fresh(self._log)
@@ -131,6 +134,7 @@ class Process:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
         code = self._forget()
+        self.absent = code == ABSENT and not self._is_program
         if self._is_program and code < 0:  # perhaps it was killed, and has not ended what the program started
             _kill_marked(self._mark)
         words = self._last_words() if code > 0 or self._is_program else ""

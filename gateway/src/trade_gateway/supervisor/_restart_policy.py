@@ -17,6 +17,7 @@ GRACE_S: Final = 20.0
 """How long its shutdown may take, in seconds: a robot is brought to rest first."""
 _FIRST_S: Final = 0.1
 _LONGEST_S: Final = 30.0
+_DOUBLINGS: Final = 16
 """The wait before a restart doubles from the first to the longest."""
 
 
@@ -31,7 +32,7 @@ class State(enum.Enum):
     """Its process runs but did not answer the last health check."""
     STOPPING = "stopping"
     WAITING = "waiting"
-    """It ended by itself, and is restarted after a wait."""
+    """It ended by itself, and is restarted after a wait; without limit if a device does not answer yet."""
     GIVEN_UP = "given up"
     """It ended by itself too often; only an explicit request restarts it."""
 
@@ -80,6 +81,8 @@ class Life:
         """When `due` is to be called."""
         self._grace_s = grace_s
         self._launched = False
+        self.absences = 0
+        """How many starts in a row ended since a device did not answer."""
         self._failures: deque[float] = deque()
         self._after = _After.FAILED
         self._next: deque[Transition] = deque()
@@ -118,7 +121,7 @@ class Life:
     def up(self, now: float) -> None:
         """It is up with all its objects."""
         if self.state is State.STARTING:
-            self.state, self.why, self._missed = State.UP, "", 0
+            self.state, self.why, self._missed, self.absences = State.UP, "", 0, 0
             self.deadline = self._tick(now)
 
     def answered(self, now: float) -> None:
@@ -149,8 +152,9 @@ class Life:
             return self._step(now)
         return None
 
-    def ended(self, now: float, how: str) -> Transition | None:
-        """Its process ended or could not be started."""
+    def ended(self, now: float, how: str, *, absent: bool = False) -> Transition | None:
+        """Its process ended or could not be started; ``absent``: since a device does not answer, which is no crash."""
+        self.absences = self.absences + 1 if absent and self.state is State.STARTING else 0
         after = self._after if self.state is State.STOPPING else _After.FAILED
         if self.state is not State.STOPPING:
             self.why = how
@@ -214,14 +218,20 @@ class Life:
         if self.terms.restart == "never":
             self._rest(State.STOPPED)
             return
+        if self.absences:
+            self._wait(now, self.absences)
+            return
         self._failures.append(now)
         while self._failures[0] <= now - self.terms.window_s:
             self._failures.popleft()
         if len(self._failures) > self.terms.restarts:
             self._rest(State.GIVEN_UP)
             return
+        self._wait(now, len(self._failures))
+
+    def _wait(self, now: float, times: int) -> None:
         self.state = State.WAITING
-        self.wait_s = min(_FIRST_S * 2 ** (len(self._failures) - 1), _LONGEST_S)
+        self.wait_s = min(_FIRST_S * 2 ** min(times - 1, _DOUBLINGS), _LONGEST_S)
         self.deadline = now + self.wait_s
 
     def _rest(self, state: State) -> None:

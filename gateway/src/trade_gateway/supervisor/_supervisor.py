@@ -308,13 +308,18 @@ class Supervisor:
         self._selector.unregister(process.end)
         with contextlib.suppress(KeyError):  # its output ended before
             self._selector.unregister(process.output)
-        self._ended(unit, process.close())
+        how = process.close()
+        self._ended(unit, how, absent=process.absent)
 
-    def _ended(self, unit: Unit, how: str) -> None:
+    def _ended(self, unit: Unit, how: str, *, absent: bool = False) -> None:
         life, name = unit.life, unit.child.name
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
-        do = life.ended(self._clock(), how)
+        before = life.why if life.absences else ""
+        do = life.ended(self._clock(), how, absent=absent)
         match life.state:
+            case State.WAITING if life.absences:
+                if how != before:  # it is reported once, and not every 30 s
+                    self._report(unit, f"{name} {how}; it waits for its device and is tried again", bad=True)
             case State.WAITING:
                 self._report(unit, f"{name} {how}; back in {life.wait_s:g} s", bad=True)
             case State.GIVEN_UP:

@@ -7,7 +7,7 @@ from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.mechanics._device import start_rad
 
-from ._drive import Drive
+from ._drive import FIRMWARE, Drive
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus, Joint
@@ -65,6 +65,8 @@ class Cia402Bus(JointBus):
             joint.id,
             joint=joint.name,
             model=joint.model,
+            firmware=joint.firmware or FIRMWARE,
+            serial_number=joint.serial_number or 0,
             counts_per_rev=joint.counts_per_rev,
             gear=joint.gear,
             position_counts=round(start_rad(joint) / tau * joint.counts_per_rev * joint.gear),

@@ -34,11 +34,14 @@ VOLTS: Final = (18.0, 60.0)
 HOTTEST_C: Final = 85
 FULL: Final = 1000
 PRODUCT: Final = 402
+FIRMWARE: Final = "0.1.0"
+"""Its software version (100Ah), unless a robot file names another one."""
 
 
-def _named(model: str) -> list[Object]:
-    """The objects of a drive that identifies as this model."""
-    return [replace(o, default=model.encode()) if o.name == "device_name" else o for o in OBJECTS]
+def _named(model: str, firmware: str, serial_number: int) -> list[Object]:
+    """The objects of a drive that identifies as this one."""
+    own = {"device_name": model.encode(), "software_version": firmware.encode(), "serial_number": serial_number}
+    return [replace(o, default=own.get(o.name, o.default)) for o in OBJECTS]
 
 
 class Drive(JointDevice):
@@ -48,6 +51,8 @@ class Drive(JointDevice):
         device_id: its node id, 1 to 127.
         joint: name of the joint, for the log.
         model: what it is called.
+        firmware: its software version, object 100Ah.
+        serial_number: object 1018h.
         counts_per_rev: counts of the encoder for one turn of the motor.
         gear: turns of the motor for one turn of the joint.
         position_counts: where the shaft is at first.
@@ -66,6 +71,8 @@ class Drive(JointDevice):
         *,
         joint: str = "",
         model: str = "CiA402",
+        firmware: str = FIRMWARE,
+        serial_number: int = 0,
         counts_per_rev: float = 4096.0,
         gear: float = 1.0,
         position_counts: float = 0.0,
@@ -82,7 +89,8 @@ class Drive(JointDevice):
             offset_rad=offset_rad,
         )
         self.due = t
-        self.store = Store([*_named(model), *pdo_objects(device_id)], counts_per_rev)
+        named = _named(model, firmware, serial_number)
+        self.store = Store([*named, *pdo_objects(device_id)], counts_per_rev)
         self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
         self._machine = Machine(self.store, self._shaft, self.modes, self.note)
         self._mode_due = self._look_due = inf

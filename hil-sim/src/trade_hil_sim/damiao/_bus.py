@@ -7,7 +7,7 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.mechanics._device import start_rad
 
 from . import _table as table
-from ._motor import Motor
+from ._motor import SOFTWARE, Motor
 from ._table import MASTER, MODELS
 
 if TYPE_CHECKING:
@@ -52,9 +52,18 @@ class DamiaoBus(JointBus):
             joint.id,
             joint=joint.name,
             model=joint.model,
+            software=_software(joint),
             gear=joint.gear,
             position_rad=start_rad(joint) * joint.gear,
             reversed_=joint.reversed,
             offset_rad=joint.offset_rad,
             t=t,
         )
+
+
+def _software(joint: "Joint") -> int:
+    if joint.firmware is None:
+        return SOFTWARE
+    if not joint.firmware.isdecimal():
+        raise SimulationError(f'joint."{joint.name}".firmware: {joint.firmware!r} is no number, such as {SOFTWARE}')
+    return int(joint.firmware)

@@ -28,6 +28,8 @@ HARDLY_RAD: Final = 5e-4
 """Below its resolution."""
 VOLTS: Final = (15.0, 52.0)
 HOTTEST_C: Final = 120
+SOFTWARE: Final = 5014
+"""Its version of the software, unless a robot file names another one."""
 
 
 class Motor(JointDevice):
@@ -37,6 +39,7 @@ class Motor(JointDevice):
         device_id: the id it listens to, 1 to 15; it answers with that id plus 16.
         joint: name of the joint, for the log.
         model: ``DM4310`` or another of `MODELS`.
+        software: version of its software, register 14.
         gear: turns of the motor's own shaft for one turn of the joint.
         position_rad: where its shaft is at first.
         reversed_: whether the joint turns against the motor.
@@ -52,6 +55,7 @@ class Motor(JointDevice):
         *,
         joint: str = "",
         model: str = "DM4310",
+        software: int = SOFTWARE,
         gear: float = 1.0,
         position_rad: float = 0.0,
         reversed_: bool = False,
@@ -69,6 +73,7 @@ class Motor(JointDevice):
         self._zero = 0.0
         """Where its shaft was when a command set the zero there."""
         self._goal = position_rad
+        self._software = software
         self._registers: dict[int, float] = {}
         self._power_on()
         self._status = Status.DISABLED
@@ -86,7 +91,7 @@ class Motor(JointDevice):
             Register.MASTER_ID: self.device_id + table.MASTER,
             Register.ESC_ID: self.device_id,
             Register.CONTROL_MODE: Mode.MIT,
-            Register.SOFTWARE: 5014,
+            Register.SOFTWARE: self._software,
             Register.POSITION_MAX: ranges.position_rad,
             Register.VELOCITY_MAX: ranges.velocity_rad_s,
             Register.TORQUE_MAX: ranges.torque_nm,

@@ -38,6 +38,8 @@ class Servo(ServoModel[ControlTable, Shaft]):
         emit: called with each event.
     """
 
+    firmware = ("firmware_version",)
+
     def __init__(
         self,
         device_id: int,
@@ -174,7 +176,7 @@ class Servo(ServoModel[ControlTable, Shaft]):
         spared = {0xFF: set[str](), 1: {"id"}, 2: {"id", "baud_rate"}}.get(option)
         if spared is None:
             raise Refusal(ErrorCode.DATA_RANGE, f"factory reset takes 0xFF, 1 or 2, not {option}")
-        fresh = (r for r in self.model.registers if r.eeprom and r.name not in spared)
+        fresh = (r for r in self.model.registers if r.eeprom and r.writable and r.name not in spared)
         self.memory.restore(fresh)
         self.reboot(t, "factory_reset")
 

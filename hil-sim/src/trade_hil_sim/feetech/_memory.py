@@ -5,7 +5,7 @@ Independent of motion and time.
 
 from trade_hil_sim.serial._registers import Memory
 
-from ._table import EEPROM_BEGINS, RAM_BEGINS, TABLE_ENDS, Model, Register
+from ._table import RAM_BEGINS, TABLE_ENDS, Model, Register
 
 __all__ = ["MemoryTable"]
 
@@ -25,9 +25,9 @@ class MemoryTable(Memory[Register]):
         self._kept[span] = self._bytes[span]
 
     def lose_power(self) -> None:
-        """EEPROM registers as kept, the others at their defaults."""
+        """EEPROM registers and those of the firmware as kept, the others at their defaults."""
         self.restore(self.model.registers)
-        self._bytes[EEPROM_BEGINS:RAM_BEGINS] = self._kept[EEPROM_BEGINS:RAM_BEGINS]
+        self._bytes[:RAM_BEGINS] = self._kept[:RAM_BEGINS]
         self.set("torque_limit", self.get("max_torque"))
 
     def factory_reset(self, spared: tuple[str, ...] = ()) -> None:

@@ -47,6 +47,8 @@ class Servo(ServoModel[MemoryTable, Shaft]):
         emit: called with each event.
     """
 
+    firmware = ("firmware_major", "firmware_minor")
+
     def __init__(
         self,
         device_id: int,
@@ -169,7 +171,7 @@ class Servo(ServoModel[MemoryTable, Shaft]):
 
     def factory_reset(self, t: float) -> None:
         """Restore all registers but the id."""
-        self.memory.factory_reset(spared=("id",))
+        self.memory.factory_reset(spared=("id", *self.firmware))
         self.reboot(t, "factory_reset")
 
     # faults

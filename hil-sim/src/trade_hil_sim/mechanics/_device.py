@@ -14,7 +14,7 @@ from trade_hil_sim.mechanics._truth import DeviceState, GripperTruth
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
 
-__all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "start_rad", "unheard"]
+__all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "start_rad", "unheard", "version_of"]
 
 Emit = Callable[[Entry], None]
 """Adds a line to the log; a bus fills in its name."""
@@ -28,6 +28,19 @@ def start_rad(joint: "Joint") -> float:
     """The initial position of a joint's shaft, from its offset: at zero, or as near as the joint's limits allow."""
     angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
     return (-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad)
+
+
+def version_of(joint: "Joint", count: int) -> tuple[int, ...]:
+    """The numbers of the firmware version that the robot file names for a joint.
+
+    Raises:
+        SimulationError: it is no version of ``count`` numbers of one byte, which a device of this kind has.
+    """
+    numbers = (joint.firmware or "").split(".")
+    if len(numbers) != count or not all(number.isdecimal() and int(number) < 256 for number in numbers):
+        form = ".".join("N" * count)
+        raise faults.SimulationError(f'joint."{joint.name}".firmware: {joint.firmware!r} has not the form {form}')
+    return tuple(map(int, numbers))
 
 
 class DeviceModel(ABC):

@@ -38,6 +38,7 @@ class Axis(JointDevice):
         joint: name of the joint, for the log.
         model: what it is called.
         line: its product line: 4 Pro, 5 S1, 6 Micro.
+        firmware: its version, three numbers.
         gear: turns of the motor for one turn of the joint.
         turns: where its motor is at first.
         reversed_: whether the joint turns against the motor.
@@ -56,6 +57,7 @@ class Axis(JointDevice):
         joint: str = "",
         model: str = "ODrive S1",
         line: int = 5,
+        firmware: tuple[int, ...] = FIRMWARE,
         gear: float = 1.0,
         turns: float = 0.0,
         reversed_: bool = False,
@@ -75,6 +77,7 @@ class Axis(JointDevice):
         self.watchdog_s = watchdog_s
         self.calibrated = True
         self._line = self._shown_line = line
+        self._firmware = firmware
         self._state, self._result = State.IDLE, Result.SUCCESS
         self._errors = self._disarmed_by = 0
         self._lasting = 0
@@ -193,7 +196,7 @@ class Axis(JointDevice):
                 done = not self._moving(t)
                 return struct.pack("<IBBBx", self._errors, self._state, self._result, done)
             case Command.GET_VERSION:
-                return bytes((2, self._shown_line, 2, 0, *FIRMWARE, 0))
+                return bytes((2, self._shown_line, 2, 0, *self._firmware, 0))
             case Command.GET_ERROR:
                 return struct.pack("<II", self._errors, self._disarmed_by)
             case Command.GET_ENCODER_ESTIMATES:

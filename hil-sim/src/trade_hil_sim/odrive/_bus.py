@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Final
 
 from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.mechanics._device import start_rad
+from trade_hil_sim.mechanics._device import start_rad, version_of
 
-from ._axis import Axis
+from ._axis import FIRMWARE, Axis
 from ._table import ANSWERS, Command
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class OdriveBus(JointBus):
             joint=joint.name,
             model=joint.model,
             line=LINES[joint.model],
+            firmware=FIRMWARE if joint.firmware is None else version_of(joint, len(FIRMWARE)),
             gear=joint.gear,
             turns=start_rad(joint) * joint.gear / tau,
             reversed_=joint.reversed,

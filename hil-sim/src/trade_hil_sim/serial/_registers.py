@@ -91,6 +91,9 @@ class Memory(Generic[_Register_co]):
         register = self._by_name[name]
         self._bytes[register.address : register.address + register.size] = register.encode(value)
 
+    def keep(self, name: str) -> None:
+        """Let a register's value survive power loss; for memories that do not do that by themselves."""
+
     def restore(self, registers: Iterable[Register]) -> None:
         """Set registers to their factory defaults."""
         for register in registers:

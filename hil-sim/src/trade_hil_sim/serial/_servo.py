@@ -3,13 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from math import copysign, tau
-from typing import Final, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.mechanics._device import Emit, JointModel
+from trade_hil_sim.mechanics._device import Emit, JointModel, version_of
 from trade_hil_sim.mechanics._profile import Course, to_speed
 from trade_hil_sim.serial._device_bus import LineDevice
 from trade_hil_sim.serial._registers import Memory, Register
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Joint
 
 __all__ = ["CENTRE", "COUNTS_PER_TURN", "QUICK_COUNTS_S2", "RAD_PER_COUNT", "ServoModel", "ServoShaft"]
 
@@ -103,6 +106,8 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
         emit: called with each event.
     """
 
+    firmware: ClassVar[tuple[str, ...]]
+    """The registers of its firmware version, major number first."""
     overload_s = 1.0
     """How long it pushes against a jam before an overload."""
 
@@ -125,6 +130,25 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
         self._registered: tuple[int, bytes] | None = None
         self._boots_at: float | None = None
         self._strains_since: float | None = None
+
+    def resemble(self, joint: "Joint", t: float) -> None:
+        """Become the device of a robot file: its homing offset, and its firmware if the file names one.
+
+        Raises:
+            SimulationError: the registers cannot have such a value.
+        """
+        position = self.shaft.position(t)
+        values = {"homing_offset": joint.homing_counts}
+        if joint.firmware is not None:
+            values |= zip(self.firmware, version_of(joint, len(self.firmware)), strict=True)
+        for name, value in values.items():
+            self.memory.set(name, value)
+            self.memory.keep(name)
+            if self.memory.get(name) != value:
+                key = "homing_counts" if name == "homing_offset" else "firmware"
+                raise faults.SimulationError(f'joint."{joint.name}".{key}: {value} does not fit into {self.thing}')
+        self.shaft.place(position, t)
+        self._start_ram(t)
 
     # properties
 

@@ -65,7 +65,10 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
         if bus.baud not in cls.bauds:
             known = ", ".join(map(str, sorted(cls.bauds)))
             raise SimulationError(f"bus.{bus.name}.baud: {bus.baud} is no rate of {joint.model}; there is {known}")
-        return cls._new_servo(joint, bus.baud, CENTRE + round(start_rad(joint) / RAD_PER_COUNT), time.monotonic())
+        t = time.monotonic()
+        servo = cls._new_servo(joint, bus.baud, CENTRE + round(start_rad(joint) / RAD_PER_COUNT), t)
+        servo.resemble(joint, t)
+        return servo
 
     @classmethod
     @abstractmethod

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
-from trade.errors import ConfigurationError, WrongDevice
+from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers._validation import not_installed
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
@@ -106,7 +106,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
                 problem = f"{port}: {lost}; is the interface up? `ip link` lists the interfaces"
-                raise ConfigurationError(where=f"{where}.channel", problem=problem) from None
+                raise DeviceAbsent(where=f"{where}.channel", problem=problem) from None
             undo.pop_all()
         return exchange
 
@@ -127,7 +127,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
             exchange.idle(exchange.period_ns / 1e9)
 
     def check_away(self, exchange: _Exchange, axis: _Motor, where: str, *, last: bool) -> None:
-        """Raises ``ConfigurationError`` for a motor that cannot be accepted; with ``last``, also without an answer."""
+        """Raises ``ConfigurationError`` for a motor that cannot be accepted; ``last``: ``DeviceAbsent`` if silent."""
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
             case Another() as other:
@@ -140,7 +140,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
                     f"no motor answers as {axis.id} on {axis.bus}; check its power and cable, its id and bit rate, "
                     "and the two terminations of the bus"
                 )
-                raise ConfigurationError(where=key, problem=problem)
+                raise DeviceAbsent(where=key, problem=problem)
             case NoAnswer():
                 axis.probe_at_ns = exchange.clock()
             case _:

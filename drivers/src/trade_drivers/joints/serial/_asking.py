@@ -63,7 +63,8 @@ def zero_moved(axis: ServoAxis[Any], found: int) -> str:
     if found == expected:
         return ""
     where = f"its homing offset (register {axis.homing.address})"
-    return f"{where} is {found}, but {expected} in the robot file: its zero has moved"
+    moved = "its zero has moved, or this is the calibration of another arm"
+    return f"{where} is {found}, but {expected} in the robot file: {moved}"
 
 
 def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:

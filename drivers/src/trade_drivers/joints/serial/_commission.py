@@ -79,6 +79,7 @@ class ServoBench(Bench, Generic[_Wire]):
                 self.wire.read(device_id, *self.restless)
                 shared = shared or self.wire.answers_twice()
             firmware, torque = self.firmware_of(device_id), self.read(device_id, self.torque) != 0
+            homing = self.read(device_id, self.homing)
         except BadAnswer:
             return self._found(device_id, problem=_SHARED)
         except NoAnswer:
@@ -86,10 +87,16 @@ class ServoBench(Bench, Generic[_Wire]):
             return self._found(device_id, model, problem=self.mute)
         except Refused as refused:
             return self._found(device_id, model, problem=f"it refuses to be read: {refused}")
-        return self._found(device_id, model, firmware, torque, _SHARED if shared else "")
+        return self._found(device_id, model, firmware, torque, _SHARED if shared else "", homing)
 
     def _found(
-        self, device_id: int, model: str = "", firmware: str = "", torque: bool | None = None, problem: str = ""
+        self,
+        device_id: int,
+        model: str = "",
+        firmware: str = "",
+        torque: bool | None = None,
+        problem: str = "",
+        homing_counts: int = 0,
     ) -> Found:
         return Found(
             driver=self.driver,
@@ -97,6 +104,7 @@ class ServoBench(Bench, Generic[_Wire]):
             id=device_id,
             model=model,
             firmware=firmware,
+            homing_counts=homing_counts,
             torque=torque,
             problem=problem,
         )

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from math import tau
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from trade.errors import ConfigurationError, WrongDevice
+from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers.bus._attempts import ATTEMPTS, attempts
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Unfit, check_least, check_rate
@@ -71,11 +71,17 @@ def first_ping(
     key: str,
     registers: Sequence[int],
 ) -> int:
-    """Returns the model number of a joint's device; raises ``ConfigurationError`` if it is absent or shares its id."""
+    """Returns the model number of a joint's device.
+
+    Raises:
+        DeviceAbsent: no device answers.
+        ConfigurationError: two share the id, or there is noise.
+    """
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         f"cable, its id (register {registers[0]}) and its baud rate (register {registers[1]})"
     )
+    absent = True
     twice = f"the answer of id {axis.id} is garbled or arrives twice: two devices may share this id, or there is noise"
     garbled = 0
     for _ in attempts(clock_ns, int(bus.stale_after_s * 1e9)):
@@ -89,10 +95,10 @@ def first_ping(
             if not wire.answers_twice():
                 return number
             garbled += 1
-        problem = twice
+        problem, absent = twice, False
         if garbled == ATTEMPTS:  # with more of them, the answers of two devices might once look like one
             break
-    raise ConfigurationError(where=key, problem=problem)
+    raise (DeviceAbsent if absent else ConfigurationError)(where=key, problem=problem)
 
 
 def again(
@@ -144,7 +150,8 @@ def first_look(
         The bytes of its persistent registers, from address 0.
 
     Raises:
-        ConfigurationError: the device is absent, another model, or shares its id.
+        DeviceAbsent: no device answers.
+        ConfigurationError: the device is another model, or shares its id.
         NoAnswer: the device answers a ping, but no read.
     """
     number = first_ping(wire, bus, axis, clock_ns, key, kept.registers)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceAbsent
 from trade_drivers import robotfile
 from trade_drivers._validation import not_installed
 from trade_drivers.bus._attempts import attempts
@@ -143,11 +143,11 @@ def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> No
             _wrong(key, f"what answers to id {hand.id} on bus {bus.name!r} is no 2F-85: its status makes no sense")
         hand.silent = False
         return
-    _wrong(
-        key,
+    problem = (
         f"no gripper answers to id {hand.id} on bus {bus.name!r} ({exchange.wire.path}, {bus.baud} baud); check its "
-        "power and cable, its id and its baud rate with the vendor's tool",
+        "power and cable, its id and its baud rate with the vendor's tool"
     )
+    raise DeviceAbsent(where=key, problem=problem)
 
 
 def wire_at(port: str, baud: int, where: str) -> "Wire":

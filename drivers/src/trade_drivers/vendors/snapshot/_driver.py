@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct
 
 from trade import current_call
-from trade.errors import ConfigurationError, DeviceFault, DeviceSilent
+from trade.errors import ConfigurationError, DeviceAbsent, DeviceFault, DeviceSilent
 from trade_drivers import robotfile
 from trade_drivers.interfaces._sensing import Camera, CameraInfo, Image, Sensor
 from trade_drivers.plugins._driver import SenseDriver
@@ -50,7 +50,9 @@ class SnapshotDriver(SenseDriver):
             place = place_of(url)
             address = str(socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)[0][4][0])
             shown, _ = _look(place._replace(host=address), name, url, options.timeout_s)
-        except (OSError, ValueError, DeviceFault) as bad:
+        except OSError as silent:
+            raise DeviceAbsent(where=f"{where}.url", problem=str(silent)) from None
+        except (ValueError, DeviceFault) as bad:
             raise ConfigurationError(where=f"{where}.url", problem=str(bad)) from None
         for key, wanted, is_ in (
             ("width_px", options.width_px, shown.width_px),

@@ -7,7 +7,7 @@ from typing import Final, NoReturn
 
 from msgspec import structs
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceAbsent
 from trade_drivers import robotfile
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost
@@ -102,7 +102,7 @@ class UrDriver(Driver):
                 _refuse_company(port, where)
                 _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
             except (PortLost, DashboardError) as problem:
-                _wrong(f"{where}.host", str(problem))
+                raise DeviceAbsent(where=f"{where}.host", problem=str(problem)) from None
             exchange = Exchange(link, bus, limb)
             exchange.listen()
             _stop_if_moving(exchange)

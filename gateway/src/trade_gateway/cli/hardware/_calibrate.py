@@ -1,4 +1,4 @@
-"""``trade calibrate ROBOT.toml JOINT``: measures zero and range of a joint while a person moves it by hand."""
+"""``trade calibrate ROBOT.toml JOINT``: measures zero and range of a joint that a person moves, or imports them."""
 
 import difflib
 import os
@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from math import pi
+from math import pi, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar, cast
 
@@ -21,6 +21,7 @@ from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._output import Output
+from trade_gateway.cli.hardware._lerobot import imported, read_calibration
 
 if TYPE_CHECKING:
     import tomlkit
@@ -45,27 +46,43 @@ _Number = TypeVar("_Number", int, float)
 
 def calibrate(
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
-    joint: Annotated[str, typer.Argument(help="Name of the joint in the file: neck.pan.")],
+    joint: Annotated[
+        str | None, typer.Argument(help="Name of the joint in the file: neck.pan. With --from, by default all.")
+    ] = None,
     zero_here: Annotated[bool, typer.Option("--zero-here", help="Use the current position as zero.")] = False,
     range_from_motion: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", min=1.0, max=_LONGEST_S, help="Time to move it over its range, in seconds."),
     ] = None,
+    from_file: Annotated[
+        Path | None, typer.Option("--from", metavar="ARM.json", help="Import this calibration of LeRobot instead.")
+    ] = None,
+    bus: Annotated[str | None, typer.Option(help="With --from: bus of the arm, if several have its ids.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write the file without a prompt.")] = False,
 ) -> None:
-    """Measure zero and range of a joint that you move by hand.
+    """Measure zero and range of a joint that you move by hand, or import them.
 
     Both are written into the robot file, whose comments are kept.
     The joint's torque must be off. Nothing is written to the device.
+    --from imports homing offsets and ranges that LeRobot has measured and set, and opens no port.
 
     For example: trade calibrate rosie.toml neck.pan
     """
     out = Output(as_json=False)
     robot = load(robot_file)
     text = robot_file.read_text(encoding="utf-8")
-    record, bus = _joint(robot, joint)
-    with _slack(bus, record) as bench:
-        sweep = Sweep(bench, record.id, _place(bus, record))
+    if from_file is not None:
+        if zero_here or range_from_motion is not None:
+            raise UsageError(where="--from", problem="imports zero and range, and measures none; leave the others out")
+        _import(out, robot, robot_file, text, from_file, joint, bus, yes=yes)
+        return
+    if joint is None:
+        raise UsageError(where="JOINT", problem="missing; name the joint to measure")
+    if bus is not None:
+        raise UsageError(where="--bus", problem="needs --from")
+    record, line = _joint(robot, joint)
+    with _slack(line, record) as bench:
+        sweep = Sweep(bench, record.id, _place(line, record))
         values = _measure(out, record, sweep, zero_here=zero_here, seconds=range_from_motion)
         values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
     changed = with_values(text, joint, values)
@@ -73,12 +90,32 @@ def calibrate(
     _write(out, robot_file, text, changed, yes=yes)
 
 
+def _import(
+    out: Output, robot: Robot, path: Path, text: str, source: Path, joint: str | None, bus: str | None, *, yes: bool
+) -> None:
+    """Writes a calibration of LeRobot into the robot file."""
+    if joint is not None:
+        _joint(robot, joint)
+    values, remarks = imported(robot, read_calibration(source), str(source), joint, bus)
+    changed = text
+    for name, keys in values.items():
+        changed = with_values(changed, name, keys)
+    parse(changed, str(path))
+    for remark in remarks:
+        out.say(escape(remark))
+    _write(out, path, text, changed, yes=yes)
+
+
 class Ends(Struct, frozen=True):
-    """The ends that a device was moved to, in its own direction."""
+    """The ends that a device was moved to, in its own direction.
+
+    A device that passes the end of its encoder counts further here: ``low`` or ``high`` is then beyond half a turn.
+    """
 
     low: float
     high: float
     last: float
+    """Its last reading."""
 
 
 class Sweep:
@@ -98,19 +135,22 @@ class Sweep:
         """Reads positions until a condition holds.
 
         Raises:
-            ConfigurationError: the device passed the end of its encoder, or the condition did not hold in time.
+            ConfigurationError: it turned by more than a turn, or the condition did not hold in time.
         """
-        low = high = last = self.read()
+        low = high = at = last = self.read()
         until = time.monotonic() + longest_s
         while not done():
             if time.monotonic() > until:
                 problem = f"no answer to the prompt for {longest_s:g} s; nothing was written"
                 raise ConfigurationError(where=self._where, problem=problem)
-            now = self.read()
-            if abs(now - last) > pi or abs(now) > pi:
-                problem = "it turns past the end of its encoder: mount its horn so that it cannot, then try again"
+            last = self.read()
+            at = last + tau * round((at - last) / tau)  # 4095 to 0 is one count, not a turn
+            low, high = min(low, at), max(high, at)
+            if high - low >= tau:
+                problem = (
+                    "it turns by more than a whole turn, which one robot joint here cannot; move it between its ends"
+                )
                 raise ConfigurationError(where=self._where, problem=problem)
-            low, high, last = min(low, now), max(high, now), now
         return Ends(low, high, last)
 
     def still(self) -> float:
@@ -157,7 +197,7 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
         ends: the ends that the device was moved to; None keeps the range.
 
     Raises:
-        ConfigurationError: the joint was moved too little for a range.
+        ConfigurationError: the joint was moved too little for a range, or past the end of its encoder.
     """
     sign = -1 if joint.reversed else 1
     offset = joint.offset_rad if zero is None else -sign * zero
@@ -165,6 +205,13 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
     if ends is not None:
         if ends.high - ends.low < _LEAST_RAD:
             problem = f"was moved by {ends.high - ends.low:.3f} rad only; move it from one end to the other"
+            raise ConfigurationError(where=joint.name, problem=problem)
+        if ends.low < -pi or ends.high > pi:
+            problem = (
+                f"its range is {ends.high - ends.low:.3f} rad wide, but passes the end of its encoder, which a servo "
+                "cannot do by itself. Bring its middle to the centre of the encoder: mount its horn half a turn "
+                "further, or set its homing offset with the vendor's tool. Then try again"
+            )
             raise ConfigurationError(where=joint.name, problem=problem)
         low, high = sorted((offset + sign * ends.low, offset + sign * ends.high))
         values |= {"min_rad": low + _MARGIN_RAD, "max_rad": high - _MARGIN_RAD}

@@ -16,6 +16,7 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
 from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.cli.hardware import _doctor_robot as robots
+from trade_gateway.cli.hardware._doctor_brltty import brltty
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._scan import serial_ports
 
@@ -56,6 +57,7 @@ def doctor(
 def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Finding]:
     yield from host.ports(serial_ports(), _lines_of(robot_file))
     yield from host.latencies()
+    yield from brltty()
     if robot_file is None:
         yield from host.libraries(sorted(drivers()), needed=False)
     yield from host.clock()

@@ -75,6 +75,8 @@ def _joint(one: Found) -> list[str]:
         keys.append(f"firmware = {_text(one.firmware)}      # any other is refused as another device")
     if one.serial_number is not None:
         keys.append(f"serial_number = {one.serial_number}    # any other is refused as another device")
+    if one.homing_counts:
+        keys.append(f"homing_counts = {one.homing_counts}    # its own homing offset; any other is refused")
     if one.wire == "can":
         if one.driver == "cia402":
             keys.append(_counts_per_rev(one.counts_per_rev))

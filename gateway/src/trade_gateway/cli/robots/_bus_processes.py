@@ -10,7 +10,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
 
 from trade import Container, where
-from trade.errors import ConfigurationError, TradeError
+from trade.errors import ConfigurationError, DeviceAbsent, TradeError
 from trade_drivers import FaultInfo
 from trade_drivers.robotfile import Robot
 from trade_gateway.process._signals import SignalEvent
@@ -69,13 +69,15 @@ class BusProcesses:
         """Waits until all are up, or until ``leave`` is set.
 
         Raises:
-            ConfigurationError: one ended instead; with its last words.
+            DeviceAbsent: one ended instead, since a device does not answer.
+            ConfigurationError: one ended for another reason; with its last words.
         """
         while self._supervisor is not None and not leave.is_set():
             children = self._supervisor.children()
             for child in children:
                 if child.restarts or child.state in ("waiting", "given up"):
-                    raise ConfigurationError(where=child.name, problem=child.why)
+                    kind = DeviceAbsent if child.absent else ConfigurationError
+                    raise kind(where=child.name, problem=child.why)
             if len(children) == len(self.names) and all(child.state == "up" for child in children):
                 return
             leave.wait(_LOOK_EVERY_S)

@@ -1,0 +1,31 @@
+"""What naive code makes of setting up a robot and of its computer. Each changes one function."""
+
+from collections.abc import Callable
+
+import pytest
+
+from trade_gateway.cli.hardware._calibrate import Ends, Sweep
+from trade_gateway.supervisor._restart_policy import Life, Transition
+
+
+def a_range_is_the_least_and_the_greatest_reading(patch: pytest.MonkeyPatch) -> None:
+    def until(self: Sweep, done: Callable[[], bool], longest_s: float) -> Ends:
+        readings = [self.read()]
+        while not done():
+            readings.append(self.read())
+        return Ends(min(readings), max(readings), readings[-1])
+
+    patch.setattr(Sweep, "until", until)
+
+
+def a_start_without_its_device_is_a_crash(patch: pytest.MonkeyPatch) -> None:
+    ended = Life.ended
+
+    def counted(self: Life, now: float, how: str, *, absent: bool = False) -> Transition | None:
+        return ended(self, now, how)
+
+    patch.setattr(Life, "ended", counted)
+
+
+def no_rule_of_udev_is_read(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_gateway.cli.hardware._doctor_brltty._lines", lambda _: [])
