@@ -10,7 +10,8 @@ from trade import current_call
 from trade.errors import InvalidArgument, LimitExceeded
 from trade_drivers._validation import finite, one_each
 from trade_drivers.motion._plan import Course, JointLimits, Plan, Tolerances, Track
-from trade_drivers.motion._spline import Curve
+from trade_drivers.motion._ramps import Passage
+from trade_drivers.motion._spline import Curve, Piece, cubic
 
 __all__ = ["Trajectory", "TrajectoryPoint", "checked", "planned"]
 
@@ -31,8 +32,10 @@ class TrajectoryPoint(Struct, frozen=True, kw_only=True):
 class Trajectory(Struct, frozen=True, kw_only=True):
     """Angles over time.
 
-    Between two points, each joint follows the cubic curve with the angles and speeds of both. Without velocities, the
-    trajectory begins and ends at rest, and the driver chooses intermediate speeds so that no point is overshot.
+    Between two points, each joint follows the cubic curve with the angles and speeds of both. If that curve breaks a
+    limit, the joint follows the motion with ramps at its full acceleration around a cruise, if there is one. Without
+    velocities, the trajectory begins and ends at rest, and the driver chooses intermediate speeds so that no point is
+    overshot; then all pieces are cubic.
     """
 
     joints: list[str]
@@ -59,11 +62,53 @@ def planned(trajectory: Trajectory, tolerances: Tolerances, limits: Sequence[Joi
     velocities = _velocities(trajectory, service)
     tracks: list[Track] = []
     for column, limit in zip(order, limits, strict=True):
-        speeds = None if velocities is None else [row[column] for row in velocities]
-        tracks.append(Track(limit, Curve.through(times, [row[column] for row in positions], speeds)))
+        angles = [row[column] for row in positions]
+        if velocities is None:
+            tracks.append(Track(limit, Curve.through(times, angles)))
+        else:
+            tracks.append(Track(limit, _curve(limit, times, angles, [row[column] for row in velocities])))
     _tolerable(tolerances, service)
     _in_time(times[-1], service)
     return checked(tracks, tolerances)
+
+
+def _curve(
+    limits: JointLimits, times_s: Sequence[float], angles_rad: Sequence[float], speeds_rad_s: Sequence[float]
+) -> Curve:
+    """Returns a curve through points with speeds; where the cubic piece would break a limit, the motion is ramped.
+
+    Raises:
+        LimitExceeded: a point exceeds a limit, or no motion between two points keeps those of speed and acceleration.
+    """
+    speed, accel = limits.max_speed_rad_s, limits.max_accel_rad_s2
+    low, high = _range(limits, angles_rad[0])
+    _keep(limits.name, "angle", "rad", list(zip(times_s, angles_rad, strict=True)), low, high)
+    _keep(limits.name, "speed", "rad/s", list(zip(times_s, speeds_rad_s, strict=True)), -speed, speed)
+    speed = max(speed, *map(abs, speeds_rad_s))  # they exceed it by no more than rounding
+    pieces: list[Piece] = []
+    for (begins_s, start, before), (ends_s, end, after) in pairwise(
+        zip(times_s, angles_rad, speeds_rad_s, strict=True)
+    ):
+        piece = cubic(begins_s, start, ends_s, end, before, after)
+        if _keeps(limits, piece, angles_rad[0]):
+            pieces.append(piece)
+            continue
+        passage = Passage(begins_s, ends_s - begins_s, start, end, before, after)
+        if (ramped := passage.ramped(speed, accel)) is None:
+            if abs(mean := passage.mean_rad_s) > speed:
+                raise _beyond(limits.name, "speed", "rad/s", begins_s, mean, -speed, speed)
+            needed = passage.least_accel_rad_s2(speed)
+            raise _beyond(limits.name, "acceleration", "rad/s2", begins_s, needed, -accel, accel)
+        pieces += ramped
+    return Curve(pieces)
+
+
+def _keeps(limits: JointLimits, piece: Piece, start_rad: float) -> bool:
+    try:
+        _within(limits, [piece], start_rad)
+    except LimitExceeded:
+        return False
+    return True
 
 
 def checked(tracks: Sequence[Track], tolerances: Tolerances) -> Plan:
@@ -75,26 +120,38 @@ def checked(tracks: Sequence[Track], tolerances: Tolerances) -> Plan:
         LimitExceeded: a track exceeds a limit.
     """
     for limits, curve in tracks:
-        ends = (limits.min_rad, limits.max_rad)
-        start, goal = curve.at(0)[0], curve.at(inf)[0]
-        _keep(limits.name, "angle", "rad", [(curve.duration_s, goal)], *ends)
-        _keep(limits.name, "angle", "rad", _each(curve, "angles"), min(start, ends[0]), max(start, ends[1]))
-        speed, accel = limits.max_speed_rad_s, limits.max_accel_rad_s2
-        _keep(limits.name, "speed", "rad/s", _each(curve, "speeds"), -speed, speed)
-        _keep(limits.name, "acceleration", "rad/s2", _each(curve, "accels"), -accel, accel)
+        goal = curve.at(inf)[0]
+        _keep(limits.name, "angle", "rad", [(curve.duration_s, goal)], limits.min_rad, limits.max_rad)
+        _within(limits, curve.pieces, curve.at(0)[0])
     return Plan(tracks, tolerances, Course([limits.name for limits, _ in tracks], tracks[0].curve.duration_s))
 
 
-def _each(curve: Curve, what: str) -> list[tuple[float, float]]:
-    return [(piece.begins_s, value) for piece in curve.pieces for value in getattr(piece, what)()]
+def _within(limits: JointLimits, pieces: Sequence[Piece], start_rad: float) -> None:
+    """Raises ``LimitExceeded`` if pieces exceed a limit; the range includes the start of the motion."""
+    low, high = _range(limits, start_rad)
+    speed, accel = limits.max_speed_rad_s, limits.max_accel_rad_s2
+    angles = [(piece.begins_s, each) for piece in pieces for each in piece.angles()]
+    _keep(limits.name, "angle", "rad", angles, low, high)
+    speeds = [(piece.begins_s, each) for piece in pieces for each in piece.speeds()]
+    _keep(limits.name, "speed", "rad/s", speeds, -speed, speed)
+    accels = [(piece.begins_s, each) for piece in pieces for each in piece.accels()]
+    _keep(limits.name, "acceleration", "rad/s2", accels, -accel, accel)
+
+
+def _range(limits: JointLimits, start_rad: float) -> tuple[float, float]:
+    return min(start_rad, limits.min_rad), max(start_rad, limits.max_rad)
 
 
 def _keep(joint: str, what: str, unit: str, values: Sequence[tuple[float, float]], lower: float, upper: float) -> None:
     slack = _ROUNDING * max(1.0, upper - lower)
     for time_s, value in values:
         if not lower - slack <= value <= upper + slack:
-            where = f"{joint} {what} from {time_s:.4g} s on"
-            raise LimitExceeded(what=where, value=value, lower=lower, upper=upper, unit=unit)
+            raise _beyond(joint, what, unit, time_s, value, lower, upper)
+
+
+def _beyond(joint: str, what: str, unit: str, time_s: float, value: float, lower: float, upper: float) -> LimitExceeded:
+    where = f"{joint} {what} from {time_s:.4g} s on"
+    return LimitExceeded(what=where, value=value, lower=lower, upper=upper, unit=unit)
 
 
 def _order(trajectory: Trajectory, joints: Sequence[str], service: str) -> list[int]:
