@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+import msgspec
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from trade.errors import LimitExceeded
+from trade.errors import InvalidArgument, LimitExceeded, TradeError
 from trade_drivers import JointLimits, Tolerances, Trajectory, TrajectoryPoint, planned
 from trade_drivers.motion._plan import Plan
 
@@ -184,3 +185,57 @@ def test_S22_within_a_piece_the_range_is_left_no_farther_than_braking_needs() ->
     with pytest.raises(LimitExceeded, match=r"angle from 0\.2 s on") as refused:
         plan(rows((0.0, 0.0, 0.0), (0.2, 0.1, 1.0), (0.6, 0.14, 0.0)), 0.0, 0.14)
     assert 0.14 < refused.value.value <= 0.15 + 1e-9
+
+
+# --- rest and 0, to what a joint resolves
+
+
+@pytest.mark.parametrize("speed", [1e-12, -4e-7, 5e-5, 1e-3])
+def test_a_last_speed_that_no_joint_resolves_is_rest(speed: float) -> None:
+    made = plan(rows((0.0, 0.0, 0.0), (1.0, 0.5, speed)))
+    assert made.tracks[0].curve.at(1.0) == (pytest.approx(0.5), 0.0)
+
+
+@pytest.mark.parametrize("speed", [0.05, -0.05, 2e-3])
+def test_S22_a_last_speed_is_refused_with_its_joint_and_its_size(speed: float) -> None:
+    with pytest.raises(InvalidArgument, match=rf"rosie\.joint still has {speed:g} rad/s .* must end at rest"):
+        plan(rows((0.0, 0.0, 0.0), (1.0, 0.5, speed)))
+
+
+def test_a_ramp_that_is_cut_off_just_before_its_end_is_no_faster_for_it() -> None:
+    ends_s = 0.2 - 5e-5
+    profile = Profile([(0.2, ACCEL), (0.2, -ACCEL)])
+    trajectory = rows(*((at, *profile.at(at)) for at in (0.0, 0.1, 0.2, 0.3, 0.2 + ends_s)))
+    judge(plan(trajectory), trajectory, 0.0, 0.4)
+
+
+@pytest.mark.parametrize("first_s", [1e-12, -1e-12, 1e-9, 9e-4])
+def test_a_first_time_that_is_almost_0_is_0(first_s: float) -> None:
+    [(_, curve)] = plan(rows((first_s, 0.0, 0.0), (1.0 + first_s, 0.5, 0.0))).tracks
+    assert (curve.at(0), curve.duration_s) == ((0.0, 0.0), pytest.approx(1.0))
+
+
+@pytest.mark.parametrize("first_s", [1e-3, 0.05, -0.05])
+def test_S22_a_first_time_is_refused_with_its_size(first_s: float) -> None:
+    with pytest.raises(InvalidArgument, match=rf"the first is {first_s:g}; it must be 0"):
+        plan(rows((first_s, 0.0, 0.0), (1.0, 0.5, 0.0)))
+
+
+@pytest.mark.parametrize("accel", [10.0, -10.0])
+def test_accelerations_of_points_are_accepted_within_the_limits(accel: float) -> None:
+    with_it = msgspec.structs.replace(rows((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)).points[1], accelerations_rad_s2=[accel])
+    plan(Trajectory(joints=["rosie.joint"], points=[rows((0.0, 0.0, 0.0)).points[0], with_it]))
+
+
+@pytest.mark.parametrize(
+    ("accels", "error", "says"),
+    [
+        ([10.1], LimitExceeded, r"rosie\.joint acceleration from 1 s on: 10\.1 rad/s2 is outside -10 to 10"),
+        ([math.nan], InvalidArgument, r"accelerations_rad_s2.*finite"),
+        ([1.0, 2.0], InvalidArgument, r"accelerations_rad_s2.*takes 1"),
+    ],
+)
+def test_S22_accelerations_of_points_keep_the_limits(accels: list[float], error: type[TradeError], says: str) -> None:
+    with_it = msgspec.structs.replace(rows((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)).points[1], accelerations_rad_s2=accels)
+    with pytest.raises(error, match=says):
+        plan(Trajectory(joints=["rosie.joint"], points=[rows((0.0, 0.0, 0.0)).points[0], with_it]))

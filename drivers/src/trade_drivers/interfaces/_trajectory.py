@@ -16,17 +16,23 @@ from trade_drivers.motion._spline import Curve, Piece, cubic
 __all__ = ["Trajectory", "TrajectoryPoint", "checked", "planned"]
 
 _ROUNDING = 1e-6
+_AT_ONCE_S = 1e-3
+"""A first time below this is rounding of 0."""
+_REST_RAD_S = 1e-3
+"""A last velocity up to this is rest, as no joint resolves it."""
 
 
 class TrajectoryPoint(Struct, frozen=True, kw_only=True):
     """The positions of all joints at one time."""
 
     time_from_start_s: float
-    """0 at the first point; increases from point to point."""
+    """0 at the first point, to less than a millisecond; increases from point to point."""
     positions_rad: list[float]
     """In the order of the trajectory's ``joints``."""
     velocities_rad_s: list[float] | None = None
-    """In the same order; given at all points or at none."""
+    """In the same order; given at all points or at none. The last ones are 0, to 1e-3 rad/s."""
+    accelerations_rad_s2: list[float] | None = None
+    """In the same order; given at any points. They must keep the limits; the curve follows from the rest."""
 
 
 class Trajectory(Struct, frozen=True, kw_only=True):
@@ -60,8 +66,11 @@ def planned(trajectory: Trajectory, tolerances: Tolerances, limits: Sequence[Joi
         for point in trajectory.points
     ]
     velocities = _velocities(trajectory, service)
+    accelerations = _accelerations(trajectory, service)
     tracks: list[Track] = []
     for column, limit in zip(order, limits, strict=True):
+        accels = [(time_s, row[column]) for time_s, row in accelerations]
+        _keep(limit.name, "acceleration", "rad/s2", accels, -limit.max_accel_rad_s2, limit.max_accel_rad_s2)
         angles = [row[column] for row in positions]
         if velocities is None:
             tracks.append(Track(limit, Curve.through(times, angles)))
@@ -167,14 +176,14 @@ def _times(trajectory: Trajectory, service: str) -> list[float]:
     problem = ""
     if len(times) < 2:
         problem = f"there are {len(times)} points; a trajectory has at least two"
-    elif times[0] != 0:
+    elif abs(times[0]) >= _AT_ONCE_S:
         problem = f"the first is {times[0]:g}; it must be 0, at the current position of the joints"
     else:
         late = [(before, after) for before, after in pairwise(times) if not after > before]
         problem = f"{late[0][1]:g} comes after {late[0][0]:g}; times must increase" if late else ""
     if problem:
         raise InvalidArgument(service=service, argument=argument, problem=problem)
-    return times
+    return [time_s - times[0] for time_s in times]
 
 
 def _velocities(trajectory: Trajectory, service: str) -> list[list[float]] | None:
@@ -186,11 +195,24 @@ def _velocities(trajectory: Trajectory, service: str) -> list[list[float]] | Non
     problem = ""
     if len(rows) < len(given):
         problem = f"{len(rows)} of {len(given)} points have velocities; give them at all points or at none"
-    elif any(rows[-1]):
-        problem = f"the last velocities are {rows[-1]}; a trajectory must end at rest"
+    elif moving := [each for each in zip(trajectory.joints, rows[-1], strict=True) if abs(each[1]) > _REST_RAD_S]:
+        joint, speed = moving[0]
+        problem = f"{joint} still has {speed:g} rad/s at the last point; a trajectory must end at rest (0)"
     if problem:
         raise InvalidArgument(service=service, argument=argument, problem=problem)
     return rows
+
+
+def _accelerations(trajectory: Trajectory, service: str) -> list[tuple[float, list[float]]]:
+    """Returns the time and the accelerations of each point that has some."""
+    return [
+        (
+            point.time_from_start_s,
+            one_each(point.accelerations_rad_s2, trajectory.joints, service, "trajectory.accelerations_rad_s2"),
+        )
+        for point in trajectory.points
+        if point.accelerations_rad_s2 is not None
+    ]
 
 
 def _tolerable(tolerances: Tolerances, service: str) -> None:
