@@ -17,6 +17,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade._atomic_file import replace
+from trade._text_file import as_before, as_text
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
@@ -62,7 +63,8 @@ def calibrate(
     """
     out = Output(as_json=False)
     robot = load(robot_file)
-    text = robot_file.read_text(encoding="utf-8")
+    before = robot_file.read_bytes()
+    text = as_text(before)
     record, bus = _joint(robot, joint)
     with _slack(bus, record) as bench:
         sweep = Sweep(bench, record.id, _place(bus, record))
@@ -70,7 +72,7 @@ def calibrate(
         values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
     changed = with_values(text, joint, values)
     parse(changed, str(robot_file))
-    _write(out, robot_file, text, changed, yes=yes)
+    _write(out, robot_file, before, changed, yes=yes)
 
 
 class Ends(Struct, frozen=True):
@@ -300,8 +302,9 @@ def _enter_pressed() -> bool:
     return False
 
 
-def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> None:
+def _write(out: Output, path: Path, contents: bytes, after: str, *, yes: bool) -> None:
     """Shows the changes, prompts, and replaces the whole file."""
+    before = as_text(contents)
     if before == after:
         out.say("the file has these values already; nothing was written")
         return
@@ -312,10 +315,10 @@ def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> No
         out.say("nothing was written")
         raise typer.Exit(1)
     target = path.resolve()
-    if target.read_text(encoding="utf-8") != before:
+    if target.read_bytes() != contents:
         raise ConfigurationError(where=name, problem="was changed meanwhile; nothing was written")
     try:
-        replace(target, after.encode(), stat.S_IMODE(target.stat().st_mode))
+        replace(target, as_before(contents, after), stat.S_IMODE(target.stat().st_mode))
     except OSError as bad:
         raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is unchanged") from None
     out.say(f"[bold]{escape(name)}[/] is written")
