@@ -14,9 +14,7 @@ _EVERY_S = 0.07
 """No whole part of the ramps: between two points, a cubic curve breaks the limits."""
 
 
-def _trapezoid(
-    joints: list[str], starts: list[float], limits: JointLimits, end_rad: float, factor: float
-) -> Trajectory:
+def trapezoid(joints: list[str], starts: list[float], limits: JointLimits, end_rad: float, factor: float) -> Trajectory:
     """The first joint goes to an angle at its greatest speed and acceleration, the others stay."""
     speed, accel, way = limits.max_speed_rad_s, limits.max_accel_rad_s2 * factor, end_rad - starts[0]
     ramp_s = speed / accel
@@ -51,9 +49,9 @@ def test_S22_a_profile_at_the_limits_is_followed_to_the_end_of_the_range(rig: Jo
     mark = written_now()
     for factor in (1.1, 1.3):
         with pytest.raises(LimitExceeded, match="acceleration"):
-            group.follow(_trapezoid(group.joints(), starts, limits, rig.max_rad, factor))
+            group.follow(trapezoid(group.joints(), starts, limits, rig.max_rad, factor))
     assert not rig.sent_away(mark)
-    ended = group.follow(_trapezoid(group.joints(), starts, limits, rig.max_rad, 1.0), Tolerances(path_rad=0.5))
+    ended = group.follow(trapezoid(group.joints(), starts, limits, rig.max_rad, 1.0), Tolerances(path_rad=0.5))
     assert ended[0] == pytest.approx(rig.max_rad, abs=rig.within_rad)
     sent = rig.targets_rad(mark)
     assert max(sent) <= rig.max_rad + rig.exactly_rad
@@ -69,7 +67,7 @@ def test_S22_an_arm_follows_a_profile_at_the_limits_of_a_joint() -> None:
         names, starts, limits = [joint.name for joint in joints], rig.arm.state().positions_rad, joints[0]
         for factor in (1.1, 1.3):
             with pytest.raises(LimitExceeded, match="acceleration"):
-                rig.arm.follow(_trapezoid(names, starts, limits, starts[0] + 1.0, factor))
+                rig.arm.follow(trapezoid(names, starts, limits, starts[0] + 1.0, factor))
         assert not rig.moves()
-        rig.arm.follow(_trapezoid(names, starts, limits, starts[0] + 1.0, 1.0), Tolerances(path_rad=0.5))
+        rig.arm.follow(trapezoid(names, starts, limits, starts[0] + 1.0, 1.0), Tolerances(path_rad=0.5))
         assert rig.base_rad == pytest.approx(starts[0] + 1.0, abs=0.01)
