@@ -221,6 +221,16 @@ def test_S22_a_first_time_is_refused_with_its_size(first_s: float) -> None:
         plan(rows((first_s, 0.0, 0.0), (1.0, 0.5, 0.0)))
 
 
+@pytest.mark.parametrize("step_s", [0.0, 1e-200, 1e-12, -1.0])
+def test_S22_points_at_one_time_are_refused(step_s: float) -> None:
+    with pytest.raises(InvalidArgument, match="times must increase, by 1 ns at least"):
+        plan(rows((0.0, 0.0, 0.0), (step_s, 0.0, 0.0), (1.0, 0.0, 0.0)))
+
+
+def test_points_a_nanosecond_apart_are_accepted() -> None:
+    plan(rows((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (5.000000001, 0.0, 0.0), (6.0, 0.0, 0.0)))
+
+
 @pytest.mark.parametrize("accel", [10.0, -10.0])
 def test_accelerations_of_points_are_accepted_within_the_limits(accel: float) -> None:
     with_it = msgspec.structs.replace(rows((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)).points[1], accelerations_rad_s2=[accel])

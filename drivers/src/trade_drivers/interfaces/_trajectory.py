@@ -18,6 +18,8 @@ __all__ = ["Trajectory", "TrajectoryPoint", "checked", "planned"]
 _ROUNDING = 1e-6
 _AT_ONCE_S = 1e-3
 """A first time below this is rounding of 0."""
+_STEP_S = 0.99e-9
+"""The least time between two points: 1 ns, to rounding, as in ROS."""
 _REST_RAD_S = 1e-3
 """A last velocity up to this is rest, as no joint resolves it."""
 
@@ -179,8 +181,8 @@ def _times(trajectory: Trajectory, service: str) -> list[float]:
     elif abs(times[0]) >= _AT_ONCE_S:
         problem = f"the first is {times[0]:g}; it must be 0, at the current position of the joints"
     else:
-        late = [(before, after) for before, after in pairwise(times) if not after > before]
-        problem = f"{late[0][1]:g} comes after {late[0][0]:g}; times must increase" if late else ""
+        late = [(before, after) for before, after in pairwise(times) if after - before < _STEP_S]
+        problem = f"{late[0][1]:g} comes after {late[0][0]:g}; times must increase, by 1 ns at least" if late else ""
     if problem:
         raise InvalidArgument(service=service, argument=argument, problem=problem)
     return [time_s - times[0] for time_s in times]
