@@ -136,7 +136,7 @@ def _trajectory(*rows: Row) -> Callable[[JointGroup], object]:
         (_trajectory((0.0, [0.0, 0.0]), (0.7, [1.2, 0.0])), LimitExceeded, "neck.pan speed"),
         (_trajectory((0.0, [0.0, 0.0]), (0.2, [0.2, 0.0])), LimitExceeded, "neck.pan acceleration"),
         (
-            _trajectory((0.0, [0.0, 0.5], [0.0, 2.0]), (1.0, [0.0, 0.5], [0.0, 0.0])),
+            _trajectory((0.0, [0.0, 0.5], [0.0, 2.3]), (1.0, [0.0, 0.5], [0.0, 0.0])),
             LimitExceeded,
             "neck.tilt angle",  # only between the points
         ),

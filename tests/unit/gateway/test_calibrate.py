@@ -200,6 +200,16 @@ def test_zero_is_the_current_position_and_nothing_is_written_to_the_device(rosie
     assert not writes(list(rosie.sim.log.entries))
 
 
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_line_ends_and_a_byte_order_mark_stay(rosie: Rosie, mark: bytes) -> None:
+    rosie.file.write_bytes(mark + rosie.text.replace("\n", "\r\n").encode())
+    rosie.sim.devices[0].place(2148, 0.0)
+    said = rosie.calibrate("neck.pan", "--zero-here", "--yes")
+    assert said.exit_code == 0, said.output
+    expected = rosie.text.replace("min_rad = -1.4 ", "offset_rad = -0.1534\nmin_rad = -1.4 ")
+    assert rosie.file.read_bytes() == mark + expected.replace("\n", "\r\n").encode()
+
+
 def test_answering_no_leaves_the_file_unchanged(rosie: Rosie) -> None:
     rosie.sim.devices[0].place(2148, 0.0)
     said = rosie.calibrate("neck.pan", "--zero-here", says="n\n")

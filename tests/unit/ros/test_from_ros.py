@@ -318,6 +318,31 @@ def test_a_trajectory_is_sent_to_ros_in_the_joint_order_of_the_call(stand: Stand
     assert [point["positions"] for point in arm.goals[0]["points"]] == [[0.0, 0.0], [-1.0, 1.0]]
 
 
+def _trajectory(last_rad_s: list[float]) -> dict[str, Any]:
+    points = [
+        {
+            "time_from_start_s": t,
+            "positions_rad": [t, -t],
+            "velocities_rad_s": speeds,
+            "accelerations_rad_s2": [1.0, 2.0],
+        }
+        for t, speeds in ((0.0, [0.0, 0.0]), (1.0, last_rad_s))
+    ]
+    return {"joints": ["lab.arm.b", "lab.arm.a"], "points": points}
+
+
+def test_speeds_and_accelerations_are_sent_to_ros_too_and_the_last_speed_is_0(stand: Stand, arm: RosArm) -> None:
+    found(stand, "lab.arm", "follow")(_trajectory([4e-7, -5e-5]))
+    assert [point["velocities"] for point in arm.goals[0]["points"]] == [[0.0, 0.0], [0.0, 0.0]]
+    assert [point["accelerations"] for point in arm.goals[0]["points"]] == [[2.0, 1.0], [2.0, 1.0]]
+
+
+def test_a_trajectory_that_ends_in_motion_is_not_sent_to_ros(stand: Stand, arm: RosArm) -> None:
+    with pytest.raises(InvalidArgument, match=r"lab\.arm\.a still has 0\.05 rad/s at the last point"):
+        found(stand, "lab.arm", "follow")(_trajectory([0.0, 0.05]))
+    assert arm.goals == []
+
+
 @pytest.mark.parametrize("how", ["move_to", "follow"])
 def test_a_motion_in_ros_is_answered_with_where_the_joints_are_at_its_end(stand: Stand, arm: RosArm, how: str) -> None:
     points = [{"time_from_start_s": 1.0, "positions_rad": [0.4, -0.4]}]

@@ -75,6 +75,54 @@ def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, ar
     assert arm.at == pytest.approx([0.5, -0.5])
 
 
+def profile(*points: tuple[float, float, float, float]) -> dict[str, Any]:
+    """The same time, angle, speed and acceleration for both joints."""
+    asked = goal(*((at, [angle] * 2) for at, angle, _, _ in points))
+    for point, (_, _, speed, accel) in zip(asked["trajectory"]["points"], points, strict=True):
+        point |= {"velocities": [speed] * 2, "accelerations": [accel] * 2}
+    return asked
+
+
+@pytest.mark.parametrize("last_rad_s", [1e-12, 4e-7, 5e-5])
+def test_a_last_speed_that_no_joint_resolves_is_rest(stand: Stand, arm: Limb, last_rad_s: float) -> None:
+    stand.up(ARM)
+    outcome = ended(stand.node(), profile((0.0, 0.0, 0.0, 1.0), (2.0, 0.5, last_rad_s, -1.0)))
+    assert (outcome.how, outcome.result["error_string"]) == (Ended.SUCCEEDED, "")
+    assert arm.at == pytest.approx([0.5, 0.5])
+
+
+@pytest.mark.parametrize("first_s", [1e-9, 9e-4])
+def test_a_first_point_that_is_almost_at_0_s_is_the_first(stand: Stand, arm: Limb, first_s: float) -> None:
+    stand.up(ARM)
+    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is Ended.SUCCEEDED
+    assert [track.curve.at(0.0)[0] for track in arm.plans[0].tracks] == [0.0, 0.0]
+    assert [len(track.curve.pieces) for track in arm.plans[0].tracks] == [1, 1]
+
+
+@pytest.mark.parametrize("first_s", [1e-3, 0.05])
+def test_a_first_point_later_than_that_begins_with_the_way_there(stand: Stand, arm: Limb, first_s: float) -> None:
+    stand.up(ARM)
+    assert ended(stand.node(), profile((first_s, 0.0, 0.0, 0.0), (2.0, 0.5, 0.0, 0.0))).how is Ended.SUCCEEDED
+    assert [len(track.curve.pieces) for track in arm.plans[0].tracks] == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ("last_rad_s", "accel", "says"),
+    [
+        (0.05, 0.0, "rosie.arm.a still has 0.05 rad/s at the last point"),
+        (0.0, 31.0, "rosie.arm.a acceleration from 2 s on: 31 rad/s2 is outside -30 to 30"),
+    ],
+)
+def test_S22_a_last_speed_and_accelerations_are_refused_with_joint_and_size(
+    stand: Stand, arm: Limb, last_rad_s: float, accel: float, says: str
+) -> None:
+    stand.up(ARM)
+    outcome = ended(stand.node(), profile((0.0, 0.0, 0.0, 0.0), (2.0, 0.5, last_rad_s, accel)))
+    assert outcome.how is Ended.ABORTED
+    assert says in outcome.result["error_string"]
+    assert arm.plans == []
+
+
 @pytest.mark.parametrize(
     ("asked", "code", "says"),
     [

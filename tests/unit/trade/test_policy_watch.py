@@ -54,20 +54,20 @@ def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
 ) -> None:
     """A copy by another user with a later right to read changes nothing else of the file."""
     monkeypatch.setattr("trade._container.policy_reload._AGAIN_NS", 10**15)
-    listed, may = tmp_path / "revoked.toml", Path.read_text
+    listed, may = tmp_path / "revoked.toml", Path.read_bytes
     listed.write_text("revoked = []")
     rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
     wait_until(lambda: "thief is revoked no more" in caplog.text, "the list is named now")
 
-    def refused(path: Path, **options: str) -> str:
+    def refused(path: Path) -> bytes:
         if path == listed:
             raise PermissionError(13, "Permission denied")
-        return may(path, **options)
+        return may(path)
 
-    monkeypatch.setattr(Path, "read_text", refused)
+    monkeypatch.setattr(Path, "read_bytes", refused)
     listed.write_text('revoked = ["planner"]')
     wait_until(lambda: "Permission denied" in caplog.text, "it cannot be read")
-    monkeypatch.setattr(Path, "read_text", may)
+    monkeypatch.setattr(Path, "read_bytes", may)
     listed.chmod(0o640)
     wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
     assert watching.access.policy is not None
@@ -77,14 +77,14 @@ def test_files_that_were_refused_are_tried_again_as_they_are(
     watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade._container.policy_reload._AGAIN_NS", 10**9)
-    may, down = Path.read_text, [False]
+    may, down = Path.read_bytes, [False]
 
-    def passing(path: Path, **options: str) -> str:
+    def passing(path: Path) -> bytes:
         if path == policy and down[0]:
             raise OSError(5, "Input/output error")
-        return may(path, **options)
+        return may(path)
 
-    monkeypatch.setattr(Path, "read_text", passing)
+    monkeypatch.setattr(Path, "read_bytes", passing)
     rewritten(policy, 'revoked = ["thief"]', 'revoked = ["thief", "planner"]')
     down[0] = True
     wait_until(lambda: "Input/output error" in caplog.text, "it cannot be read")

@@ -300,10 +300,10 @@ def test_a_folder_that_this_user_may_not_enter_is_named_with_its_owner(
 ) -> None:
     folder = papers.of("arm")
 
-    def denied(_self: Path, **_: object) -> str:
+    def denied(_self: Path) -> bytes:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_text", denied)
+    monkeypatch.setattr(Path, "read_bytes", denied)
     monkeypatch.setattr(os, "access", lambda path, _mode: Path(path) != folder)
     with pytest.raises(ConfigurationError) as refused:
         Certificate.read(folder)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
@@ -36,7 +37,7 @@ def chosen_settings(environment: Mapping[str, str]) -> dict[str, str]:
             return {}
         if hasattr(os, "getuid") and (state.st_uid != os.getuid() or stat.S_IMODE(state.st_mode) & 0o022):
             raise ConfigurationError(where=str(file), problem=f"others may write this file; {_REMEDY}")
-        found = read_toml_text(file.read_text(encoding="utf-8"))
+        found = read_toml_text(read_text(file))
     except (FileNotFoundError, NotADirectoryError, PermissionError):
         return {}
     except (OSError, ValueError) as bad:

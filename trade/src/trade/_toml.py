@@ -18,6 +18,6 @@ def read_toml_text(text: str) -> dict[str, Any]:
         ValueError: the text is not TOML, or is nested too deeply.
     """
     try:
-        return tomllib.loads(text)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        return tomllib.loads(text.removeprefix("\ufeff"))  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

@@ -6,7 +6,7 @@ from itertools import pairwise
 from math import copysign, sqrt
 from typing import Final, NamedTuple
 
-__all__ = ["Curve", "Piece", "Way", "there_together"]
+__all__ = ["Curve", "Piece", "Way", "cubic", "there_together"]
 
 
 class Piece(NamedTuple):
@@ -71,7 +71,7 @@ class Curve:
         points = list(zip(times_s, positions_rad, strict=True))
         speeds = _chosen(points) if velocities_rad_s is None else velocities_rad_s
         ends = zip(pairwise(points), pairwise(speeds), strict=True)
-        return cls([_piece(*first, *second, *both) for (first, second), both in ends])
+        return cls([cubic(*first, *second, *both) for (first, second), both in ends])
 
     @property
     def duration_s(self) -> float:
@@ -88,7 +88,8 @@ class Curve:
         return piece.at(time_s - piece.begins_s)
 
 
-def _piece(begins_s: float, start: float, ends_s: float, end: float, before: float, after: float) -> Piece:
+def cubic(begins_s: float, start: float, ends_s: float, end: float, before: float, after: float) -> Piece:
+    """Returns the cubic piece between two points, each a time in s, an angle in rad, and a speed in rad/s."""
     duration = ends_s - begins_s
     slope = (end - start) / duration
     accel = 2 / duration * (3 * slope - 2 * before - after)

@@ -3,6 +3,7 @@
 from os import PathLike
 from pathlib import Path
 
+from trade._text_file import read_text
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Robot, parse
 
@@ -17,7 +18,7 @@ def load(path: str | PathLike[str]) -> Robot:
     """
     where = str(path)
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(Path(path))
     except FileNotFoundError:
         raise ConfigurationError(where=where, problem="there is no such file") from None
     except IsADirectoryError:

@@ -9,6 +9,7 @@ from trade._container.policy_reload import different
 from trade._security.certificates import Certificate
 from trade._security.policy import Policy
 from trade._security.policy_file import policy_files
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
@@ -68,7 +69,7 @@ def _digest(files: Sequence[Path]) -> str:
 
 def _beside(path: Path) -> list[Path]:
     try:
-        raw = read_toml_text(path.read_text(encoding="utf-8"))
+        raw = read_toml_text(read_text(path))
     except (OSError, ValueError):  # the reload reports the error
         return []
     shares = raw.get("share")

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Struct
 
 from trade import Settings
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
@@ -269,7 +270,7 @@ def _options(values: Mapping[str, Sequence[str]]) -> list[str]:
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """Reads a TOML file; returns its text and its contents. Raises ConfigurationError."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         return text, read_toml_text(text)
     except FileNotFoundError:
         raise ConfigurationError(where=str(path), problem="there is no such file") from None

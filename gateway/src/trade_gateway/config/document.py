@@ -10,6 +10,7 @@ from typing import Final
 from msgspec import Struct
 
 from trade._atomic_file import replace
+from trade._text_file import as_before, as_text
 from trade.errors import ConfigurationError
 
 __all__ = ["Document", "FileText"]
@@ -35,7 +36,7 @@ class Document:
         """Returns its contents. Raises ConfigurationError: it cannot be read."""
         try:
             data = self.path.read_bytes()
-            return FileText(path=str(self.path), text=data.decode(), version=hashlib.sha256(data).hexdigest()[:16])
+            return FileText(path=str(self.path), text=as_text(data), version=hashlib.sha256(data).hexdigest()[:16])
         except (OSError, UnicodeDecodeError) as bad:
             raise ConfigurationError(where=str(self.path), problem=f"cannot be read: {bad}") from None
 
@@ -57,7 +58,7 @@ class Document:
             check()
             target = self.path.resolve()
             try:
-                replace(target, text.encode(), target.stat().st_mode & 0o7777)
+                replace(target, as_before(target.read_bytes(), text), target.stat().st_mode & 0o7777)
             except OSError as bad:
                 raise ConfigurationError(where=str(self.path), problem=f"cannot be written: {bad}") from None
 

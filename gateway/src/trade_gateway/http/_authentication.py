@@ -13,6 +13,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from trade._atomic_file import replace
 from trade._protocol.keys import is_chunk
+from trade._text_file import as_before, read_text
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
 from trade_gateway.clients._errors import NotAuthenticated
@@ -38,7 +39,7 @@ def add_token(path: Path, identity: str) -> str:
     token = secrets.token_urlsafe(_BYTES)
     text = tomlkit.dumps({_TABLE: {**known, _hash(token): identity}})
     try:
-        replace(path, (_HEAD + text).encode())
+        replace(path, as_before(path.read_bytes() if path.exists() else b"", _HEAD + text))
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be written ({bad.strerror})") from None
     return token
@@ -86,7 +87,7 @@ def _seen(path: Path | None) -> tuple[int, ...]:
 
 def _read(path: Path) -> dict[str, str]:
     try:
-        known: Any = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap().get(_TABLE, {})
+        known: Any = tomlkit.parse(read_text(path)).unwrap().get(_TABLE, {})
     except OSError as bad:
         problem = f"cannot be read ({bad.strerror}). `trade http token NAME` creates a token and the file"
         raise ConfigurationError(where=str(path), problem=problem) from None

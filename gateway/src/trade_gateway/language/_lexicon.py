@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
@@ -184,7 +185,7 @@ def read_lexicon(path: Path | None = None) -> Lexicon:
     phrases, names = _read(own, "lexicon.toml")
     if path is not None:
         try:
-            further, names = _read(path.read_text(encoding="utf-8"), str(path))
+            further, names = _read(read_text(path), str(path))
         except OSError as bad:
             raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
         except UnicodeDecodeError as bad:

@@ -27,6 +27,7 @@ from msgspec import Struct
 
 from trade._atomic_file import claim, replace
 from trade._protocol.keys import is_chunk
+from trade._text_file import as_before, read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
@@ -177,7 +178,8 @@ class Authority:
         while (names := self.revoked()) != self._listed():
             listed = ", ".join(f'"{name}"' for name in sorted(names))
             text = f"# Written by trade pki: identities that policies refuse.\nrevoked = [{listed}]\n"
-            replace(self._revoked_file, text.encode(), 0o644)
+            before = self._revoked_file.read_bytes() if self._revoked_file.exists() else b""
+            replace(self._revoked_file, as_before(before, text), 0o644)
 
     def issued(self) -> list[Issued]:
         """Returns all names that were ever issued, sorted."""
@@ -191,7 +193,7 @@ class Authority:
     def _listed(self) -> frozenset[str] | None:
         """Returns the names in the list for policies; None if there is no list."""
         try:
-            listed = read_toml_text(self._revoked_file.read_text(encoding="utf-8"))["revoked"]
+            listed = read_toml_text(read_text(self._revoked_file))["revoked"]
         except FileNotFoundError:
             return None
         except (ValueError, KeyError):

@@ -56,7 +56,7 @@ class JointStates(Struct, frozen=True, kw_only=True):
     fault: list[str]
     """Likewise."""
     stamp_s: list[float]
-    """Times of the measurements: seconds since the epoch by the clock of their host."""
+    """Times of the measurements: seconds since the epoch, on the time of the recording (`Timeline`)."""
 
     @property
     def is_gripper(self) -> bool:
@@ -91,7 +91,7 @@ class Call(Struct, frozen=True, kw_only=True):
     caller: str
     session: str
     began_s: float
-    """Seconds since the epoch by the clock of its host."""
+    """Seconds since the epoch, on the time of the recording."""
     waited_s: float
     took_s: float
     outcome: str
@@ -107,7 +107,7 @@ class Lock(Struct, frozen=True, kw_only=True):
     owner: str
     purpose: str
     since_s: float
-    """Seconds since the epoch by the clock of its host."""
+    """Seconds since the epoch, on the time of the recording."""
     waiting: list[str]
 
 
@@ -178,7 +178,7 @@ class Message(NamedTuple):
     arrived_ns: int
     """Its time of arrival here, in nanoseconds since the epoch."""
     stamp_ns: int
-    """The time of its content, by the clock of its source."""
+    """The time of its content, on the time of the recording."""
     data: bytes
 
 

@@ -69,10 +69,10 @@ class SavedAtFault:
         if message.channel is FAULTS:
             fault = _decode(message.data)
             if fault.kind != "gone" and fault.text and fault.new:
-                self._save(fault, message.arrived_ns)
+                self._save(fault)
 
-    def _save(self, fault: Fault, at_ns: int) -> None:
-        now = self._clock()
+    def _save(self, fault: Fault) -> None:
+        now, at_ns = self._clock(), time.time_ns()  # a clock that was wrong when the recorder began may be right now
         if now < self._held_until:
             return
         self._held_until = now + HOLD_OFF_S

@@ -75,7 +75,7 @@ class RecordingFile:
         self._do(lambda: self._begin(about, attachments))
 
     def _begin(self, about: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
-        now_ns = time.time_ns()
+        now_ns = max(0, time.time_ns())  # the format has no time before 1970
         self._writer.start()
         for name, data in attachments:
             self._writer.add_attachment(now_ns, now_ns, name, "application/toml", data)

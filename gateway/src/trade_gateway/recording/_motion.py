@@ -42,6 +42,8 @@ _SLOWER: Final = 0.99
 _SLOWEST: Final = 0.05
 _SAME_S: Final = 0.002
 """Two reads of one measurement have time stamps with a smaller difference, in seconds."""
+_SET_BACK_S: Final = 1.0
+"""A measurement that is older than its predecessor by more is of a clock that was set back, in seconds."""
 _GAP_S: Final = 0.5
 _STILL_RAD: Final = 0.02
 """A joint with a smaller change over a gap has not moved meanwhile."""
@@ -171,7 +173,10 @@ def _measured(group: str, states: Iterable[JointStates]) -> tuple[list[str], lis
         if each.names != joints:
             problem = f"{group} has other joints later: {', '.join(each.names)} instead of {', '.join(joints)}"
             raise ConfigurationError(where="recording", problem=problem)
-        for track, at_s, position in zip(measured, each.stamp_s, each.positions, strict=True):
+        for joint, track, at_s, position in zip(joints, measured, each.stamp_s, each.positions, strict=True):
+            if track and at_s < track[-1][0] - _SET_BACK_S:
+                problem = f"{joint} was measured at {at_s:.3f} s after {track[-1][0]:.3f} s: the clock was set back"
+                raise ConfigurationError(where="recording", problem=f"{problem} while it was recorded. Record it again")
             if not track or at_s > track[-1][0] + _SAME_S:
                 track.append((at_s, position))
     return joints, measured, still

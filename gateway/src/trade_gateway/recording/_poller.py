@@ -23,6 +23,7 @@ from trade_gateway.recording._channels import (
     encoded,
 )
 from trade_gateway.recording._sources import within
+from trade_gateway.recording._timeline import Timeline
 
 __all__ = ["Watch"]
 
@@ -39,8 +40,11 @@ _END_S: Final = 15.0
 class Watch:
     """Polls several times a second, and keeps the results until they are taken."""
 
-    def __init__(self, container: Container, groups: list[str], wake: threading.Event) -> None:
+    def __init__(self, container: Container, groups: list[str], wake: threading.Event, timeline: Timeline) -> None:
         self._container = container
+        self._timeline = timeline
+        self._since: dict[tuple[str, str, float], float] = {}
+        """Begins of locks, by container, owner and the wall clock of that moment."""
         self._groups = groups
         self._wake = wake
         self._seen: queue.SimpleQueue[Message] = queue.SimpleQueue()
@@ -79,20 +83,29 @@ class Watch:
         self._wake.set()
 
     def _put(self, channel: Channel, stamp_s: float, value: object) -> None:
-        self._seen.put(Message(channel, 0, int(stamp_s * 1e9), encoded(value)))
+        self._seen.put(Message(channel, 0, max(0, int(stamp_s * 1e9)), encoded(value)))
 
     def _look_at_calls(self) -> None:
         for span in self._calls.read():
-            self._put(CALLS, span.began + span.took_s, _call(span))
+            ended_s = self._timeline.of(span.began + span.took_s)
+            self._put(CALLS, ended_s, _call(span, ended_s - span.took_s))
 
     def _look_at_locks(self) -> None:
         known, used = self._container.locking.known(), self._used()
-        locks = [_lock(info) for info in known.locks if self._about(info.resources) or used & set(info.resources)]
+        shown = [info for info in known.locks if self._about(info.resources) or used & set(info.resources)]
+        locks = [_lock(info, self._began(info)) for info in shown]
         locks += [lock for lock in self._locks or () if known.still(lock.container)]
         now = time.monotonic()
         if locks != self._locks or now - self._locks_at >= _LOCKS_AGAIN_S:
             self._locks, self._locks_at = locks, now
-            self._put(LOCKS, time.time(), Locks(locks=locks))
+            self._put(LOCKS, self._timeline.now_s(), Locks(locks=locks))
+
+    def _began(self, info: LockInfo) -> float:
+        """Converts the begin of a lock as soon as the lock is seen, before the clock can step again."""
+        key = info.container, info.holder.owner, info.holder.since
+        if key not in self._since:
+            self._since[key] = self._timeline.of(info.holder.since)
+        return self._since[key]
 
     def _used(self) -> set[str]:
         """The resources of the recorded services: those of a joint group have names of other groups."""
@@ -122,7 +135,7 @@ class Watch:
         self._estops, self._looked = estops, True
 
     def _changed(self, about: str, kind: FaultKind, text: str) -> None:
-        self._put(FAULTS, time.time(), Fault(about=about, kind=kind, text=text, new=self._looked))
+        self._put(FAULTS, self._timeline.now_s(), Fault(about=about, kind=kind, text=text, new=self._looked))
 
     def close(self) -> None:
         """Polls once more, and turns off the tracing that it turned on. Idempotent."""
@@ -187,7 +200,7 @@ def _refuse(outcome: Outcome) -> None:
         raise outcome.error
 
 
-def _call(span: Span) -> Call:
+def _call(span: Span, began_s: float) -> Call:
     return Call(
         call_id=str(span.call_id),
         calls=[str(call) for call in span.calls],
@@ -196,7 +209,7 @@ def _call(span: Span) -> Call:
         container=span.container,
         caller=span.caller,
         session=span.session,
-        began_s=span.began,
+        began_s=began_s,
         waited_s=span.waited_s,
         took_s=span.took_s,
         outcome=span.outcome,
@@ -204,13 +217,13 @@ def _call(span: Span) -> Call:
     )
 
 
-def _lock(info: LockInfo) -> Lock:
+def _lock(info: LockInfo, since_s: float) -> Lock:
     return Lock(
         container=info.container,
         resources=list(info.resources),
         owner=info.holder.owner,
         purpose=info.holder.purpose,
-        since_s=info.holder.since,
+        since_s=since_s,
         waiting=list(info.waiting),
     )
 

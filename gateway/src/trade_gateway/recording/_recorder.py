@@ -16,6 +16,7 @@ from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._poller import Watch
 from trade_gateway.recording._sources import Sources, Wanted
+from trade_gateway.recording._timeline import Timeline
 
 __all__ = ["Recorder", "Ring", "Sink", "about"]
 
@@ -78,11 +79,10 @@ class Recorder:
         self.container: Final = container
         self._wake = threading.Event()
         self._ending = ending
-        self._sources = Sources(container, wanted, self._wake)
-        self._watch = Watch(container, list(wanted.groups), self._wake)
+        self._timeline = Timeline()
+        self._sources = Sources(container, wanted, self._wake, self._timeline)
+        self._watch = Watch(container, list(wanted.groups), self._wake, self._timeline)
         self.messages = 0
-        self._ahead_ns = 0
-        """The greatest difference so far of the wall clock to the monotonic clock."""
 
     @property
     def dropped(self) -> int:
@@ -137,13 +137,7 @@ class Recorder:
 
     def _new(self) -> Iterator[Message]:
         for message in chain(self._sources.take(), self._watch.take()):
-            yield message._replace(arrived_ns=self._now_ns())
-
-    def _now_ns(self) -> int:
-        """Nanoseconds since the epoch: follows the wall clock forwards, and is steady when that is set back."""
-        running_ns = time.monotonic_ns()
-        self._ahead_ns = max(self._ahead_ns, time.time_ns() - running_ns)
-        return running_ns + self._ahead_ns
+            yield message._replace(arrived_ns=self._timeline.now_ns())
 
     def close(self) -> None:
         """Ends all subscriptions. Idempotent."""

@@ -1,10 +1,11 @@
 """The subscriptions of a recording: joints, arms, grippers, cameras and other services, as they come and go."""
 
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, cast
+
+from msgspec.structs import replace
 
 from trade import Container, Handle, Sample, Stream, where
 from trade.errors import ServiceGone, TradeError
@@ -19,6 +20,7 @@ from trade_gateway.recording._channels import (
     picture,
     service_channel,
 )
+from trade_gateway.recording._timeline import Timeline
 
 __all__ = ["Sources", "Wanted", "joint_states", "within"]
 
@@ -49,8 +51,9 @@ class _Source(NamedTuple):
 class Sources:
     """The open streams. Used by one thread, which is woken when there are samples."""
 
-    def __init__(self, container: Container, wanted: Wanted, wake: threading.Event) -> None:
+    def __init__(self, container: Container, wanted: Wanted, wake: threading.Event, timeline: Timeline) -> None:
         self._container = container
+        self._timeline = timeline
         self._wanted = wanted
         self._wake = wake
         self._open: dict[Handle, _Source] = {}
@@ -111,7 +114,7 @@ class Sources:
         while True:
             try:
                 sample = source.stream.take()
-                message = None if sample is None else source.read(handle, sample)
+                message = None if sample is None else source.read(handle, self._placed(handle, sample))
             except ServiceGone:  # the registry reports that too
                 return
             except Exception as bad:  # noqa: BLE001 - any exception of the service itself
@@ -128,13 +131,17 @@ class Sources:
                     yield from self._noted(joint, "joint", fault)
             yield message
 
+    def _placed(self, handle: Handle, sample: Sample) -> Sample:
+        """The sample, at its time on the recording's timeline."""
+        return replace(sample, at=self._timeline.placed(handle.container, sample.at, sample.at_ns))
+
     def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
         """Yields a message if a fault has changed; compares ``what``, because the whole text may contain times."""
         now, before = what or text, self._wrong.get((about, kind))
         self._wrong[about, kind] = now
         if now != (before or ""):
             fault = Fault(about=about, kind=kind, text=text, new=before is not None)
-            yield Message(FAULTS, 0, time.time_ns(), encoded(fault))
+            yield Message(FAULTS, 0, self._timeline.now_ns(), encoded(fault))
 
     def _arm(self, handle: Handle, sample: Sample) -> Message:
         names = self._arms.get(handle)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta, Struct, structs
 
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway.ros._urdf import read_urdf
@@ -327,7 +328,7 @@ def read_ros_file(path: Path) -> RosFile:
         ConfigurationError: the file cannot be read, or an entry is wrong; the error says where, and what is valid.
     """
     try:
-        raw = read_toml_text(path.read_text(encoding="utf-8"))
+        raw = read_toml_text(read_text(path))
     except (OSError, ValueError) as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
     try:
@@ -349,7 +350,7 @@ def _placed(read: RosFile, folder: Path) -> RosFile:
 
 def _read_description(entry: RobotEntry) -> None:
     try:
-        read_urdf(Path(entry.urdf).read_text(encoding="utf-8"), entry.urdf)
+        read_urdf(read_text(Path(entry.urdf)), entry.urdf)
     except (OSError, UnicodeDecodeError) as bad:
         raise ConfigurationError(where=entry.urdf, problem=f"cannot be read: {bad}") from None
 

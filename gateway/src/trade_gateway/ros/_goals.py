@@ -14,6 +14,7 @@ from trade_gateway.ros.to_ros._served_goals import Unacceptable
 
 __all__ = [
     "ACTION",
+    "AT_ONCE_S",
     "GOAL_TOLERANCE_VIOLATED",
     "INVALID_GOAL",
     "INVALID_JOINTS",
@@ -36,6 +37,8 @@ OLD_HEADER_TIMESTAMP: Final = -3
 PATH_TOLERANCE_VIOLATED: Final = -4
 GOAL_TOLERANCE_VIOLATED: Final = -5
 
+AT_ONCE_S: Final = 1e-3
+"""A first point before this time is rounding of 0, as in `trade_drivers`."""
 _CLOCKS_S: Final = 1.0
 """Greatest difference between the clock of a goal's sender and ours."""
 
@@ -60,7 +63,8 @@ def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | 
     Args:
         goal: the whole goal.
         names: the joints' names.
-        here: the current angles, by TRADE name, prepended if the first point is later. None: it must be at 0 s.
+        here: the current angles, by TRADE name, prepended if the first point is later than `AT_ONCE_S`. None: it must
+            be at 0 s.
 
     Raises:
         Unacceptable: it has other joints, or points without angles.
@@ -75,18 +79,19 @@ def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | 
     if not points:
         raise Unacceptable(INVALID_GOAL, "it has no points. To stop, cancel a goal or call the stop service")
     joints = [names.trade_names[name] for name in said]
-    if points[0]["time_from_start_s"] > 0:
+    if points[0]["time_from_start_s"] >= AT_ONCE_S:
         if here is None:
             raise Unacceptable(INVALID_GOAL, "its first point must be at 0 s")
         first: dict[str, Any] = {"time_from_start_s": 0.0, "positions_rad": [here[joint] for joint in joints]}
-        if "velocities_rad_s" in points[0]:
-            first["velocities_rad_s"] = [0.0] * len(joints)
+        first |= {
+            field: [0.0] * len(joints) for field in ("velocities_rad_s", "accelerations_rad_s2") if field in points[0]
+        }
         points.insert(0, first)
     return {"joints": joints, "points": points}
 
 
 def _point(point: Message, names: Sequence[str]) -> dict[str, Any]:
-    for field in ("positions", "velocities"):
+    for field in ("positions", "velocities", "accelerations"):
         if len(point[field]) not in ((len(names),) if field == "positions" else (0, len(names))):
             problem = f"a point has {len(point[field])} {field} for {len(names)} joints"
             raise Unacceptable(INVALID_GOAL, problem)
@@ -94,7 +99,11 @@ def _point(point: Message, names: Sequence[str]) -> dict[str, Any]:
         "time_from_start_s": seconds(point["time_from_start"]),
         "positions_rad": point["positions"],
     }
-    return plain | ({"velocities_rad_s": point["velocities"]} if point["velocities"] else {})
+    if point["velocities"]:
+        plain["velocities_rad_s"] = point["velocities"]
+    if point["accelerations"]:
+        plain["accelerations_rad_s2"] = point["accelerations"]
+    return plain
 
 
 def lasts_s(trajectory: Mapping[str, Any]) -> float:
@@ -141,6 +150,7 @@ def goal_of(joints: Sequence[str], points: Sequence[Mapping[str, Any]]) -> Messa
                 {
                     "positions": list(point["positions_rad"]),
                     "velocities": list(point.get("velocities_rad_s") or ()),
+                    "accelerations": list(point.get("accelerations_rad_s2") or ()),
                     "time_from_start": ros_stamp(point["time_from_start_s"]),
                 }
                 for point in points

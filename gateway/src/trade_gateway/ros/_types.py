@@ -17,6 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from trade._text_file import read_text
 from trade.errors import ConfigurationError
 
 __all__ = ["Field", "Message", "Types", "installed_definitions"]
@@ -241,7 +242,11 @@ class Types:
 
     def _add(self, path: Path, type_name: str, kind: str) -> None:
         names = [f"{type_name}_{part}" for part in _PARTS.get(kind, ())]
-        texts = _sections(path.read_text()) if names else [path.read_text()]
+        try:
+            whole = read_text(path)
+        except (OSError, UnicodeDecodeError) as bad:
+            raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
+        texts = _sections(whole) if names else [whole]
         if names and len(texts) != len(names):
             raise ConfigurationError(where=str(path), problem=f"needs {len(names)} parts between ---, not {len(texts)}")
         try:

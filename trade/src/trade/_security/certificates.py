@@ -4,6 +4,7 @@ A handshake with ourselves, in memory, checks that the files of a folder fit tog
 transport does not report what is wrong with them.
 """
 
+import codecs
 import contextlib
 import hashlib
 import ipaddress
@@ -123,13 +124,17 @@ def _plain(host: str) -> str:
 
 def _check_file(path: Path, mark: str) -> None:
     try:
-        text = path.read_text(encoding="ascii", errors="replace")
+        data = path.read_bytes()
         mode = path.stat().st_mode
     except PermissionError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read ({bad.strerror}): {_closed(path)}") from None
     except OSError as bad:
         problem = f"cannot be read ({bad.strerror}); {_ISSUE}"
         raise ConfigurationError(where=str(path), problem=problem) from None
+    if data.startswith((codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        problem = "begins with a byte-order mark, which TLS does not read; save it as ASCII, or as UTF-8 without it"
+        raise ConfigurationError(where=str(path), problem=problem)
+    text = data.decode("ascii", errors="replace")
     if mark not in text or "ENCRYPTED" in text:
         kind = "unencrypted private key" if path.name == _KEY else "certificate"
         raise ConfigurationError(where=str(path), problem=f"is no {kind} in PEM form; {_ISSUE}")

@@ -8,6 +8,7 @@ from typing import Final, cast
 
 from trade._protocol.keys import GROUP, NO_GROUP, is_chunk
 from trade._security.policy import EVERYTHING, VERBS, Policy, Role
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
@@ -62,7 +63,7 @@ def read_policy(path: Path, text: str | None = None) -> Policy:
 def policy_files(path: Path) -> tuple[Path, ...]:
     """The policy's file and the file of revoked identities that it names; only the former if it cannot be read."""
     try:
-        beside = read_toml_text(path.read_text(encoding="utf-8")).get("revoked_file")
+        beside = read_toml_text(read_text(path)).get("revoked_file")
     except (OSError, ValueError):
         return (path,)
     return (path, path.parent / beside) if isinstance(beside, str) else (path,)
@@ -83,7 +84,7 @@ def _stamp(file: Path) -> tuple[int, int, int, int] | None:
 
 def _load(path: Path, text: str | None = None) -> _Table:
     try:
-        text = path.read_text(encoding="utf-8") if text is None else text
+        text = read_text(path) if text is None else text
     except (OSError, ValueError) as bad:
         reason = bad.strerror if isinstance(bad, OSError) and bad.strerror else str(bad)
         raise _wrong(str(path), f"the policy cannot be read: {reason}. Write the file, or name another one") from None

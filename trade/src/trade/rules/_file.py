@@ -15,6 +15,7 @@ from trade._notifications.triggers import LONGEST_S, SHORTEST_S
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import Scalar
 from trade._registry.constraints import Constraint, where
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
@@ -196,7 +197,7 @@ def read_rules(path: Path, text: str | None = None) -> dict[str, Rule]:
     """
     file = str(path)
     try:
-        raw = read_toml_text(path.read_text(encoding="utf-8") if text is None else text)
+        raw = read_toml_text(read_text(path) if text is None else text)
     except OSError as bad:
         raise ConfigurationError(where=file, problem=f"cannot be read: {bad.strerror or bad}") from None
     except ValueError as bad:  # not TOML, or not UTF-8

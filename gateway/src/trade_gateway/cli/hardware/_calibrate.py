@@ -17,6 +17,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade._atomic_file import replace
+from trade._text_file import as_before, as_text
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
@@ -70,11 +71,11 @@ def calibrate(
     """
     out = Output(as_json=False)
     robot = load(robot_file)
-    text = robot_file.read_text(encoding="utf-8")
+    before = robot_file.read_bytes()
     if from_file is not None:
         if zero_here or range_from_motion is not None:
             raise UsageError(where="--from", problem="imports zero and range, and measures none; leave the others out")
-        _import(out, robot, robot_file, text, from_file, joint, bus, yes=yes)
+        _import(out, robot, robot_file, before, from_file, joint, bus, yes=yes)
         return
     if joint is None:
         raise UsageError(where="JOINT", problem="missing; name the joint to measure")
@@ -85,25 +86,25 @@ def calibrate(
         sweep = Sweep(bench, record.id, _place(line, record))
         values = _measure(out, record, sweep, zero_here=zero_here, seconds=range_from_motion)
         values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
-    changed = with_values(text, joint, values)
+    changed = with_values(as_text(before), joint, values)
     parse(changed, str(robot_file))
-    _write(out, robot_file, text, changed, yes=yes)
+    _write(out, robot_file, before, changed, yes=yes)
 
 
 def _import(
-    out: Output, robot: Robot, path: Path, text: str, source: Path, joint: str | None, bus: str | None, *, yes: bool
+    out: Output, robot: Robot, path: Path, before: bytes, source: Path, joint: str | None, bus: str | None, *, yes: bool
 ) -> None:
     """Writes a calibration of LeRobot into the robot file."""
     if joint is not None:
         _joint(robot, joint)
     values, remarks = imported(robot, read_calibration(source), str(source), joint, bus)
-    changed = text
+    changed = as_text(before)
     for name, keys in values.items():
         changed = with_values(changed, name, keys)
     parse(changed, str(path))
     for remark in remarks:
         out.say(escape(remark))
-    _write(out, path, text, changed, yes=yes)
+    _write(out, path, before, changed, yes=yes)
 
 
 class Ends(Struct, frozen=True):
@@ -347,8 +348,9 @@ def _enter_pressed() -> bool:
     return False
 
 
-def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> None:
+def _write(out: Output, path: Path, contents: bytes, after: str, *, yes: bool) -> None:
     """Shows the changes, prompts, and replaces the whole file."""
+    before = as_text(contents)
     if before == after:
         out.say("the file has these values already; nothing was written")
         return
@@ -359,10 +361,10 @@ def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> No
         out.say("nothing was written")
         raise typer.Exit(1)
     target = path.resolve()
-    if target.read_text(encoding="utf-8") != before:
+    if target.read_bytes() != contents:
         raise ConfigurationError(where=name, problem="was changed meanwhile; nothing was written")
     try:
-        replace(target, after.encode(), stat.S_IMODE(target.stat().st_mode))
+        replace(target, as_before(contents, after), stat.S_IMODE(target.stat().st_mode))
     except OSError as bad:
         raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is unchanged") from None
     out.say(f"[bold]{escape(name)}[/] is written")

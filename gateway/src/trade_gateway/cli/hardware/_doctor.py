@@ -8,6 +8,7 @@ import typer
 from msgspec.structs import replace
 from rich.markup import escape
 
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import SerialBus, drivers, load, refusals
@@ -120,7 +121,7 @@ def _of_robot(path: Path) -> Iterator[Finding]:
 def _no_robot(path: Path) -> Finding | None:
     """Returns a finding that the file is of another known kind, or None."""
     try:
-        system = read_toml_text(path.read_text(encoding="utf-8")).get("system")
+        system = read_toml_text(read_text(path)).get("system")
     except (OSError, ValueError):
         return None
     if system is None:

@@ -16,6 +16,7 @@ import typer
 from rich.markup import escape
 
 from trade import Settings
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
@@ -149,7 +150,7 @@ def _keep_revoked(there: Path, fresh: Path) -> None:
 def _revoked(path: Path) -> set[str] | None:
     """Returns the names in a list of revoked identities; None for another file."""
     try:
-        read = read_toml_text(path.read_text(encoding="utf-8"))
+        read = read_toml_text(read_text(path))
     except ValueError:
         return None
     names = read.get("revoked")

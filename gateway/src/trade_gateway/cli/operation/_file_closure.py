@@ -8,6 +8,7 @@ from typing import Final, NamedTuple, TypeVar
 import msgspec
 from msgspec import Struct
 
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
@@ -117,7 +118,7 @@ def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 def _read(path: Path, kind: type[_Table]) -> _Table:
     try:
-        raw = read_toml_text(path.read_text(encoding="utf-8"))
+        raw = read_toml_text(read_text(path))
         return msgspec.convert(raw, kind)
     except FileNotFoundError:
         raise ConfigurationError(where=str(path), problem="there is no such file") from None

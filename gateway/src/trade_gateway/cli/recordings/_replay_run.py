@@ -132,7 +132,7 @@ class Robot:
                 continue
             if sample is None:
                 return
-            yield joint_states(sample.value, sample.at, self._arm_joints)
+            yield joint_states(sample.value, sample.at_ns / 1e9, self._arm_joints)  # no step of a wall clock is in it
 
     def _compared(self, measured: Motion) -> Replayed:
         found, _ = deviation(self._motion, self.speed, measured)

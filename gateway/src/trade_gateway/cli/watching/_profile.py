@@ -13,6 +13,7 @@ from rich.markup import escape
 from trade import CallDeviation, CallModel, Span, where
 from trade._atomic_file import replace
 from trade._telemetry.call_model import deviations, learn
+from trade._text_file import read_text
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
@@ -32,8 +33,8 @@ def write(path: Path, model: CallModel) -> None:
 def read(path: Path) -> CallModel:
     """Reads a model. Raises ConfigurationError."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=CallModel)
-    except (OSError, msgspec.DecodeError) as problem:
+        return msgspec.json.decode(read_text(path), type=CallModel)
+    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as problem:
         raise ConfigurationError(where=str(path), problem=str(problem)) from None
 
 

@@ -24,6 +24,8 @@ _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 _PEAK: Final = 1.5
 """Ratio of the peak to the mean speed of a cubic curve from rest to rest."""
 _SHORTEST_S: Final = 0.2
+_REST_RAD_S: Final = 1e-3
+"""A last velocity up to this is rest, as in `trade_drivers`."""
 
 Position = Annotated[float, Meta(description="joint angle in rad")]
 
@@ -119,18 +121,28 @@ class RosJoints:
             problem = f"is for {', '.join(trajectory.joints) or 'no joints'}; it takes one for {', '.join(self._names)}"
             raise InvalidArgument(service="follow", argument="trajectory.joints", problem=problem)
         order = [trajectory.joints.index(name) for name in self._names]
-        points: list[Mapping[str, Any]] = []
+        points: list[Message] = []
         for point in trajectory.points:
-            for angles in (point.positions_rad, point.velocities_rad_s or point.positions_rad):
-                if len(angles) != len(order):
-                    problem = f"a point has {len(angles)} values for {len(order)} joints"
-                    raise InvalidArgument(service="follow", argument="trajectory.points", problem=problem)
             plain: Message = msgspec.to_builtins(point)
-            plain["positions_rad"] = [point.positions_rad[column] for column in order]
-            if point.velocities_rad_s is not None:
-                plain["velocities_rad_s"] = [point.velocities_rad_s[column] for column in order]
+            for field in ("positions_rad", "velocities_rad_s", "accelerations_rad_s2"):
+                if (values := getattr(point, field)) is not None:
+                    if len(values) != len(order):
+                        problem = f"a point has {len(values)} values for {len(order)} joints"
+                        raise InvalidArgument(service="follow", argument="trajectory.points", problem=problem)
+                    plain[field] = [values[column] for column in order]
             points.append(plain)
+        for last in points[-1:]:
+            if (speeds := last["velocities_rad_s"]) is not None:
+                last["velocities_rad_s"] = self._at_rest(speeds)
         return self._pursue(points)
+
+    def _at_rest(self, speeds_rad_s: Sequence[float]) -> list[float]:
+        """Returns 0 for each last speed that no joint resolves, as a ROS controller refuses even 1e-6 rad/s."""
+        for name, speed in zip(self._names, speeds_rad_s, strict=True):
+            if not abs(speed) <= _REST_RAD_S:
+                problem = f"{name} still has {speed:g} rad/s at the last point; a trajectory must end at rest (0)"
+                raise InvalidArgument(service="follow", argument="trajectory.velocities_rad_s", problem=problem)
+        return [0.0] * len(speeds_rad_s)
 
     @service(effect="stop")
     def stop(self) -> None:

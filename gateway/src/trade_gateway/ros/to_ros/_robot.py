@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from trade import Container
+from trade._text_file import read_text
 from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._file import RobotEntry
 from trade_gateway.ros._graph import Graph
@@ -24,7 +25,7 @@ class Description:
 
     def __init__(self, entry: RobotEntry, graph: Graph) -> None:
         """Raises ConfigurationError: the file cannot be read any more."""
-        text = Path(entry.urdf).read_text(encoding="utf-8")
+        text = read_text(Path(entry.urdf))
         self._publishers = [
             graph.advertise(entry.topic, "std_msgs/msg/String", latched=True),
             graph.advertise("/tf_static", _TF, latched=True),
@@ -46,7 +47,8 @@ class TransformsToRos(LimbTopic):
     def __init__(self, entry: RobotEntry, topics: Topics, container: Container) -> None:
         """Raises ConfigurationError: the description is invalid."""
         super().__init__(entry, "/tf", _TF, topics, container)
-        self._moving = [one for one in read_urdf(Path(entry.urdf).read_text("utf-8"), entry.urdf) if not one.fixed]
+        description = read_text(Path(entry.urdf))
+        self._moving = [one for one in read_urdf(description, entry.urdf) if not one.fixed]
         self._turning = {joint.name for joint in self._moving if joint.turns}
 
     def _message(self, names: Sequence[str], now: Measured, at_s: float) -> Message:

@@ -9,9 +9,18 @@ from typing import Any, Final
 import msgspec
 
 from trade import Constraint, Container, Handle, where
-from trade_gateway.ros._conversion import ros_stamp
+from trade_gateway.ros._conversion import ros_stamp, seconds
 from trade_gateway.ros._file import TrajectoryEntry
-from trade_gateway.ros._goals import ACTION, SUCCESSFUL, code_of, lasts_s, starts_late, tolerances_of, trajectory_of
+from trade_gateway.ros._goals import (
+    ACTION,
+    AT_ONCE_S,
+    SUCCESSFUL,
+    code_of,
+    lasts_s,
+    starts_late,
+    tolerances_of,
+    trajectory_of,
+)
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
 from trade_gateway.ros._joints import LIMBS, JointNames, beside, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place
@@ -177,7 +186,7 @@ class _Trajectories:
     def _here(self, goal: Goal) -> dict[str, float] | None:
         """The current angles, unless the goal says where the joints begin."""
         points = goal.message["trajectory"]["points"]
-        if not points or points[0]["time_from_start"] == {"sec": 0, "nanosec": 0}:
+        if not points or seconds(points[0]["time_from_start"]) < AT_ONCE_S:
             return None
         now = measured(list(self._names.trade_names.values()), self._state.with_(deadline_s=_READ_WITHIN_S)())
         return dict(zip(now.names, now.positions, strict=True))
