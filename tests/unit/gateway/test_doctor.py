@@ -21,7 +21,7 @@ from trade_gateway.cli.hardware._doctor import _of_robot
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.pki._authority import Authority
-from trade_hil_sim import DynamixelBus, Mute, writes
+from trade_hil_sim import DynamixelBus, Mute, Place, writes
 
 
 def only(found: Iterable[Finding]) -> Finding:
@@ -222,6 +222,17 @@ def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_fil
     assert (
         'joint."neck.pan": min_rad -1.4 to max_rad 1.4 is more than the device\'s own range (registers 52' in pan.text
     )
+
+
+@pytest.mark.realtime
+def test_S23_a_joint_outside_the_devices_own_range_is_reported_with_both_angles(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].memory.set("max_position_limit", 3000)
+        sim.do(Place(ids=(1,), counts=3100))
+        pan, tilt = of_devices(robot_file)
+        assert not writes(list(sim.log.entries))
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert "at 1.614 rad, outside its own range, which ends at 1.460 rad (register 48)" in pan.text
 
 
 def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:

@@ -73,6 +73,11 @@ class BusDevice(ABC, Generic[_Sample]):
         self.silent_since_ns = 0
         self.probe_at_ns = 0
 
+    @property
+    def unheld(self) -> str:
+        """Why the device cannot hold where it is; empty if it can."""
+        return ""
+
     @abstractmethod
     def faulty(self, fault: str = "") -> DeviceFault:
         """Returns the error for a fault; by default the latched one."""
@@ -261,7 +266,8 @@ class BusCycle(ABC, Generic[_Device]):
             if device.silent or device.age_ns(now_ns) > self.stale_after_ns:
                 error = device.deaf(now_ns)
             elif device.halting_since_ns and now_ns - device.halting_since_ns > HALT_NS:
-                error = device.faulty("a stop was sent, but it is still moving")
+                why = f": {device.unheld}" if device.unheld else ""
+                error = device.faulty(f"a stop was sent, but it is still moving{why}")
             elif device.halting_since_ns:
                 return
         self._stopping.remove(ticket)

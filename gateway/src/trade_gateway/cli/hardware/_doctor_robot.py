@@ -144,7 +144,7 @@ def _on_line(robot: Robot, bus: SerialBus, driver: Driver, commissioner: Commiss
 def _unfit(
     driver: Driver, bench: Bench, robot: Robot, bus: SerialBus, device: Joint | Gripper, about: str
 ) -> Finding | None:
-    """Returns what `trade up` would refuse about a device that answers, or None."""
+    """Returns what `trade up` or `enable` would refuse about a device that answers, or None."""
     try:
         driver.fits(bench, robot, bus, device)
     except ConfigurationError as bad:
