@@ -235,6 +235,16 @@ def test_S23_a_joint_outside_the_devices_own_range_is_reported_with_both_angles(
     assert "at 1.614 rad, outside its own range, which ends at 1.460 rad (register 48)" in pan.text
 
 
+def test_one_adapter_under_two_names_is_an_error_that_names_both_keys(tmp_path: Path) -> None:
+    path, link = tmp_path / "two.toml", tmp_path / "by-id"
+    link.symlink_to("/dev/null")
+    text = HEAD.replace("/dev/ttyNOWHERE", "/dev/null")
+    path.write_text(text + TAIL.split('"rosie"')[1].replace("/dev/ttyNOTAIL", str(link)))
+    found = next(one for one in _of_robot(path) if one.level == "error")
+    assert (found.level, found.about) == ("error", "ports")
+    assert "bus.tail.port" in found.text and "bus.neck.port" in found.text and str(link) in found.text
+
+
 def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:
     (tmp_path / "neck").write_text("a file\n")
     found = only(of_devices(robot_file))

@@ -21,6 +21,7 @@ from trade_drivers import (
     load_driver,
 )
 from trade_drivers.bus._jobs import TAKEN
+from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
@@ -28,7 +29,7 @@ from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasured", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "shared", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
@@ -96,6 +97,14 @@ def judged(bus: CanBus, link: "Link") -> Finding:
         )
         return Finding(level="error", about=about, text=text, fix=fix)
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
+
+
+def shared(robot: Robot) -> Iterator[Finding]:
+    """Reports two names of one port."""
+    try:
+        check_ports(robot)
+    except ConfigurationError as bad:
+        yield Finding(level="error", about="ports", text=str(bad), fix="correct one of the two keys")
 
 
 def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
