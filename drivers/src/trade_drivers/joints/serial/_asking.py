@@ -54,7 +54,8 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
         else:
             yield
             return result
-    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9)
+    waited_s = (bus.clock() - began_ns) / 1e9
+    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s, reason=bus.why_silent())
 
 
 def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:

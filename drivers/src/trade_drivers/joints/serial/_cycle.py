@@ -58,6 +58,9 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         """The line, for the bus thread only."""
         return self._wire
 
+    def why_silent(self) -> str:
+        return self.wire.intruder()
+
     # --- parts that differ between vendors
 
     @abstractmethod

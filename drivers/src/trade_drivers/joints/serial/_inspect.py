@@ -90,7 +90,7 @@ def first_ping(
         problem = twice
         if garbled == ATTEMPTS:  # with more of them, the answers of two devices might once look like one
             break
-    raise ConfigurationError(where=key, problem=problem)
+    raise ConfigurationError(where=key, problem=wire.intruder() or problem)
 
 
 def again(

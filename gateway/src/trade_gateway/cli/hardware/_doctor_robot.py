@@ -20,7 +20,7 @@ from trade_drivers import (
     WireError,
     load_driver,
 )
-from trade_drivers.bus._jobs import TAKEN
+from trade_drivers.bus._jobs import SHARED, TAKEN
 from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
@@ -138,6 +138,9 @@ def _unseen(robot: Robot, bus: SerialBus, bad: ConfigurationError) -> Finding:
         fix = "end the program that uses it and run this again; while a robot is up, `trade up` reports its devices"
         return Finding(level="warning", about=about, text=f"was not checked: {bad}", fix=fix)
     text = f"was not checked: {robot.where}: bus.{bus.name}.port: {bad.problem}"
+    if SHARED in bad.problem:
+        fix = "end it and keep it away: ModemManager by ID_MM_DEVICE_IGNORE in a udev rule, a getty by systemctl"
+        return Finding(level="error", about=about, text=text, fix=fix)
     return Finding(
         level="error", about=about, text=text, fix="set port to the line of these devices, and run this again"
     )
