@@ -161,7 +161,7 @@ def attach(
     """
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
-        check(robot)
+        check(robot, ports)
         faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
         poller = FaultPoller(faults, f"faults of {robot.name}")
         undo.callback(poller.close)  # closes after the devices, to record faults during their shutdown, too

@@ -11,7 +11,7 @@ from trade_drivers.joints import Axis, Exchange, Ramp
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
-from trade_drivers.joints.serial import written
+from trade_drivers.joints.serial import ServoAxis, written
 from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 from trade_drivers.vendors.dynamixel import _table as dynamixel
 from trade_drivers.vendors.feetech import _table as feetech
@@ -100,3 +100,7 @@ def a_joint_outside_its_limits_is_refused(patch: pytest.MonkeyPatch) -> None:
         return sample
 
     patch.setattr(Axis, "check_usable", strict)
+
+
+def a_servo_may_be_enabled_anywhere(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(ServoAxis, "outside", lambda self, position: "")

@@ -141,3 +141,18 @@ def test_a_joint_outside_its_limits_cannot_be_moved_back(body: Body) -> None:
     refusal = outcome(lambda: motor.move_to(body.farthest_rad - 0.2))
     assert not refusal, f"the way back was refused: {refusal}"
     assert abs(body.truth.position_rad - (body.farthest_rad - 0.2)) < 0.03
+
+
+@complaint(("feetech", mutants.a_servo_may_be_enabled_anywhere, "it moved to 1.4. rad"))
+def test_enabling_outside_its_own_limits_moves_a_servo(body: Body) -> None:
+    body.rig.plug()
+    for name, counts in (("min_angle", 1000), ("max_angle", 3000)):
+        body.rig.servo().memory.set(name, counts)
+    body.turn_by_hand(1.614)
+    motor = body.motor()
+    refusal = outcome(motor.enable)
+    if not refusal:
+        body.rig.wait_for("at_rest", body.device_id)
+    assert not body.events("motion_started"), f"it moved to {body.truth.position_rad:.2f} rad"
+    assert refusal.startswith("DeviceFault")
+    assert not body.moves()

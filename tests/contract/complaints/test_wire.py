@@ -1,14 +1,18 @@
 """Complaints of other projects about answers: bad ones, missing ones, old ones, and those of the wrong device."""
 
 import time
+from pathlib import Path
 
 import pytest
 
 from tests.contract.complaints import wire_mutants as mutants
 from tests.contract.complaints.bodies import Body, Call, outcome
 from tests.contract.complaints.table import complaint
+from tests.support.simulated_robots import HEAD, TAIL
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import sleep_past
+from tests.unit.drivers.test_second_reader import HOLDS, other_program
+from trade_drivers import check, parse
 from trade_hil_sim import Unplug
 
 pytestmark = pytest.mark.realtime
@@ -76,3 +80,22 @@ def test_stale_state_after_link_loss(body: Body) -> None:
     wait_until(lambda: "BusGone" in outcome(motor.relax), "its driver has noticed")
     sleep_past(time.monotonic_ns() + int(body.rig.robot.buses[0].stale_after_s * 1e9))
     assert outcome(motor.state).startswith("BusGone"), "an old state is reported as the current one"
+
+
+@complaint(("feetech", mutants.a_missing_answer_is_the_devices, "its error names the program"))
+def test_another_program_takes_the_answers(body: Body) -> None:
+    motor = body.motor()
+    with other_program(str(body.rig.sim.port), HOLDS) as pid:
+        body.strike(body.ways.deaf)
+        wait_until(lambda: f"(pid {pid})" in outcome(motor.state), "its error names the program")
+
+
+@complaint(("folder", mutants.two_names_are_two_ports, "was accepted"))
+def test_one_adapter_has_two_names_in_a_file(folder: Path) -> None:
+    link = folder / "by-id"
+    link.symlink_to("/dev/null")
+    text = HEAD.replace("/dev/ttyNOWHERE", "/dev/null") + TAIL.partition('"rosie"')[2]
+    refusal = outcome(lambda: check(parse(text.replace("/dev/ttyNOTAIL", str(link)), "rosie.toml")))
+    assert refusal, "the file was accepted"
+    assert "bus.neck.port" in refusal
+    assert "bus.tail.port" in refusal

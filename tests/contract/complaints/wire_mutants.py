@@ -10,6 +10,7 @@ from dynamixel_sdk import PacketHandler, PortHandler
 
 from tests.contract.complaints.bodies import Body
 from trade.errors import DeviceError
+from trade_drivers.bus._serial_port import SerialWire
 from trade_drivers.joints import BusMotor, Gate
 from trade_drivers.joints.serial import Answer, ServoExchange
 from trade_drivers.vendors.cia402 import _sdo as sdo
@@ -125,3 +126,11 @@ def the_last_value_is_reported_without_end(patch: pytest.MonkeyPatch) -> None:
         return last[self]
 
     patch.setattr(BusMotor, "state", cached)
+
+
+def a_missing_answer_is_the_devices(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(SerialWire, "intruder", lambda self: "")
+
+
+def two_names_are_two_ports(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_drivers.plugins._validate.check_ports", lambda robot, ports: None)

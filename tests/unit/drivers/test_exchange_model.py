@@ -32,7 +32,7 @@ class Joint:
         self.resource = Resource(name)
         self.halting_since_ns = self.misses = self.silent_since_ns = self.probe_at_ns = self.heard_ns = 0
         self.doubted = self.silent = self.deafened = False
-        self.fault = ""
+        self.fault = self.unheld = ""
 
     def age_ns(self, now_ns: int) -> int:
         return now_ns - self.heard_ns

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.simulated_robots import HAND, HEAD, TAIL
+from tests.unit.drivers.test_second_reader import HOLDS, other_program
 from trade import Container
 from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
@@ -21,7 +22,7 @@ from trade_gateway.cli.hardware._doctor import _of_robot
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.pki._authority import Authority
-from trade_hil_sim import Arm, DynamixelBus, Mute, UrBus, motion_writes, writes
+from trade_hil_sim import Arm, DynamixelBus, Mute, Place, UrBus, motion_writes, received, writes
 
 
 def only(found: Iterable[Finding]) -> Finding:
@@ -222,6 +223,37 @@ def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_fil
     assert (
         'joint."neck.pan": min_rad -1.4 to max_rad 1.4 is more than the device\'s own range (registers 52' in pan.text
     )
+
+
+@pytest.mark.realtime
+def test_S23_a_joint_outside_the_devices_own_range_is_reported_with_both_angles(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].memory.set("max_position_limit", 3000)
+        sim.do(Place(ids=(1,), counts=3100))
+        pan, tilt = of_devices(robot_file)
+        assert not writes(list(sim.log.entries))
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert "at 1.614 rad, outside its own range, which ends at 1.460 rad (register 48)" in pan.text
+
+
+@pytest.mark.realtime
+def test_another_program_that_reads_a_line_is_an_error_with_its_name_and_pid(robot_file: Path) -> None:
+    with simulated(robot_file) as sim, other_program(str(sim.port), HOLDS) as pid:
+        found = only(of_devices(robot_file))
+        assert not received(list(sim.log.entries))
+    assert found.level == "error"
+    assert f"(pid {pid})" in found.text
+    assert "ModemManager" in found.fix
+
+
+def test_one_adapter_under_two_names_is_an_error_that_names_both_keys(tmp_path: Path) -> None:
+    path, link = tmp_path / "two.toml", tmp_path / "by-id"
+    link.symlink_to("/dev/null")
+    text = HEAD.replace("/dev/ttyNOWHERE", "/dev/null")
+    path.write_text(text + TAIL.split('"rosie"')[1].replace("/dev/ttyNOTAIL", str(link)))
+    found = next(one for one in _of_robot(path) if one.level == "error")
+    assert (found.level, found.about) == ("error", "ports")
+    assert "bus.tail.port" in found.text and "bus.neck.port" in found.text and str(link) in found.text
 
 
 def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:

@@ -683,8 +683,12 @@ class DeviceSilent(DeviceError, TimeoutError):
 
     waited_s: float
     """How long it has been silent: since the request, or since its last measurement."""
+    reason: str = ""
+    """Why, if that is known."""
 
     def describe(self) -> str:
+        if self.reason:
+            return f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}: {self.reason}"
         return (
             f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}. Is it powered, plugged in, and set to "
             "the id and baud rate of the robot file? If it is simulated, this computer may be too busy"
@@ -706,9 +710,6 @@ class DeviceFault(DeviceError, RuntimeError):
 class BusGone(DeviceSilent, ConnectionError):
     """The port of a bus is gone: unplugged, down, or off the bus. The driver reopens it when it comes back."""
 
-    reason: str = ""
-    """What the operating system or the adapter reports."""
-
     def describe(self) -> str:
         why = self.reason or "plug its adapter in again"
         return (
@@ -719,10 +720,10 @@ class BusGone(DeviceSilent, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class NotStopped(DeviceSilent):
-    """A required stop failed: no client can lock the device until a person has checked and resumed it."""
+    """A required stop failed: no client can lock the device until a person has checked and resumed it.
 
-    reason: str
-    """When the stop failed, and why."""
+    ``reason`` says when the stop failed, and why.
+    """
 
     def describe(self) -> str:
         return (

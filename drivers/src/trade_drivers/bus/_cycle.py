@@ -72,6 +72,13 @@ class BusDevice(ABC, Generic[_Sample]):
         """True after its retries are used up and its measurement is too old: it is left out, and tried now and then."""
         self.silent_since_ns = 0
         self.probe_at_ns = 0
+        self.why_silent = ""
+        """Why its answers are missing, if that is known."""
+
+    @property
+    def unheld(self) -> str:
+        """Why the device cannot hold where it is; empty if it can."""
+        return ""
 
     @abstractmethod
     def faulty(self, fault: str = "") -> DeviceFault:
@@ -93,7 +100,8 @@ class BusDevice(ABC, Generic[_Sample]):
 
     def deaf(self, now_ns: int) -> DeviceSilent:
         """Returns the error for a device that does not answer."""
-        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
+        waited_s = self.age_ns(now_ns) / 1e9
+        return DeviceSilent(device=self.name, bus=self.bus, waited_s=waited_s, reason=self.why_silent)
 
 
 _Device = TypeVar("_Device", bound=BusDevice[Any])
@@ -246,6 +254,10 @@ class BusCycle(ABC, Generic[_Device]):
             if self.clock() >= until_ns:
                 return
 
+    def why_silent(self) -> str:
+        """Returns why answers are missing on this bus, if that is known. Never waits."""
+        return ""
+
     def worked_on(self, device: _Device) -> bool:
         """Returns whether a job is between two of its exchanges with this device."""
         return any(device in job.devices for job in self._working)
@@ -261,7 +273,8 @@ class BusCycle(ABC, Generic[_Device]):
             if device.silent or device.age_ns(now_ns) > self.stale_after_ns:
                 error = device.deaf(now_ns)
             elif device.halting_since_ns and now_ns - device.halting_since_ns > HALT_NS:
-                error = device.faulty("a stop was sent, but it is still moving")
+                why = f": {device.unheld}" if device.unheld else ""
+                error = device.faulty(f"a stop was sent, but it is still moving{why}")
             elif device.halting_since_ns:
                 return
         self._stopping.remove(ticket)
@@ -294,7 +307,7 @@ class BusCycle(ABC, Generic[_Device]):
         now_ns = self.clock()
         self.missed_answers += 1
         device.misses += 1
-        device.doubted = True
+        device.doubted, device.why_silent = True, self.why_silent()
         if device.silent:
             device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - ATTEMPTS + 1))
         elif device.misses >= ATTEMPTS and device.age_ns(now_ns) > self.stale_after_ns:

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from trade_drivers.bus._holders import holders
+
 __all__ = ["HostLock", "Taken"]
 
 _log = logging.getLogger("trade")
@@ -66,7 +68,7 @@ class HostLock:
             fcntl.flock(self._line, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.release()
-            raise Taken(f"a process that `fuser {self._device}` names") from None
+            raise Taken(", ".join(holders(self._device)) or f"a process that `fuser {self._device}` names") from None
         except OSError as bad:  # opening the device reports the reason
             _log.debug("%s: %s", self._device, bad)
 

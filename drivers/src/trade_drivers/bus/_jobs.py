@@ -9,6 +9,7 @@ from trade import current_call
 from trade.errors import DeviceFault, TradeError
 
 __all__ = [
+    "SHARED",
     "TAKEN",
     "BadAnswer",
     "Device",
@@ -30,7 +31,9 @@ Gate = Callable[[], None]
 """Called immediately before the bytes are sent; an exception prevents that."""
 
 TAKEN: Final = "another driver owns this port"
-"""The message for a port that another process has opened."""
+"""The message for a port that another process has locked."""
+SHARED: Final = "another program has this port open"
+"""The message for a port that another process reads, without a lock."""
 
 _TELL_S: Final = 0.1
 

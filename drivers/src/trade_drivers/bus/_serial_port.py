@@ -4,9 +4,11 @@ Only modules that need a vendor's library may import this one, as it needs pyser
 """
 
 import errno
+import logging
 import os
 import select
 import termios
+import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
@@ -15,7 +17,8 @@ from typing import Final
 import serial
 
 from trade.errors import ConfigurationError, TradeError
-from trade_drivers.bus._jobs import TAKEN, Gate, PortLost
+from trade_drivers.bus._holders import holders
+from trade_drivers.bus._jobs import SHARED, TAKEN, Gate, PortLost
 
 __all__ = ["ANSWER_MARGIN_S", "DRAIN_S", "LONGEST_WAIT_S", "SerialLine", "SerialWire"]
 
@@ -26,7 +29,10 @@ LONGEST_WAIT_S: Final = 0.048
 DRAIN_S: Final = 0.030
 """The pause after a failed exchange, in which late answers arrive and are discarded."""
 
+_log = logging.getLogger("trade")
 _BITS_PER_BYTE: Final = 10
+_SOUGHT_S: Final = 5.0
+"""How long bytes that another program took explain missing answers, and how often that program is searched."""
 
 
 class SerialLine:
@@ -47,6 +53,8 @@ class SerialLine:
         self._poll = select.poll()
         self._sent = 0
         self._deadline = 0.0
+        self.stolen_at = -_SOUGHT_S
+        """When another program last read bytes that were on their way to this one."""
         self._overdue = False
         """Whether the timeout of the answer is over and all that arrived until then was read."""
 
@@ -105,14 +113,23 @@ class SerialLine:
                 if self._overdue:
                     return False
                 for_s, self._overdue = 0, True
-        if for_s < 0 or not self._poll.poll(for_s * 1e3):
-            self._overdue = True
-            return False
-        data = os.read(self._fd, 4096)
-        if not data:
-            raise OSError(errno.EIO, "the port hung up")
-        self.received += data
-        return True
+        until = time.monotonic() + for_s
+        while for_s >= 0 and (ready := self._poll.poll(for_s * 1e3)):
+            if data := self._read():
+                self.received += data
+                return True
+            if ready[0][1] != select.POLLIN:
+                raise OSError(errno.EIO, "the port hung up")
+            self.stolen_at = time.monotonic()
+            for_s = until - self.stolen_at
+        self._overdue = True
+        return False
+
+    def _read(self) -> bytes:
+        try:
+            return os.read(self._fd, 4096)
+        except BlockingIOError:
+            return b""
 
 
 class SerialWire:
@@ -129,12 +146,13 @@ class SerialWire:
         self.settled_at = 0.0
         self.pause: Callable[[float], None] = time.sleep
         self._line = SerialLine(path, baud)
+        self._others, self._sought_at = "", -_SOUGHT_S
 
     def open(self) -> None:
         """Opens the port for exclusive use.
 
         Raises:
-            ConfigurationError: another driver owns it, it is not a serial port, or baud rate or permissions are wrong.
+            ConfigurationError: another program has it, it is not a serial port, or baud rate or permissions are wrong.
             PortLost: there is no such device.
         """
         try:
@@ -142,11 +160,34 @@ class SerialWire:
         except (OSError, termios.error, ValueError) as bad:
             self.close()
             raise self._cannot_open(bad) from None
+        if others := ", ".join(holders(self.path)):
+            self.close()
+            raise self._wrong("port", f"{SHARED}, and would take answers away: {others}; end it first")
+
+    def intruder(self) -> str:
+        """Returns who else reads this port and may have taken missing answers away; empty if nothing says so.
+
+        It never waits: another thread searches the host's processes.
+        """
+        now = time.monotonic()
+        if now - self._sought_at > _SOUGHT_S:
+            self._sought_at = now
+            threading.Thread(target=self._seek, name=f"who reads {self.path}", daemon=True).start()
+        if not self._others and now - self._line.stolen_at > _SOUGHT_S:
+            return ""
+        who = self._others or f"`sudo fuser {self.path}` names it"
+        return f"{SHARED}, and takes answers away: {who}; end it"
+
+    def _seek(self) -> None:
+        if others := ", ".join(holders(self.path)):
+            _log.warning("%s: %s, and takes answers away: %s", self.path, SHARED, others)
+        self._others = others
 
     def _cannot_open(self, bad: Exception) -> Exception:
         match _error_number(bad):
             case errno.EAGAIN | errno.EBUSY:
-                problem = f"{TAKEN}; stop it first (`fuser {self.path}` names the process)"
+                who = ", ".join(holders(self.path)) or f"`sudo fuser {self.path}` names the process"
+                problem = f"{TAKEN}; stop it first ({who})"
             case errno.EACCES | errno.EPERM:
                 problem = "no permission to open it; add yourself to its group (often dialout) and log in again"
             case errno.ENOTTY | errno.EISDIR:

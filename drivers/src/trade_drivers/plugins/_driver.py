@@ -138,7 +138,7 @@ class Driver(AnyDriver, ABC):
         """Checks that a device on an open line is set up as the robot file requires. Writes nothing.
 
         Raises:
-            ConfigurationError: ``attach`` would refuse the device; names file and key.
+            ConfigurationError: ``attach`` or ``enable`` would refuse the device; names file and key.
             WireError: the device does not answer reliably.
         """
 

@@ -1,21 +1,27 @@
 """Validation of a robot file by its drivers, before any port is opened."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
 from trade_drivers.plugins._driver import Driver, SenseDriver, load_driver
+from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Bus, Robot
 
 __all__ = ["check", "refusals"]
 
 
-def check(robot: Robot) -> None:
+def check(robot: Robot, ports: Mapping[str, str] | None = None) -> None:
     """Has the drivers of a robot check its file, without access to any device.
 
+    Args:
+        robot: the robot.
+        ports: replacements for the ports in the file, by bus or device.
+
     Raises:
-        ConfigurationError: the first mistake that a driver found; names file and key.
+        ConfigurationError: two keys name one port, or the first mistake that a driver found; names file and key.
     """
+    check_ports(robot, ports)
     for _, refusal in refusals(robot):
         raise refusal
 

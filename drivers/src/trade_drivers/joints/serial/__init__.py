@@ -4,7 +4,7 @@ It is independent of a vendor's registers and packets. Only ``_wire`` needs pyse
 """
 
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused, WireError
-from trade_drivers.joints.serial._asking import health_of, still_homed, tried, written
+from trade_drivers.joints.serial._asking import as_set, health_of, tried, written
 from trade_drivers.joints.serial._axis import Answer, Health, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.joints.serial._driver import ServoDriver
@@ -21,12 +21,12 @@ __all__ = [
     "ServoDriver",
     "ServoExchange",
     "WireError",
+    "as_set",
     "check_cycle",
     "check_own_range",
     "check_ranges",
     "first_look",
     "health_of",
-    "still_homed",
     "tried",
     "written",
 ]

@@ -10,7 +10,7 @@ from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
-__all__ = ["check_homing", "health_of", "still_homed", "tried", "written"]
+__all__ = ["as_set", "check_homing", "health_of", "tried", "written"]
 
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
@@ -54,7 +54,8 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
         else:
             yield
             return result
-    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9)
+    waited_s = (bus.clock() - began_ns) / 1e9
+    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s, reason=bus.why_silent())
 
 
 def zero_moved(axis: ServoAxis[Any], found: int) -> str:
@@ -69,19 +70,19 @@ def zero_moved(axis: ServoAxis[Any], found: int) -> str:
 
 def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
     """Raises ``WrongDevice`` for a servo with another zero; ``settings`` are its registers from address 0."""
-    found = axis.homing.decode(settings, 0)
-    if problem := zero_moved(axis, found):
-        expected = str(axis.joint.homing_counts)
-        raise WrongDevice(where=key, key="homing_counts", expected=expected, found=str(found), problem=problem)
+    if problem := axis.zero_moved(settings):
+        expected, found = str(axis.joint.homing_counts), str(axis.homing.decode(settings))
+        raise WrongDevice(where=key, key="homing_counts", expected=expected, found=found, problem=problem)
 
 
-def still_homed(bus: AnyExchange, axis: ServoAxis[Any]) -> Steps:
-    """Checks that a servo's zero is the calibrated one, as it may have lost settings or have been replaced.
+def as_set(bus: AnyExchange, axis: ServoAxis[Any]) -> Steps:
+    """Compares a servo with the robot file again, as it may have lost settings or have been replaced.
 
     Raises:
-        DeviceFault: the zero has moved.
+        DeviceFault: its zero has moved, it is set otherwise, or it cannot hold where it is.
     """
-    register = axis.homing
-    answer = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, register.address, register.size))
-    if problem := zero_moved(axis, register.decode(answer.data, register.address)):
-        raise axis.faulty(f"{problem}; write {axis.joint.homing_counts} there again, or `trade calibrate` it")
+    answer = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *axis.settings))
+    if problem := bus.misfit(axis, answer.data):
+        raise axis.faulty(problem)
+    if axis.sample is not None:
+        axis.seed(axis.sample.position)

@@ -7,7 +7,7 @@ from typing import ClassVar, Final, Generic, NamedTuple, Protocol, TypeVar
 from msgspec import Struct
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Axis, Grain, Sample
+from trade_drivers.joints import Axis, Goal, Grain, Sample
 from trade_drivers.robotfile import Joint
 
 __all__ = ["Answer", "Health", "Register", "ServoAxis"]
@@ -61,8 +61,12 @@ class ServoAxis(Axis, Generic[_Health]):
     """Address and size of the block read from each joint in each cycle."""
     slow: ClassVar[tuple[int, int]]
     """Address and size of the slow block, read from one joint at a time."""
+    settings: ClassVar[tuple[int, int]]
+    """Address and size of the block of persistent registers; it begins at 0."""
     homing: ClassVar[Register]
     """The register of the homing offset."""
+    ends: ClassVar[tuple[Register, Register]]
+    """The registers of the low and the high end of its own range."""
     error_remedy: ClassVar[str]
     """The remedy for errors that it reports."""
 
@@ -81,6 +85,8 @@ class ServoAxis(Axis, Generic[_Health]):
         self.model_number = model_number
         """The model number of the model in the robot file."""
         self._full_effort_counts = full_effort_counts
+        self.own_range: tuple[int, int] = (0, int(2 * grain.centre) - 1)
+        """The positions that the device can hold, as its registers said last."""
         self.health: _Health | None = None
         self.health_due_ns = 0
 
@@ -107,6 +113,51 @@ class ServoAxis(Axis, Generic[_Health]):
         if problem := self.problem(before, self.health):
             self.fault, self.ready = problem, False
         return self.health
+
+    def zero_moved(self, settings: bytes) -> str:
+        """Returns what is wrong with the homing offset; empty if it is the one of the robot file's calibration."""
+        found, expected = self.homing.decode(settings), self.joint.homing_counts
+        if found == expected:
+            return ""
+        where = f"its homing offset (register {self.homing.address})"
+        return f"{where} is {found}, but {expected} in the robot file: its zero has moved"
+
+    def own_goal(self, position: int) -> int:
+        """Returns the goal that holds a position: the end of the device's own range, if that is near."""
+        return max(self.own_range[0], min(self.own_range[1], position))
+
+    def outside(self, position: int) -> str:
+        """Returns why the device cannot hold a position; empty if it can."""
+        end = self.own_goal(position)
+        if abs(position - end) <= self.grain.arrived:
+            return ""
+        register, here = self.ends[position > end], self.scale.angle_rad
+        return (
+            f"it is at {here(position):.3f} rad, outside its own range, which ends at {here(end):.3f} rad (register "
+            f"{register.address}): it cannot hold there, and each goal drives it to that end"
+        )
+
+    def seed(self, position: int) -> Goal:
+        """Returns the goal with which torque is switched on at a measured position.
+
+        Raises:
+            DeviceFault: the device cannot hold there.
+        """
+        if problem := self.outside(position):
+            raise self.faulty(f"{problem}; turn it back by hand with its torque off, or widen that register")
+        return Goal(self.own_goal(position), self.accel_counts, self.speed_counts)
+
+    def brake(self, position: int) -> Goal:
+        """Returns the goal of a hold: at full acceleration, even in a slow move.
+
+        Outside its own range the device drives on to the end of that range, at the least speed that is not rest.
+        """
+        speed = self.grain.still_velocity + 1 if self.outside(position) else self.speed_counts
+        return Goal(self.own_goal(position), self.accel_counts, speed)
+
+    @property
+    def unheld(self) -> str:
+        return "" if self.sample is None else self.outside(self.sample.position)
 
     @property
     def in_doubt(self) -> bool:

@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
+from trade.errors import ConfigurationError
 from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Exchange, Motion, Steps
@@ -56,11 +57,18 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         """The line, for the bus thread only."""
         return self._wire
 
+    def why_silent(self) -> str:
+        return self.wire.intruder()
+
     # --- parts that differ between vendors
 
     @abstractmethod
     def admit(self, axis: _Servo) -> None:
         """Accepts a checked joint, and stops it if it moves."""
+
+    @abstractmethod
+    def check_settings(self, axis: _Servo, settings: bytes, key: str) -> None:
+        """Compares the persistent registers of a joint with the robot file. Raises ``ConfigurationError``."""
 
     def name_of(self, model_number: int) -> str:
         """Returns the name of a model, or its number."""
@@ -68,6 +76,16 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
 
     def look_after(self, axis: _Servo) -> None:
         """Reacts to the health just read. Raises ``NoAnswer``."""
+
+    def misfit(self, axis: _Servo, settings: bytes) -> str:
+        """Returns in what a joint's persistent registers differ from the robot file; empty if in nothing."""
+        if moved := axis.zero_moved(settings):
+            return f"{moved}; write {axis.joint.homing_counts} there again, or `trade calibrate` it"
+        try:
+            self.check_settings(axis, settings, axis.name)
+        except ConfigurationError as wrong:
+            return wrong.problem
+        return ""
 
     # --- a joint that missed an exchange may have restarted without torque: it gets no goal until that is read
 
@@ -97,7 +115,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         self._read_health()
 
     def readmit(self, axis: _Servo) -> None:
-        """Checks model and health of a joint that was offline or missed an exchange.
+        """Checks model and health of a joint that was offline or missed an exchange, and settings after the former.
 
         Never enables or moves it; stops a motion that no client owns.
 
@@ -114,6 +132,8 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             return
         self._refresh_health(axis)
         if axis.silent:
+            if problem := self.misfit(axis, self.wire.read(axis.id, *axis.settings).data):
+                axis.fault, axis.ready = problem, False
             _log.info("%s answers again", axis.name)
             axis.misses = 0
         axis.silent = axis.doubted = False

@@ -51,6 +51,8 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
         serial, wire = self._serial(robot, bus), cast("ServoBench[_Wire]", bench).wire
         [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).devices
         self.look_over(wire, serial, axis, time.monotonic_ns, robot.where)
+        if problem := axis.unheld:
+            raise ConfigurationError(where=f'{robot.where}: joint."{axis.joint.name}"', problem=problem)
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         exchange = self.open_exchange(robot, self._serial(robot, bus), port)

@@ -23,8 +23,6 @@ _Result = TypeVar("_Result")
 class Kept(NamedTuple):
     """The layout of the persistent registers of one vendor's servos."""
 
-    size: int
-    """Size in bytes, from address 0."""
     registers: tuple[int, int]
     """The registers of the id and the baud rate."""
     name_of: Callable[[int, str], str]
@@ -98,6 +96,8 @@ def first_ping(
         problem, absent = twice, False
         if garbled == ATTEMPTS:  # with more of them, the answers of two devices might once look like one
             break
+    if company := wire.intruder():
+        raise ConfigurationError(where=key, problem=company)
     raise (DeviceAbsent if absent else ConfigurationError)(where=key, problem=problem)
 
 
@@ -157,7 +157,7 @@ def first_look(
     number = first_ping(wire, bus, axis, clock_ns, key, kept.registers)
     check_model(axis, number, kept.name_of(number, "a model this driver does not know"), key)
     asked_ns = clock_ns()
-    settings = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, 0, kept.size).data)
+    settings = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, *axis.settings).data)
     health = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, *axis.slow).data)
     sample = again(wire, bus, axis, clock_ns, lambda: wire.read(axis.id, *axis.cyclic).data)
     check_firmware(axis, kept.firmware(settings), key)
@@ -167,12 +167,15 @@ def first_look(
     return settings
 
 
-def check_own_range(axis: ServoAxis[Any], low: int, high: int, registers: str, key: str) -> None:
+def check_own_range(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
     """Raises ``ConfigurationError`` for a joint whose range exceeds the one set in its device."""
+    least, most = axis.ends
+    low, high = axis.own_range = least.decode(settings), most.decode(settings)
     if axis.low < low or axis.high > high:
         joint, ends = axis.joint, sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         raise ConfigurationError(
             where=key,
             problem=f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the device's own range "
-            f"({registers}), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the former or widen the latter",
+            f"(registers {least.address} and {most.address}), {ends[0]:.6g} to {ends[1]:.6g} rad; "
+            "narrow the former or widen the latter",
         )

@@ -68,7 +68,9 @@ class DynamixelAxis(ServoAxis[DynamixelHealth]):
 
     cyclic = CYCLIC
     slow = SLOW
+    settings = (0, table.MIN_POSITION.end)
     homing = table.HOMING_OFFSET
+    ends = (table.MIN_POSITION, table.MAX_POSITION)
     error_remedy = "let it cool down or free it, then call enable(), which restarts it"
 
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:

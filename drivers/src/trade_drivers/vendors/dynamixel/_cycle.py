@@ -8,6 +8,7 @@ from trade_drivers.joints.serial import ServoExchange, health_of
 from trade_drivers.vendors.dynamixel import _jobs as jobs
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis
+from trade_drivers.vendors.dynamixel._inspect import check_settings
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
@@ -49,10 +50,10 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         ready: dict[int, bytes] = {}
         others: dict[int, bytes] = {}
         for axis, position in positions.items():
-            if axis.ready:  # brakes at the joint's full acceleration, even in a slow move
-                ready[axis.id] = jobs.goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+            if axis.ready or axis.outside(position):
+                ready[axis.id] = jobs.goal_block(axis.brake(position))
             else:
-                others[axis.id] = table.GOAL_POSITION.encode(position)
+                others[axis.id] = table.GOAL_POSITION.encode(axis.own_goal(position))
         if ready:
             self.wire.sync_write(table.PROFILE_ACCELERATION.address, ready)
         if others:
@@ -69,6 +70,9 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
 
     def leaving(self, job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
         return jobs.leaving(self, job, axis, relax=relax)
+
+    def check_settings(self, axis: DynamixelAxis, settings: bytes, key: str) -> None:
+        check_settings(axis, settings, key)
 
     def name_of(self, model_number: int) -> str:
         return table.name_of(model_number, str(model_number))

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.dynamixel._wire import Wire
 
-__all__ = ["check_bus", "look_over"]
+__all__ = ["check_bus", "check_settings", "look_over"]
 
-_KEPT: Final = Kept(table.MIN_POSITION.end, (7, 8), table.name_of, table.firmware)
+_KEPT: Final = Kept((7, 8), table.name_of, table.firmware)
 _OTHER_THAN_REVERSED: Final = 0xFE
 _SHADOWS: Final = 252
 _ALL_ANSWER: Final = 2
@@ -48,11 +48,12 @@ def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Cal
     except NoAnswer:
         silent = "it answers a ping but no read: its status return level (68) is 0 or 1; set it to 2"
         raise ConfigurationError(where=key, problem=silent) from None
-    _check_settings(axis, settings, key)
+    check_settings(axis, settings, key)
     return table.RETURN_DELAY.decode(settings) * table.RETURN_DELAY.si_per_count
 
 
-def _check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
+def check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
+    """Compares the persistent registers with the robot file. Raises ``ConfigurationError``."""
     joint, health = axis.joint, axis.health
     mode, drive = table.OPERATING_MODE.decode(settings), table.DRIVE_MODE.decode(settings)
     if health is not None and health.status_level != _ALL_ANSWER:
@@ -66,8 +67,7 @@ def _check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
         _wrong(key, f"{problem}, torque switched on by nothing but us")
     if (shadow := table.SHADOW_ID.decode(settings)) <= _SHADOWS:
         _wrong(key, f"it also obeys what is sent to id {shadow} (register 12); set it to 255, with torque off")
-    low, high = table.MIN_POSITION.decode(settings), table.MAX_POSITION.decode(settings)
-    check_own_range(axis, low, high, "registers 52 and 48", key)
+    check_own_range(axis, settings, key)
     fastest = table.VELOCITY_LIMIT.decode(settings)
     if axis.speed_counts > fastest:
         limit = fastest * table.RAD_S_PER_COUNT

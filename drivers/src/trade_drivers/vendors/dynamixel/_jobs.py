@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.joints import Goal, Steps, Work
-from trade_drivers.joints.serial import NoAnswer, health_of, still_homed, tried, written
+from trade_drivers.joints.serial import NoAnswer, as_set, health_of, tried, written
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import DynamixelAxis, DynamixelHealth
 
@@ -67,7 +67,7 @@ def enabling(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: Dynamixel
         health = yield from _restarted(bus, job, axis)
     if health.error:
         raise axis.faulty()
-    yield from still_homed(bus, axis)
+    yield from as_set(bus, axis)
     if health.watchdog:
         yield from written(bus, job, axis, table.BUS_WATCHDOG, 0)
     block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
@@ -87,7 +87,7 @@ def _seeded(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelA
     register = table.PRESENT_POSITION
     answer = bus.wire.read(axis.id, register.address, register.size)
     position = register.decode(answer.data, register.address)
-    block = goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+    block = goal_block(axis.seed(position))
     bus.wire.write(axis.id, _GOAL_BLOCK[0], block, job.gate)
     return block
 

@@ -62,7 +62,9 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
 
     cyclic = CYCLIC
     slow = SLOW
+    settings = (0, table.TORQUE.address)
     homing = table.HOMING_OFFSET
+    ends = (table.MIN_ANGLE, table.MAX_ANGLE)
     error_remedy = "let it cool down or free it, then call enable()"
 
     def __init__(self, name: str, bus: str, joint: Joint, lead_s: float, coupled: Sequence[str] = ()) -> None:

@@ -13,6 +13,7 @@ from trade_drivers.joints.serial import ServoExchange, health_of
 from trade_drivers.vendors.feetech import _jobs as jobs
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, FeetechAxis
+from trade_drivers.vendors.feetech._inspect import check_settings
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire  # noqa: F401 - a parameter of the base class
@@ -45,9 +46,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         self.write_goals(goals, gate)
 
     def write_holds(self, positions: Mapping[FeetechAxis, int]) -> None:
-        # brakes at the joint's full acceleration, even in a slow move
-        goals = {axis: Goal(position, axis.accel_counts, axis.speed_counts) for axis, position in positions.items()}
-        self._send(goals)
+        self._send({axis: axis.brake(position) for axis, position in positions.items()})
         for axis in positions:
             axis.aim = None
 
@@ -64,6 +63,9 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         return jobs.leaving(self, job, axis, relax=relax)
 
     # --- from the bus thread
+
+    def check_settings(self, axis: FeetechAxis, settings: bytes, key: str) -> None:
+        check_settings(axis, settings, key)
 
     def name_of(self, model_number: int) -> str:
         return table.name_of(model_number, str(model_number))

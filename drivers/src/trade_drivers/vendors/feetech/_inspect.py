@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.robotfile import Robot, SerialBus
 
-__all__ = ["check_bus", "look_over"]
+__all__ = ["check_bus", "check_settings", "look_over"]
 
-_KEPT: Final = Kept(table.TORQUE.address, (5, 6), table.name_of, table.firmware)
+_KEPT: Final = Kept((5, 6), table.name_of, table.firmware)
 _MOST_SPEED_COUNTS: Final = ((1 << 15) - 1) // table.STEPS_PER_SPEED
 
 
@@ -55,11 +55,12 @@ def look_over(wire: "ServoWire", bus: "SerialBus", axis: FeetechAxis, clock_ns: 
     """
     key = f'{where}: joint."{axis.joint.name}"'
     settings = first_look(wire, bus, axis, _KEPT, clock_ns, key)
+    check_settings(axis, settings, key)
+
+
+def check_settings(axis: FeetechAxis, settings: bytes, key: str) -> None:
+    """Compares the persistent registers with the robot file. Raises ``ConfigurationError``."""
     axis.unload = table.UNLOAD.decode(settings)
-    _check_settings(axis, settings, key)
-
-
-def _check_settings(axis: FeetechAxis, settings: bytes, key: str) -> None:
     phase = table.PHASE.decode(settings)
     if table.END.decode(settings) != 0:
         _wrong(key, "its words have their high byte first (register 2): it is no servo of the STS series")
@@ -74,7 +75,7 @@ def _check_settings(axis: FeetechAxis, settings: bytes, key: str) -> None:
     low, high = table.MIN_ANGLE.decode(settings), table.MAX_ANGLE.decode(settings)
     if low == high == 0:
         _wrong(key, "its range (registers 9 and 11) is 0 to 0, which is many turns; set it to 0 and 4095")
-    check_own_range(axis, low, high, "registers 9 and 11", key)
+    check_own_range(axis, settings, key)
 
 
 def _wrong(where: str, problem: str) -> NoReturn:

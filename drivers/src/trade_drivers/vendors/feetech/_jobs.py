@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.joints import Goal, Steps, Work
-from trade_drivers.joints.serial import health_of, still_homed, tried, written
+from trade_drivers.joints.serial import as_set, health_of, tried, written
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import FeetechAxis
 
@@ -54,7 +54,7 @@ def enabling(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) 
         health = yield from health_of(bus, axis)
     if health.error:
         raise axis.faulty()
-    yield from still_homed(bus, axis)
+    yield from as_set(bus, axis)
     if not health.locked:
         yield from written(bus, job, axis, table.LOCK, 1)
         health = yield from health_of(bus, axis)
@@ -72,7 +72,8 @@ def _seeded(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -
     """Sets the goal to the measured position, which may switch torque on; measures again at each retry."""
     asked_ns = bus.clock()
     health = axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
-    block = goal_block(Goal(health.position, axis.accel_counts, axis.speed_counts))
-    axis.aim, axis.sent = None, health.position
+    goal = axis.seed(health.position)
+    block = goal_block(goal)
+    axis.aim, axis.sent = None, goal.position
     bus.wire.write(axis.id, GOAL_BLOCK[0], block, job.gate)
     return block

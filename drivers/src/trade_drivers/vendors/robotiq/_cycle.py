@@ -35,6 +35,9 @@ class Exchange(BusCycle[Hand]):
 
     # --- from any thread
 
+    def why_silent(self) -> str:
+        return self.wire.intruder()
+
     def stop(self, hands: Sequence[Hand], reason: str = "", *, grip: bool = False) -> StopTicket[Hand]:
         """Voids all permits for these grippers, and stops their fingers before anything else happens on the bus.
 

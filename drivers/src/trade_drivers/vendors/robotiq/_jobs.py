@@ -223,4 +223,5 @@ def _try(job: GripperCommand, act: Callable[[], None]) -> Steps:
         else:
             yield
             return
-    raise DeviceSilent(device=job.hand.name, bus=job.hand.bus, waited_s=(exchange.clock() - began_ns) / 1e9)
+    waited_s = (exchange.clock() - began_ns) / 1e9
+    raise DeviceSilent(device=job.hand.name, bus=job.hand.bus, waited_s=waited_s, reason=exchange.why_silent())

@@ -109,6 +109,7 @@ def _of_robot(path: Path) -> Iterator[Finding]:
     known = {bus.driver for bus in robot.buses} & drivers().keys()
     yield from host.libraries(sorted(known), needed=True)
     wrong = dict(refusals(robot))
+    yield from robots.shared(robot)
     yield from robots.refused(robot, wrong)
     sound = replace(robot, buses=[bus for bus in robot.buses if bus.name not in wrong])
     yield from robots.unwatched(sound)

@@ -19,7 +19,8 @@ from trade_drivers import (
     WireError,
     load_driver,
 )
-from trade_drivers.bus._jobs import TAKEN
+from trade_drivers.bus._jobs import SHARED, TAKEN
+from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
@@ -27,7 +28,7 @@ from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasured", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "shared", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
@@ -96,6 +97,14 @@ def judged(bus: CanBus, link: "Link") -> Finding:
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
 
 
+def shared(robot: Robot) -> Iterator[Finding]:
+    """Reports two names of one port."""
+    try:
+        check_ports(robot)
+    except ConfigurationError as bad:
+        yield Finding(level="error", about="ports", text=str(bad), fix="correct one of the two keys")
+
+
 def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
     """Reports the errors that drivers find in the file, before any device is asked."""
     buses = {bus.name for bus in robot.buses}
@@ -127,6 +136,9 @@ def _unseen(robot: Robot, bus: SerialBus, bad: ConfigurationError) -> Finding:
         fix = "end the program that uses it and run this again; while a robot is up, `trade up` reports its devices"
         return Finding(level="warning", about=about, text=f"was not checked: {bad}", fix=fix)
     text = f"was not checked: {robot.where}: bus.{bus.name}.port: {bad.problem}"
+    if SHARED in bad.problem:
+        fix = "end it and keep it away: ModemManager by ID_MM_DEVICE_IGNORE in a udev rule, a getty by systemctl"
+        return Finding(level="error", about=about, text=text, fix=fix)
     return Finding(
         level="error", about=about, text=text, fix="set port to the line of these devices, and run this again"
     )
@@ -142,7 +154,7 @@ def _on_line(robot: Robot, bus: SerialBus, driver: Driver, commissioner: Commiss
 def _unfit(
     driver: Driver, bench: Bench, robot: Robot, bus: SerialBus, device: Joint | Gripper, about: str
 ) -> Finding | None:
-    """Returns what `trade up` would refuse about a device that answers, or None."""
+    """Returns what `trade up` or `enable` would refuse about a device that answers, or None."""
     try:
         driver.fits(bench, robot, bus, device)
     except ConfigurationError as bad:

@@ -14,6 +14,7 @@ from trade import Container
 from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, FaultInfo, attach, load, without
 from trade_drivers import check as drivers_check
+from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import CONNECTION, SELECT, Json
@@ -141,6 +142,8 @@ def up(
         drivers_check(whole)
         out.say(f"{robot_file} is right")
         return
+    if not sim:
+        check_ports(whole, named_ports)
     if detach:
         detach_now(out, choice_of(context).settings(name or robot.name))
         return
