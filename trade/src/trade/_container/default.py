@@ -1,4 +1,7 @@
-"""The default container of the process, and functions that use it."""
+"""The default container of the process, and functions that use it.
+
+The container that created an object of the process (`System.instantiate`) is the default one, unless there is one.
+"""
 
 import contextlib
 import functools
@@ -10,6 +13,7 @@ from types import FrameType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from trade._container.container import Container
+from trade._migration.factory import first_host
 from trade._settings import Settings
 from trade.errors import ConfigurationError
 
@@ -30,7 +34,7 @@ def start(settings: Settings | None = None) -> Container:
     """
     global _default  # noqa: PLW0603 - the one default
     with _lock:
-        if _default is not None:
+        if _default is not None and not _default.closed:
             problem = (
                 "the default container runs already. Call trade.start before anything else, or trade.close() first"
             )
@@ -40,11 +44,18 @@ def start(settings: Settings | None = None) -> Container:
 
 
 def container() -> Container:
-    """The default container; starts it if necessary."""
+    """The default container; starts it if necessary.
+
+    In a process whose container hosts created objects, such as `trade container`, it is that container.
+    """
+    global _default  # noqa: PLW0603 - the one default
     running = _default
-    if running is not None:
+    if running is not None and not running.closed:
         return running
     with _lock:
+        host = first_host()
+        if isinstance(host, Container) and (_default is None or _default.closed):
+            _default = host
         return _default if _default is not None else start()
 
 

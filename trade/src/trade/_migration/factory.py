@@ -35,6 +35,15 @@ class FactoryHost(Protocol):
     def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
 
 
+_hosts: Final[dict[int, FactoryHost]] = {}
+"""The open containers of the process that imported a class to create objects, in this order."""
+
+
+def first_host() -> FactoryHost | None:
+    """The first open container of the process that created objects; None if none did."""
+    return next(iter(list(_hosts.values())), None)
+
+
 class ProviderFactory:
     """Owns the objects created here: each is closed when a client terminates it, or with the container."""
 
@@ -68,6 +77,7 @@ class ProviderFactory:
         if not _PATH.fullmatch(class_path):
             raise NoSuchClass(class_path=class_path, container=where, reason="a path looks like package.module:Class")
         module_name, _, qualified = class_path.partition(":")
+        _hosts.setdefault(id(self), self._home)
         try:
             found: Any = importlib.import_module(module_name)
         except Exception as error:
@@ -137,6 +147,7 @@ class ProviderFactory:
             made, self._made = list(self._made.values()), {}
         for one in reversed(made):
             end(one.provider)
+        _hosts.pop(id(self), None)
 
 
 def path_of(kind: type) -> str:
