@@ -104,6 +104,10 @@ class Watcher:
             trade.find(where(name="turn"))()
         return trade.container().settings.system
 
+class Tidy(Watcher):
+    def close(self) -> None:
+        trade.close()
+
 class Mute:
     def close(self) -> None:
         events.append("closed")
@@ -187,6 +191,19 @@ def test_what_was_made_finds_and_locks_in_the_system_of_its_container(
     assert asker.find(where(name="home"))() == ("maker", "maker", "maker")
     assert asker.find(where(name="turned"))() == maker.settings.system
     assert {info.name for info in asker.containers()} == {"maker", "asker"}
+
+
+def test_an_object_that_closes_the_default_container_ends_nothing_of_its_host(
+    asker: Container, maker: Container, memory: MemorySystem
+) -> None:
+    ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
+    [home, _] = ask(asker, "instantiate", "workshop:Tidy", (), ["rosie.watch"])
+    memory.settle()
+    assert home()[0] == "maker"
+    ask(asker, "terminate", home)
+    assert not maker.closed
+    assert asker.find(where(name="kind"))() == (40, "white")
+    assert trade.container() is maker
 
 
 def test_a_program_that_has_a_default_container_keeps_it(

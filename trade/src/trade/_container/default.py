@@ -24,6 +24,8 @@ _LOOK_S = 0.2
 
 _lock = threading.RLock()
 _default: Container | None = None
+_is_host = False
+"""Whether the default container hosts objects of others, and is closed by the program that started it."""
 
 
 def start(settings: Settings | None = None) -> Container:
@@ -32,14 +34,14 @@ def start(settings: Settings | None = None) -> Container:
     Raises:
         errors.ConfigurationError: it runs already; start it before any other use of ``trade``.
     """
-    global _default  # noqa: PLW0603 - the one default
+    global _default, _is_host
     with _lock:
         if _default is not None and not _default.closed:
             problem = (
                 "the default container runs already. Call trade.start before anything else, or trade.close() first"
             )
             raise ConfigurationError(problem=problem)
-        _default = Container(settings)
+        _default, _is_host = Container(settings), False
         return _default
 
 
@@ -48,22 +50,27 @@ def container() -> Container:
 
     In a process whose container hosts created objects, such as `trade container`, it is that container.
     """
-    global _default  # noqa: PLW0603 - the one default
+    global _default, _is_host
     running = _default
     if running is not None and not running.closed:
         return running
     with _lock:
         host = first_host()
         if isinstance(host, Container) and (_default is None or _default.closed):
-            _default = host
+            _default, _is_host = host, True
         return _default if _default is not None else start()
 
 
 def close() -> None:
-    """Closes the default container, which leaves the system. The next use starts a new one. Idempotent."""
-    global _default
+    """Closes the default container, which leaves the system. The next use starts a new one. Idempotent.
+
+    An object does not close the container that hosts it: other objects are there, too.
+    """
+    global _default, _is_host
     with _lock:
-        running, _default = _default, None
+        if _is_host and _default is not None and not _default.closed:
+            return
+        running, _default, _is_host = _default, None, False
     if running is not None:
         running.close()
 

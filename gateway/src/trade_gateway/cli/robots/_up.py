@@ -11,7 +11,6 @@ import typer
 from rich.markup import escape
 
 from trade import Container
-from trade import start as start_default
 from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, FaultInfo, attach, load, without
 from trade_drivers import check as drivers_check
@@ -149,7 +148,8 @@ def up(
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(whole, sim_log)) if sim else None
         ports: dict[str, str] = simulation.ports if simulation else named_ports
-        container = stack.enter_context(start_default(choice_of(context).settings(name or robot.name)))
+        container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
+        container.making.host()  # drivers of other packages may look for services
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
         if left_out:
