@@ -17,6 +17,50 @@ from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_lo
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
+class JamError(Exception):
+    """Of a module that the command line does not import."""
+
+
+class Careless:
+    @trade.service
+    def fail(self, kind: str) -> None:
+        self._close({"jam": JamError, "key": KeyError}.get(kind, RuntimeError))
+
+    def _close(self, kind: type[Exception]) -> None:
+        raise kind("the gripper is jammed")
+
+
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [
+        ("plain", "RuntimeError: the gripper is jammed"),
+        ("key", "KeyError: 'the gripper is jammed'"),
+        ("jam", "RemoteError: left.hand.fail raised tests.system.test_command_line:JamError: the gripper is jammed"),
+    ],
+)
+def test_what_a_provider_raises_is_its_message_its_place_and_on_request_its_traceback(
+    system: str, trade_command: Command, kind: str, named: str
+) -> None:
+    trade.register(Careless(), "left.hand")
+    failed = trade_command("call", "left.hand.fail", kind)
+    assert (failed.returncode, failed.stdout) == (1, "")
+    first, *lines = failed.stderr.splitlines()
+    assert first == named
+    assert len(lines) == 3
+    assert re.fullmatch(rf"  raised by the provider in {re.escape(__file__)}, line \d+, in _close:", lines[0])
+    assert [line.strip() for line in lines[1:]] == [
+        'raise kind("the gripper is jammed")',
+        "--traceback shows the whole traceback",
+    ]
+    whole = trade_command("call", "left.hand.fail", kind, "--traceback").stderr
+    assert whole.startswith("Traceback (most recent call last):")
+    assert "in fail" in whole
+    assert "trade_gateway" not in whole  # the command line's own functions say nothing about it
+    said = json.loads(trade_command("call", "left.hand.fail", kind, "--json").stderr)
+    assert said["message"] in named
+    assert "in _close" in said["data"]["traceback"]
+
+
 def test_services_of_a_robot_are_listed_as_json(rosie_up, trade_command: Command) -> None:
     rosie_up()
     listed = trade_command("services", "--group", "rosie", "--json")

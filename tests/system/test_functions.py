@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 import pytest
 
 import trade
+from tests.support.waiting import wait_until
 from trade import where
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 CAMERA = """
+import trade
 from trade import service
 
 class Camera:
@@ -24,6 +27,30 @@ class Camera:
     @service(effect="read")
     def size(self) -> int:
         return self.width
+
+class Looker:
+    @service(effect="read")
+    def home(self) -> tuple[str, str, int]:
+        here = trade.container()
+        return here.settings.system, here.name, len(trade.services(trade.where(name="home")))
+"""
+WITNESS = """
+import trade
+from trade_drivers import Measured, PolledSensor, SenseDriver, SensorInfo
+
+class Witness(PolledSensor):
+    def __init__(self, name):
+        super().__init__(SensorInfo(name=name, model="W", unit="1", size=0, low=0.0, high=9.0, rate_hz=10.0), "none")
+
+    def open(self): pass
+    def hang_up(self): pass
+
+    def measure(self):
+        return Measured(float(len(trade.services(trade.where(name="read", container=trade.container().name)))), "good")
+
+class WitnessDriver(SenseDriver):
+    def attach(self, name, device, port):
+        return Witness(name).start(name)
 """
 
 
@@ -40,6 +67,41 @@ def vision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def function(name: str, container: str) -> Any:
     return trade.find(where(name=name, group="trade", container=container), wait_s=30)
+
+
+def test_what_is_made_in_a_container_finds_what_the_container_sees(
+    run, vision: Path, system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its system is known from the command line alone, and its port is fixed: a second container could not listen."""
+    with socket.socket() as free, monkeypatch.context() as there:
+        free.bind(("127.0.0.1", 0))
+        there.setenv("TRADE_LISTEN", f"tcp/127.0.0.1:{free.getsockname()[1]}")
+        there.delenv("TRADE_SYSTEM")
+        eyes = run(
+            "-m", "trade_gateway", "--system", system, "container", "--name", "eyes", "--allow", "sight.*", "--json"
+        )
+    assert eyes.json()["system"] == system
+    function("instantiate", "eyes")("sight.vision:Looker", (), ["rosie.eyes"])
+    assert trade.find(where(name="home"), wait_s=30)() == (system, "eyes", 1)
+    assert len(trade.containers()) == 2
+
+
+def test_a_driver_from_elsewhere_finds_what_the_robots_container_sees(
+    run, tmp_path: Path, system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "witness-0.1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: witness\nVersion: 0.1.0\n")
+    (about / "entry_points.txt").write_text("[trade.drivers]\nwitness = witness:WitnessDriver\n")
+    (tmp_path / "witness.py").write_text(WITNESS)
+    robot = tmp_path / "hall.toml"
+    robot.write_text('[robot]\nname = "hall"\n[sensor.witness]\ndriver = "witness"\n')
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with monkeypatch.context() as there:
+        there.delenv("TRADE_SYSTEM")
+        run("-m", "trade_gateway", "--system", system, "up", robot, "--json").json()
+    read = trade.find(where(name="read", group="hall.witness"), wait_s=30)
+    wait_until(lambda: read().value == 1.0, "it sees itself")
 
 
 def test_an_empty_container_takes_providers_and_its_process_ends_on_request(run, vision: Path) -> None:

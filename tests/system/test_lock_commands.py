@@ -16,6 +16,7 @@ from tests.system.conftest import ROSIES_HEAD, Program, Rosie
 from trade import Container, where
 from trade._transport.endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
+from trade_hil_sim import events, read_log
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -275,6 +276,25 @@ def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_comman
     assert "no e-stop is open" in trade_command("estop", "--clear").stdout
     unknown = trade_command("estop", "--clear", "abc")
     assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (3, True)
+
+
+def test_a_stopped_group_is_resumed_by_the_one_command_that_its_refusal_names(
+    rosie_up: Callable[[], Rosie], trade_command: Command
+) -> None:
+    rosie = rosie_up()
+    assert trade_command("call", "rosie.head.move_to", "[0.05, 0.05]").returncode == 0
+    moved = events(read_log(rosie.log), "motion_started")
+    assert trade_command("stop", "rosie.head").returncode == 0
+    refused = trade_command("call", "rosie.head.move_to", "[0.1, 0.1]").stderr
+    words = re.search(r"`trade (resume rosie\.neck\.pan rosie\.neck\.tilt)`", refused)
+    assert words is not None, refused
+    unknown = trade_command("resume", "rosie.neck.pan", "rosie.neck.roll")
+    assert (unknown.returncode, "no service matches group='rosie.neck.roll'" in unknown.stderr) == (3, True)
+    assert "rosie.neck.pan was stopped" in trade_command("call", "rosie.head.move_to", "[0.1, 0.1]").stderr
+    assert events(read_log(rosie.log), "motion_started") == moved
+    resumed = trade_command(*words[1].split())
+    assert resumed.stdout == "may move again: rosie.neck.pan, rosie.neck.tilt\n"
+    assert trade_command("call", "rosie.head.move_to", "[0.1, 0.1]").returncode == 0
 
 
 def test_S09_a_robot_that_comes_up_with_one_open_says_so_and_how_it_is_cleared(

@@ -5,6 +5,7 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -101,20 +102,69 @@ def test_a_second_container_of_one_name_is_not_started(sshd: Sshd) -> None:
         assert refused.value.reason == "it did not come up"
 
 
-def test_a_container_that_does_not_join_the_system_is_reported_with_its_process(sshd: Sshd) -> None:
+def stranger(sshd: Sshd, wait_s: float = 1.0) -> CannotStart:
+    """The error of a start of a container that cannot join the system."""
+    environment = {"TRADE_CREDENTIALS": "other:secret"}
     with pytest.raises(CannotStart) as refused:
         trade.system.start_container(
-            "robot",
-            "eyes",
-            command=HERE,
-            environment={"TRADE_CREDENTIALS": "other:secret"},
-            ssh_config=sshd.config,
-            wait_s=1.0,
+            "robot", "eyes", command=HERE, environment=environment, ssh_config=sshd.config, wait_s=wait_s
         )
     assert refused.value.reason == "not seen"
-    pid = int(refused.value.said.split("process ")[1].split(",")[0])
+    return refused.value
+
+
+def process_of(error: CannotStart) -> int:
+    return int(error.said.split("process ")[1].split(",")[0])
+
+
+def gone(pid: int) -> bool:
+    return not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+def test_a_container_that_does_not_join_the_system_is_ended_again(sshd: Sshd) -> None:
+    error = stranger(sshd)
+    assert error.said.endswith("was not visible here within 1 s, and was ended again")
+    wait_until(lambda: gone(process_of(error)))
+
+
+def test_a_container_that_cannot_be_ended_again_is_named_with_its_place(
+    sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bin").mkdir()
+    ours = tmp_path / "bin" / "ssh"
+    ours.write_text(f'#!/bin/sh\ncase "$*" in *kill*) exit 255;; esac\nexec {shutil.which("ssh")} "$@"\n')
+    ours.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{ours.parent}:{os.environ['PATH']}")
+    error = stranger(sshd, wait_s=0.0)
+    pid = process_of(error)
+    assert not gone(pid)
+    assert f"it still runs there; to end it: `ssh robot kill {pid}`" in str(error)
     psutil.Process(pid).terminate()
-    wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
+    wait_until(lambda: gone(pid))
+
+
+def test_another_process_of_that_number_is_not_ended(sshd: Sshd) -> None:
+    """`command` may start the container where processes have other numbers, such as in a container of containerd."""
+    other = subprocess.Popen(["sleep", "1000"])
+    try:
+        assert not ssh.end_there("robot", "eyes", other.pid, ["container", "--name", "eyes"], sshd.config)
+        assert other.poll() is None
+        assert ssh.end_there("robot", "eyes", other.pid, ["sleep", "1000"], sshd.config)
+        assert other.wait(10) == -signal.SIGTERM
+    finally:
+        other.kill()
+        other.wait()
+
+
+def test_what_the_shell_there_prints_by_itself_hides_no_container(sshd: Sshd, tmp_path: Path) -> None:
+    talkative = tmp_path / "trade"
+    talkative.write_text(f'#!/bin/sh\necho hello\n{shlex.join(HERE)} "$@"\necho bye\n')
+    talkative.chmod(0o755)
+    started = trade.system.start_container(
+        "robot", "eyes", command=(str(talkative),), ssh_config=sshd.config, wait_s=30
+    )
+    with ended("eyes", started.pid):
+        assert started.name == "eyes"
 
 
 def refused(sshd: Sshd, *command: str) -> CannotStart:

@@ -2,7 +2,7 @@
 
 A page's ``console`` blocks are typed in order, in a folder of its own with a copy of examples/. Blocks with a title are
 files to save. A command that ends in ``&`` runs beside the others; of what it says as many lines as the page shows
-are compared. `kill %1` ends the first of those.
+are compared. `kill %1` ends the first of those. Their numbers are those of a shell: one that has ended leaves its own.
 """
 
 import os
@@ -34,7 +34,7 @@ class Terminal:
 
     def __init__(self, shell: Shell) -> None:
         self._shell = shell
-        self._jobs: list[subprocess.Popen[str]] = []
+        self._jobs: dict[int, subprocess.Popen[str]] = {}
 
     def save(self, name: str, text: str) -> None:
         (self._shell.folder / name).write_text(text, encoding="utf-8")
@@ -42,11 +42,12 @@ class Terminal:
     def type(self, command: str) -> str:
         """What a command says, errors too; what differs from run to run in words."""
         if job := re.fullmatch(r"kill %(\d)", command):
-            self._shell.end(self._jobs[int(job[1]) - 1])
+            self._shell.end(self._jobs.pop(int(job[1])))
             said = ""
         elif command.endswith(" &"):
-            self._jobs.append(self._shell.start(command[:-2]))
-            said = self._shell.heard(self._jobs[-1], _LAST)
+            number = max(self._jobs, default=0) + 1
+            self._jobs[number] = self._shell.start(command[:-2])
+            said = self._shell.heard(self._jobs[number], _LAST)
         else:
             _, said = self._shell.run(command)
         said = said.replace(str(self._shell.folder), "/home/you")

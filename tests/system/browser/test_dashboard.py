@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import expect
 
+import trade
 from tests.conftest import StartContainer
 from tests.support.waiting import wait_until
 from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
@@ -127,6 +128,38 @@ def test_a_user_without_the_lock_moves_nothing_and_sees_its_owner(bench: Bench, 
     comes_to_rest(bench)
 
 
+@pytest.mark.parametrize("label", ["Search", "Only with", "Purpose", "Mark"])
+def test_esc_in_a_field_leaves_the_field_and_the_second_one_is_the_e_stop(
+    bench: Bench, browsers: Browsers, label: str
+) -> None:
+    chief = browsers.view("chief")
+    field = chief.page.get_by_label(label, exact=True).first
+    field.focus()
+    chief.page.keyboard.press("Escape")
+    expect(field).not_to_be_focused()
+    expect(chief.page.locator("#notice")).to_have_text("You have left the field. Press Esc again for the e-stop.")
+    expect(chief.stopped).to_be_empty()
+    assert trade.estops() == []
+    chief.page.keyboard.press("Escape")
+    expect(chief.stopped).to_contain_text("Confirmed by")
+    assert len(trade.estops()) == 1
+
+
+def test_esc_in_a_field_is_the_e_stop_while_a_call_of_the_page_moves_something(
+    bench: Bench, browsers: Browsers
+) -> None:
+    chief = browsers.view("chief")
+    card = chief.service(PAN, "move_to")
+    card.get_by_label("position_rad").fill("1.3")
+    card.get_by_label("speed_rad_s").fill("0.1")
+    chief.page.keyboard.press("Enter")
+    wait_until(lambda: pan_rad(bench) > LEAST_RAD, "the joint moves")
+    expect(card.get_by_label("speed_rad_s")).to_be_focused()
+    chief.page.keyboard.press("Escape")
+    comes_to_rest(bench)
+    expect(chief.stopped).to_contain_text("Confirmed by")
+
+
 def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench, browsers: Browsers) -> None:
     anna, chief = browsers.view("anna"), browsers.view("chief")
     jog(bench, anna, anna.plus)
@@ -135,7 +168,10 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     expect(chief.stopped).to_contain_text("Confirmed by")
     expect(chief.stopped.locator("strong")).to_have_text("E-STOP: nothing moves until it is cleared.")
     expect(anna.stopped).to_contain_text("chief: dashboard")
-    expect(anna.stopped).to_contain_text("who has heard it moves nothing")
+    expect(anna.stopped.locator("strong")).to_have_text(
+        "E-STOP: robots that have received it do not move until it is cleared. "
+        "This page does not know whether all of them have received it."
+    )
     anna.page.mouse.up()
     expect(anna.stopped.get_by_role("button")).to_have_count(0)  # she does not administer the system
     at = pan_rad(bench)

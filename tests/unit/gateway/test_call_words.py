@@ -30,6 +30,7 @@ class Arm:
         count: int | str = 0,
         note: str | None = None,
         anything: Any = None,
+        firmly: bool = False,
     ) -> None: ...
 
 
@@ -115,7 +116,9 @@ def test_programs_get_every_digit(capsys: pytest.CaptureFixture[str]) -> None:
 MEANT = [
     (["[0.3,", "-0.2]"], "forgot quotes? The shell splits at spaces: '[0.3, -0.2]'"),
     (["1", "positions_rad=[1,", "2]", "5"], "forgot quotes? The shell splits at spaces: '[1, 2]'"),
-    (["left"], """forgot quotes? A text is written '"left"'"""),
+    (["left"], "argument 'left': positions_rad takes a list, and 'left' is a text"),
+    (["speed_rad_s=fast"], "argument 'speed_rad_s=fast': speed_rad_s takes a number, and 'fast' is a text"),
+    (["firmly=True"], "argument 'firmly=True': firmly takes true or false, and 'True' is a text"),
     (["anything=left"], """forgot quotes? A text is written '"left"'"""),
     (["NaN"], "JSON has no NaN and no infinity, and what moves takes neither"),
     (["[0.1, -Infinity]"], "JSON has no NaN and no infinity"),

@@ -12,7 +12,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from trade_gateway.cli import build
+from trade_gateway._usage import UsageError
+from trade_gateway.cli import app, build
 
 _WIDTH = 80
 _MOST_UNGROUPED = 5
@@ -91,3 +92,9 @@ def test_words_are_completed(words: str, expected: set[str], other: str) -> None
     ).stdout.split()
     assert expected <= set(reported)
     assert other not in reported
+
+
+def test_an_option_of_other_servers_is_answered_with_the_one_that_is_meant() -> None:
+    said = CliRunner().invoke(app, ["http", "--port", "8080"])
+    assert isinstance(said.exception, UsageError)
+    assert str(said.exception) == "--port: it is --listen HOST:PORT here: --listen 127.0.0.1:8080"

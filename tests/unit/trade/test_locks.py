@@ -246,6 +246,21 @@ def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_an
     assert table.table.withheld() == []
 
 
+def test_S08_a_call_of_stopped_resources_names_all_that_its_caller_would_have_to_resume(table: Table) -> None:
+    table.call("abc").close()
+    for name in "ac":
+        table.resources[name].stop("anna/desk", ["else"])
+    with pytest.raises(Stopped, match=r"call .*`trade resume a c`") as refused:
+        table.call("abc")
+    assert (refused.value.resource, refused.value.others) == ("a", ("c",))
+    table.resources["a"].resume()
+    with pytest.raises(Stopped, match=r"call .*`trade resume c`"):
+        table.call("abc")
+    table.resources["c"].resume()
+    table.call("abc").close()
+    assert not table.resources["b"].calls
+
+
 def test_a_lock_of_what_is_no_longer_offered_is_lost_and_who_waits_for_it_is_refused(table: Table) -> None:
     token = table.take("ab")
     asking = table.ask("a", "other")

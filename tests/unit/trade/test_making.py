@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+import trade
 from tests.support.waiting import wait_until
 from trade import Container, Handle, Settings, where
 from trade.errors import (
@@ -23,7 +24,8 @@ from trade.testing import MemorySystem, memory_system
 MODULE = """
 import subprocess
 from subprocess import Popen
-from trade import Resource, permit, service
+import trade
+from trade import Resource, permit, service, where
 
 events = []
 
@@ -87,6 +89,24 @@ class Clock:
 
     def close(self) -> None:
         events.append("clock closed")
+
+class Watcher:
+    def __init__(self) -> None:
+        self.at_the_start = trade.container().name
+
+    @service(effect="read")
+    def home(self) -> tuple[str, str, str]:
+        return self.at_the_start, trade.container().name, trade.find(where(name="kind")).container
+
+    @service
+    def turned(self) -> str:
+        with trade.lock(where(name="turn")):
+            trade.find(where(name="turn"))()
+        return trade.container().settings.system
+
+class Tidy(Watcher):
+    def close(self) -> None:
+        trade.close()
 
 class Mute:
     def close(self) -> None:
@@ -159,6 +179,53 @@ def test_an_object_is_made_elsewhere_and_its_services_are_called(
     [kind] = ask(asker, "instantiate", "workshop:Lamp", args, ["hall"])
     memory.settle()
     assert (kind.container, kind.groups, kind()) == ("maker", ("hall",), lamp)
+
+
+def test_what_was_made_finds_and_locks_in_the_system_of_its_container(
+    asker: Container, maker: Container, memory: MemorySystem
+) -> None:
+    ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
+    ask(asker, "instantiate", "workshop:Wheel", (), ["cart"])
+    ask(asker, "instantiate", "workshop:Watcher", (), ["rosie.watch"])
+    memory.settle()
+    assert asker.find(where(name="home"))() == ("maker", "maker", "maker")
+    assert asker.find(where(name="turned"))() == maker.settings.system
+    assert {info.name for info in asker.containers()} == {"maker", "asker"}
+
+
+def test_an_object_that_closes_the_default_container_ends_nothing_of_its_host(
+    asker: Container, maker: Container, memory: MemorySystem
+) -> None:
+    ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
+    [home, _] = ask(asker, "instantiate", "workshop:Tidy", (), ["rosie.watch"])
+    memory.settle()
+    assert home()[0] == "maker"
+    ask(asker, "terminate", home)
+    assert not maker.closed
+    assert asker.find(where(name="kind"))() == (40, "white")
+    assert trade.container() is maker
+
+
+def test_a_program_that_has_a_default_container_keeps_it(
+    asker: Container, memory: MemorySystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade._container.default._default", asker)
+    ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
+    ask(asker, "instantiate", "workshop:Watcher", (), ["rosie.watch"])
+    memory.settle()
+    assert asker.find(where(name="home"))() == ("asker", "asker", "maker")
+
+
+def test_a_container_that_was_closed_remains_the_default_one_until_another_one_hosts(
+    memory: MemorySystem, events: list[str]
+) -> None:
+    for name in ("first", "second"):
+        with memory.container(name, instantiable=["workshop:*"]) as maker:
+            maker.system.instantiate("workshop:Lamp")
+            [home, _] = maker.system.instantiate("workshop:Watcher")
+            assert home()[0] == name
+    with pytest.raises(ConfigurationError, match="closed"):
+        trade.services()  # not in another system, which a thread that still runs would start
 
 
 def test_a_container_makes_only_what_its_settings_allow(memory: MemorySystem, events: list[str]) -> None:

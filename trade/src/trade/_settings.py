@@ -55,7 +55,7 @@ _VARIABLES: Final = (
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _HUB: Final = ("auto", "off", "serve")
 _HOOK_LIMIT_S: Final = 0.1
-_LONGEST_HOOK_S: Final = 60.0
+LONGEST_HOOK_S: Final = 60.0
 _KEEP_DAYS: Final = 90
 _KEEP_ROWS: Final = 10_000_000
 _MOST_KEPT: Final = 1_000_000_000
@@ -162,8 +162,8 @@ class Settings:
         self._check_exports()
 
     def _check_choices(self) -> None:
-        if not 0 < self.hook_limit_s <= _LONGEST_HOOK_S:
-            problem = f"must be above 0 and at most {_LONGEST_HOOK_S:g} seconds, not {self.hook_limit_s:g}"
+        if not 0 < self.hook_limit_s <= LONGEST_HOOK_S:
+            problem = f"must be above 0 and at most {LONGEST_HOOK_S:g} seconds, not {self.hook_limit_s:g}"
             raise ConfigurationError(where="TRADE_HOOK_LIMIT_S", problem=problem)
         if self.hub not in _HUB:
             raise ConfigurationError(where="TRADE_HUB", problem=f"{self.hub!r} is none of {', '.join(_HUB)}")

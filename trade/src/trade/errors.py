@@ -328,9 +328,12 @@ class Stopped(CallerError, RuntimeError):
     """Whether an e-stop is open."""
     cleared: bool = False
     """Whether the stop was an e-stop that is cleared now; what it stopped still has to be resumed."""
+    others: Sequence[str] = ()
+    """The other resources of the call that have to be resumed, too."""
 
     def describe(self) -> str:
-        remedy = "`trade estop --clear`" if self.estop else f"trade.resume(...) or `trade resume {self.resource}`"
+        all_of_them = " ".join((self.resource, *self.others))
+        remedy = "`trade estop --clear`" if self.estop else f"trade.resume(...) or `trade resume {all_of_them}`"
         cleared = " That e-stop is cleared, but what it stopped was not resumed yet." if self.cleared else ""
         said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
         return f"{said} When it is safe to move, call {remedy}"

@@ -11,7 +11,7 @@ import typer
 from trade import errors
 from trade.errors import TradeError
 from trade_gateway._usage import ABSENT, UsageError
-from trade_gateway.cli._output import NOT_FOUND, say_error
+from trade_gateway.cli._output import NOT_FOUND, is_providers, say_error
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.process._parent_watch import end_with_stdin
 
@@ -181,13 +181,27 @@ def options(
     context.obj = SystemChoice(system, connect)
 
 
+def _say(error: Exception, words: Sequence[str]) -> None:
+    rest = "--traceback shows the whole traceback" if "call" in words else "the provider's log has the whole traceback"
+    say_error(error, as_json="--json" in words, whole="--traceback" in words, rest=rest)
+
+
 def main() -> None:
-    """Runs the command line; a TRADE error is one line on stderr, and its kind decides the exit code."""
+    """Runs the command line.
+
+    A TRADE error is one line on stderr, and its kind decides the exit code. What a provider raises itself is its type,
+    its message and its place; an error of this program has its traceback.
+    """
     words = _words()
     try:
         build(_asked_for(words))()
     except TradeError as error:
-        say_error(error, as_json="--json" in words)
+        _say(error, words)
         sys.exit(next((code for kinds, code in _CODES.items() if isinstance(error, kinds)), _FAILED))
+    except Exception as error:
+        if not is_providers(error):
+            raise
+        _say(error, words)
+        sys.exit(_FAILED)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -12,7 +12,8 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 
-from trade.errors import DeviceFault, TradeError
+from trade._protocol.remote_errors import RemoteTraceback
+from trade.errors import DeviceFault, RemoteError, TradeError
 
 NOT_FOUND: Final = 3
 """The exit code if what a command was asked for does not exist."""
@@ -117,6 +118,8 @@ REMEDIES: Final = {
     "trade.resume(...) or `trade resume": "`trade resume",
 }
 """The remedies in errors that name the Python API, and the commands to use at a terminal instead."""
+_FRAMES: Final = re.compile(r'^  File "(.+)", line (\d+), in (.+)\n((?:    .*\n)?)', re.MULTILINE)
+"""The entries of a Python traceback: file, line, function and code."""
 _CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
 
 
@@ -125,16 +128,48 @@ def as_commands(device: str, remedy: str) -> str:
     return _CALLED.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
-def say_error(error: BaseException, *, as_json: bool = False) -> None:
-    """Prints an error's name and message on standard error, with remedies as commands; or all its data as JSON."""
-    if as_json and isinstance(error, TradeError):
-        data = {field.name: getattr(error, field.name) for field in fields(error)}
+def is_providers(error: BaseException) -> bool:
+    """Whether the provider of a service raised it, and not this program."""
+    return isinstance(error.__cause__, RemoteTraceback)
+
+
+def say_error(error: BaseException, *, as_json: bool = False, whole: bool = False, rest: str = "") -> None:
+    """Prints an error's name and message on standard error, with remedies as commands; or all its data as JSON.
+
+    An error that is not TRADE's own is followed by the place where the provider raised it.
+
+    Args:
+        error: the error.
+        as_json: as JSON.
+        whole: with the provider's whole traceback before it.
+        rest: how to see the whole traceback.
+    """
+    cause = error.__cause__
+    traceback = cause.info.traceback if isinstance(cause, RemoteTraceback) else ""
+    if as_json and isinstance(error, Exception):
+        own = isinstance(error, TradeError)
+        data = {field.name: getattr(error, field.name) for field in fields(error)} if own else {"traceback": traceback}
         shown = {"error": type(error).__name__, "message": _with_commands(error), "data": data}
         print(msgspec.json.encode(shown, enc_hook=str).decode(), file=sys.stderr, flush=True)  # noqa: T201
         return
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    console.print(f"[bold red]{type(error).__name__}[/]: {escape(_with_commands(error))}")
+    if whole and traceback:
+        console.print(traceback.rstrip(), markup=False)
+    if not whole or not traceback or isinstance(error, TradeError):
+        console.print(f"[bold red]{type(error).__name__}[/]: {escape(_with_commands(error))}")
+    if not whole and (isinstance(error, RemoteError) or not isinstance(error, TradeError)):
+        for line in _place(traceback, rest):
+            console.print(line, markup=False)
     sys.stderr.flush()
+
+
+def _place(traceback: str, rest: str) -> list[str]:
+    """Where the provider raised it: the last place and line of its traceback, and how to see the others."""
+    if not (found := _FRAMES.findall(traceback)):
+        return []
+    file, number, function, code = found[-1]
+    place = f"  raised by the provider in {file}, line {number}, in {function}:"
+    return [place, *([f"      {code.strip()}"] if code else []), *([f"  {rest}"] if rest else [])]
 
 
 def _with_commands(error: BaseException) -> str:

@@ -290,7 +290,7 @@ class Components:
         )
         self.registry.changes.subscribe(self.states.changed)
         suspended = self.states.hook_suspended
-        self.hooks.suspended.subscribe(lambda hook: suspended(hook.name, hook.last_error, hook.call.key))
+        self.hooks.suspended.subscribe(lambda hook: suspended(hook.name, hook.last_error, hook.called))
         self.streams.notify = self.states.listener_changed
 
     def _build_measures(self, leaving: contextlib.ExitStack) -> None:

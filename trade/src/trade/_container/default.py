@@ -1,4 +1,7 @@
-"""The default container of the process, and functions that use it."""
+"""The default container of the process, and functions that use it.
+
+The container that created an object of the process (`System.instantiate`) is the default one, unless there is one.
+"""
 
 import contextlib
 import functools
@@ -10,6 +13,7 @@ from types import FrameType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from trade._container.container import Container
+from trade._migration.factory import first_host
 from trade._settings import Settings
 from trade.errors import ConfigurationError
 
@@ -20,6 +24,8 @@ _LOOK_S = 0.2
 
 _lock = threading.RLock()
 _default: Container | None = None
+_is_host = False
+"""Whether the default container hosts objects of others, and is closed by the program that started it."""
 
 
 def start(settings: Settings | None = None) -> Container:
@@ -28,31 +34,43 @@ def start(settings: Settings | None = None) -> Container:
     Raises:
         errors.ConfigurationError: it runs already; start it before any other use of ``trade``.
     """
-    global _default  # noqa: PLW0603 - the one default
+    global _default, _is_host
     with _lock:
-        if _default is not None:
+        if _default is not None and not _default.closed:
             problem = (
                 "the default container runs already. Call trade.start before anything else, or trade.close() first"
             )
             raise ConfigurationError(problem=problem)
-        _default = Container(settings)
+        _default, _is_host = Container(settings), False
         return _default
 
 
 def container() -> Container:
-    """The default container; starts it if necessary."""
+    """The default container; starts it if necessary.
+
+    In a process whose container hosts created objects, such as `trade container`, it is that container.
+    """
+    global _default, _is_host
     running = _default
-    if running is not None:
+    if running is not None and not running.closed:
         return running
     with _lock:
+        host = first_host()
+        if isinstance(host, Container) and (_default is None or _default.closed):
+            _default, _is_host = host, True
         return _default if _default is not None else start()
 
 
 def close() -> None:
-    """Closes the default container, which leaves the system. The next use starts a new one. Idempotent."""
-    global _default
+    """Closes the default container, which leaves the system. The next use starts a new one. Idempotent.
+
+    An object does not close the container that hosts it: other objects are there, too.
+    """
+    global _default, _is_host
     with _lock:
-        running, _default = _default, None
+        if _is_host and _default is not None and not _default.closed:
+            return
+        running, _default, _is_host = _default, None, False
     if running is not None:
         running.close()
 

@@ -3,13 +3,14 @@
 import contextlib
 import itertools
 import logging
-from typing import Final
+from typing import Any, Final
 
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 from trade._container.lookup import Lookup
 from trade._container.notifying import Notifying
-from trade._hooks.hook import HookInfo, Side
+from trade._hooks.callee import Callee, callee_of
+from trade._hooks.hook import HookInfo, Side, require_limit
 from trade._notifications.notification import Notification
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, services_at, where
@@ -22,13 +23,23 @@ _logger = logging.getLogger("trade")
 class Hook:
     """A hook that this container has attached; it ends when it is detached or this container ends."""
 
-    def __init__(self, home: "Hooking", name: str, side: Side, target: Handle | Constraint, call: Handle) -> None:
+    def __init__(
+        self,
+        home: "Hooking",
+        name: str,
+        side: Side,
+        target: Handle | Constraint,
+        call: Callee,
+        limit_s: float | None,
+    ) -> None:
         self.id: Final = name
         """Its id, unique in the system."""
         self.target_text: Final = f"hook {name}"
         self.side: Final[Side] = side
         self.target: Final = target
-        self.call: Final = call
+        self.call: Final = call.handle or call.constraint
+        self._callee: Final = call
+        self._limit_s: Final = limit_s
         self._home = home
         self._later: Notification | None = None
         self._attached = True
@@ -51,9 +62,12 @@ class Hook:
         self._later = self._home.notifying.joined(everywhere, self._join, existing=True)
 
     def _attach(self, handle: Handle) -> Run:
-        if isinstance(self.target, Handle):
-            return handle.start(self.id, self.side, self.call, handle=self.target)
-        return handle.start(self.id, self.side, self.call, constraint=self.target)
+        terms: dict[str, Any] = {"handle" if isinstance(self.target, Handle) else "constraint": self.target}
+        if self._callee.constraint is not None:
+            terms["call_where"] = self._callee.constraint
+        if self._limit_s is not None:
+            terms["limit_s"] = self._limit_s
+        return handle.start(self.id, self.side, self._callee.handle, **terms)
 
     def _join(self, handle: Handle) -> None:
         if not self._attached:
@@ -63,9 +77,9 @@ class Hook:
             if not self._attached:  # detached meanwhile, perhaps before this arrived
                 self._home.lookup.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
         except (ContainerLost, ServiceGone):  # it has left already
-            _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
+            _logger.debug("hook %s is not attached in %s, which has ended", self._callee.text, handle.container)
         except TradeError as error:
-            _logger.warning("hook %s is not attached in %s: %s", self.call.label, handle.container, error)
+            _logger.warning("hook %s is not attached in %s: %s", self._callee.text, handle.container, error)
 
     def infos(self) -> list[HookInfo]:
         """Its state in each container."""
@@ -81,7 +95,7 @@ class Hook:
                 self._home.detach_hook(self.id)
 
     def __repr__(self) -> str:
-        return f"<Hook {self.call.label} {self.side} {self.target}{'' if self._attached else ', detached'}>"
+        return f"<Hook {self._callee.text} {self.side} {self.target}{'' if self._attached else ', detached'}>"
 
 
 class Hooking:
@@ -93,38 +107,56 @@ class Hooking:
         self._access = access
         self._numbers = itertools.count(1)
 
-    def before_service(self, target: Handle | Constraint | str, call: Handle) -> Hook:
+    def before_service(
+        self, target: Handle | Constraint | str, call: Handle | Constraint | str, *, limit_s: float | None = None
+    ) -> Hook:
         """Calls a service before each call of another one, with a copy of its arguments.
 
         It runs in that service's container and delays its call by 0.1 s at most, together with other hooks by 0.25 s.
-        It never changes the call. After three failures in a row it is suspended.
+        It never changes the call. After three failures in a row it is suspended. With a handle, that is for good. With
+        a constraint, it continues once another service joins that matches, such as the observer after its restart.
 
         Args:
             target: a service, or all that match a constraint or a text, later ones included. A stop has no hooks
                 before it.
-            call: takes one argument, a `Called`.
+            call: takes one argument, a `HookEvent`: a service, or the only one that matches a constraint or a text at
+                the time of the call. Calls are not observed while none matches.
+            limit_s: how long it may take, in seconds, at most 60; None: as the service's container says
+                (``TRADE_HOOK_LIMIT_S``). All hooks of one side of a call together have two and a half times the longest
+                limit among them.
 
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` the service, or any present one.
-            ConfigurationError: the target is a stop, or an argument is not a handle.
+            ConfigurationError: the target is a stop, the limit is out of range, or an argument names no service.
         """
-        return self._hook("before", target, call)
+        return self._hook("before", target, call, limit_s)
 
-    def after_service(self, target: Handle | Constraint | str, call: Handle) -> Hook:
+    def after_service(
+        self, target: Handle | Constraint | str, call: Handle | Constraint | str, *, limit_s: float | None = None
+    ) -> Hook:
         """Calls a service after each call of another one, with its outcome, before the caller gets the answer.
 
         After a stop it runs when the caller has the answer. The rest is as for `before_service`.
         """
-        return self._hook("after", target, call)
+        return self._hook("after", target, call, limit_s)
 
-    def _hook(self, side: Side, given: Handle | Constraint | str, call: Handle) -> Hook:
+    def _hook(
+        self,
+        side: Side,
+        given: Handle | Constraint | str,
+        call: Handle | Constraint | str,
+        limit_s: float | None,
+    ) -> Hook:
         named = f"trade.{side}_service"
         target = given if isinstance(given, Handle) else as_constraint(given, named, services_at)
-        if not isinstance(call, Handle):  # pyright: ignore[reportUnnecessaryIsInstance]
+        if not isinstance(call, Handle | Constraint | str):  # pyright: ignore[reportUnnecessaryIsInstance]
             rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
-            raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")
+            problem = f"call must be a handle, where(...) or a text such as 'eye.see', {rest}, not {call!r}"
+            raise ConfigurationError(where=named, problem=problem)
+        callee = callee_of(call, named)
+        require_limit(limit_s, named)
         self._require_instrument(target)
-        hook = Hook(self, f"{self.lookup.home.address.epoch}.h{next(self._numbers)}", side, target, call)
+        hook = Hook(self, f"{self.lookup.home.address.epoch}.h{next(self._numbers)}", side, target, callee, limit_s)
         hook.begin()
         return hook
 

@@ -13,13 +13,13 @@ from trade._notifications.events import EventLog
 from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
-from trade._remote.ssh import start
+from trade._remote.ssh import Started, start
 from trade._services.decorator import service
 from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
 from trade._table import Table
 from trade._telemetry.load import LoadInfo, LoadMeter
-from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
+from trade.errors import ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 
 class _Withdrawn(Protocol):
@@ -269,31 +269,31 @@ class System:
             command: the ``trade`` command there; a path, or several words.
             environment: variables for it.
             ssh_config: a file to use instead of the user's own.
-            wait_s: how long it may take to become visible after its start.
+            wait_s: how long it may take to become visible after its start; then it is ended again.
 
         Raises:
             CannotStart: with the reason, and what to do.
             ConfigurationError: the host or a variable is not valid.
         """
         member = self._member()
-        started = start(
+
+        def joined(started: Started) -> ContainerInfo | None:
+            with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
+                member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
+            return next((info for info in self.containers() if info.epoch == started.epoch), None)
+
+        return start(
             host,
             name,
             system=member.settings.system,
+            joined=joined,
+            wait_s=wait_s,
             allow=allow,
             connect=connect,
             command=command,
             environment=environment,
             ssh_config=ssh_config,
         )
-        with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
-            member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
-        found = next((info for info in self.containers() if info.epoch == started.epoch), None)
-        if found is None:
-            said = f"it is up there as process {started.pid}, and not seen here within {wait_s:g} s"
-            remedy = "set its endpoints (connect=...), and give it the credentials or certificates of this system"
-            raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
-        return found
 
     def terminate(self, service: Handle) -> None:
         """Ends a provider that `instantiate` created in this container: its motion stops, then it is closed.

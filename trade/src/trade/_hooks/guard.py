@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, cast
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext
 from trade._context.interceptor import ServedCall
+from trade._hooks.callee import Callee, callee_of
 from trade._hooks.hook import CallCopies, HookEvent, HookHost, as_the_container
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, as_constraint, services_at
@@ -63,13 +64,13 @@ class Guard(AbstractContextManager["Guard"]):
 
     def __init__(
         self,
-        check: Check | Handle,
+        check: Check | Callee,
         target: Constraint | Handle | None,
         limit_s: float,
         end: "Callable[[Guard], None]",
     ) -> None:
-        service = cast("Handle", check) if isinstance(check, Handle) else None
-        self.name: Final = _name(cast("Check", check)) if service is None else service.label
+        service = check if isinstance(check, Callee) else None
+        self.name: Final = _name(cast("Check", check)) if service is None else service.text
         """The name of its check, as errors show it."""
         self.target: Final = target
         """What it guards; None: the service whose ``@service`` names it."""
@@ -102,15 +103,15 @@ class Guard(AbstractContextManager["Guard"]):
     def __repr__(self) -> str:
         return f"<Guard {self.name} of {self.target}, {self.passed} passed, {self.refused} refused>"
 
-    def decide(self, called: HookEvent, context: CallContext, pool: ThreadPool) -> None:
+    def decide(self, called: HookEvent, context: CallContext, guards: "Guards") -> None:
         """Raises CallRefused unless its check lets the call through, within its time."""
-        reason = self._reason(called, context, pool)
+        reason = self._reason(called, context, guards)
         if reason:
             self.refused += 1
             raise CallRefused(service=context.service, guard=self.name, reason=reason)
         self.passed += 1
 
-    def _reason(self, called: HookEvent, context: CallContext, pool: ThreadPool) -> str:
+    def _reason(self, called: HookEvent, context: CallContext, guards: "Guards") -> str:
         marker = f"guard {self.name} of {context.service}"
         if marker in context.chain:
             return "its check led to this call itself"
@@ -124,12 +125,12 @@ class Guard(AbstractContextManager["Guard"]):
         def run() -> None:
             try:
                 with as_the_container(context, marker, chain, time.monotonic_ns() + int(left_s * 1e9)):
-                    answer.give(lambda: self._ask(called, context, left_s))
+                    answer.give(lambda: self._ask(called, context, left_s, guards.home))
             finally:
                 with self._lock:
                     self._running -= 1
 
-        pool.begin(run, "trade-guard")
+        guards.pool.begin(run, "trade-guard")
         context.on_cancel(answer.arrived.set)
         if not answer.arrived.wait(left_s):
             return f"its check did not answer within {left_s:.3g} s"
@@ -142,10 +143,13 @@ class Guard(AbstractContextManager["Guard"]):
             return self.limit_s
         return max(0.0, min(self.limit_s, (context.expires_ns - time.monotonic_ns()) / 1e9))
 
-    def _ask(self, called: HookEvent, context: CallContext, left_s: float) -> Any:
+    def _ask(self, called: HookEvent, context: CallContext, left_s: float, home: HookHost) -> Any:
         if self._service is None:
             return self._check(called)
-        asked = self._service.with_(deadline_s=left_s).start(called)
+        service = self._service.now(home)
+        if service is None:
+            return f"no service matches {self._service.constraint}, its check"
+        asked = service.with_(deadline_s=left_s).start(called)
         context.on_cancel(asked.cancel)
         return asked.result(left_s)
 
@@ -159,7 +163,7 @@ class _GuardedService(NamedTuple):
 
     def require(self, call: ServedCall) -> None:
         """Raises CallRefused unless the call may run."""
-        self.guard.decide(self.home.copies.event(call, self.handle), call.context, self.home.pool)
+        self.guard.decide(self.home.copies.event(call, self.handle), call.context, self.home)
 
 
 class Guards:
@@ -168,12 +172,14 @@ class Guards:
     def __init__(self, home: HookHost, copies: CallCopies, recheck: Callable[[], None]) -> None:
         self.copies: Final = copies
         self.pool: Final = ThreadPool()
-        self._home = home
+        self.home: Final = home
         self._recheck = recheck
         self._lock = threading.Lock()
         self._added: tuple[Guard, ...] = ()
 
-    def guard(self, target: Handle | Constraint | str, check: Check | Handle, *, limit_s: float = LIMIT_S) -> Guard:
+    def guard(
+        self, target: Handle | Constraint | str, check: Check | Handle | Constraint, *, limit_s: float = LIMIT_S
+    ) -> Guard:
         """Lets a check refuse calls of services of this container, before they run.
 
         The check gets the call with copies of its arguments. It returns None to let the call run, or a text that says
@@ -185,7 +191,8 @@ class Guards:
 
         Args:
             target: a service of this container, or all that match a constraint or a text, later ones included.
-            check: a function, which runs on a thread of its own, or the handle of a service in any container.
+            check: a function, which runs on a thread of its own, or a service in any container: its handle, or a
+                constraint that only this service matches. The constraint follows a restart of the service.
             limit_s: how long the check may take, in seconds, at most an hour; never longer than the call's deadline.
 
         Returns:
@@ -198,10 +205,12 @@ class Guards:
         meant = target if isinstance(target, Handle) else as_constraint(target, named, services_at)
         if isinstance(meant, Handle):
             _require_guardable(meant, named)
-        require_check(named, check)
+        asked = callee_of(cast("object", check), named) if isinstance(check, Handle | Constraint) else check
+        if not isinstance(asked, Callee):
+            require_check(named, asked)
         if not isinstance(limit_s, int | float) or not 0 < limit_s <= _LONGEST_S:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise ConfigurationError(where=named, problem=f"limit_s is 3600 s at most and above 0, not {limit_s!r}")
-        added = Guard(check, meant, limit_s, self._end)
+        added = Guard(asked, meant, limit_s, self._end)
         with self._lock:
             self._added = (*self._added, added)
         self._recheck()
@@ -220,7 +229,7 @@ class Guards:
             found = [guard for guard in self._added if guard.means(record)]
             own = _own(service)
             if found or own or service.guards:
-                handle = self._home.handle(record.key)
+                handle = self.home.handle(record.key)
                 service.guards = tuple(_GuardedService(guard, handle, self) for guard in (*own, *found))
 
     def _end(self, guard: Guard) -> None:

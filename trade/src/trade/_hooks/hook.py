@@ -15,11 +15,13 @@ from trade._context.call_context import CallContext, running
 from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.outgoing import holding
 from trade._context.sessions import speaking
+from trade._hooks.callee import Callee, CalleeHost
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Change, Record
 from trade._services.local_service import LocalService
+from trade._settings import LONGEST_HOOK_S
 from trade._telemetry.spans import SpanRecorder, Spans, traceable
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
@@ -28,7 +30,7 @@ from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
 _logger = logging.getLogger("trade")
 
 _TOGETHER: Final = 2.5
-"""How long all hooks of one side of a call may take together, in limits of one."""
+"""How long all hooks of one side of a call may take together, in limits of the one that has most time."""
 _TRIES: Final = 3
 """A hook is suspended after this many failures in a row."""
 _MOST: Final = 1000
@@ -71,7 +73,7 @@ class HookInfo(Struct, frozen=True, kw_only=True):
     target: str
     """The services it applies to, as text."""
     call: str
-    """The service that it calls: ``rosie.watch.saw``."""
+    """The service that it calls: ``rosie.watch.saw``, or ``the service with name='saw'``."""
     owner: str
     """The session that attached it."""
     container: str
@@ -80,13 +82,13 @@ class HookInfo(Struct, frozen=True, kw_only=True):
     """The services there that it is attached to."""
     fired: int
     skipped: int
-    """How often it was left out: it led to the call itself, or no time was left."""
+    """How often it was left out: it led to the call itself, no service matched, or no time was left."""
     failures: int
     suspended: bool
     last_error: str
 
 
-class HookHost(Protocol):
+class HookHost(CalleeHost, Protocol):
     """The functions of a container that hooks use."""
 
     @property
@@ -107,7 +109,8 @@ class AttachedHook:
         name: str,
         side: Side,
         target: Handle | Constraint,
-        call: Handle,
+        call: Callee,
+        limit_s: float,
         owner: str,
         identity: str,
         suspended: Callable[["AttachedHook"], None],
@@ -116,10 +119,13 @@ class AttachedHook:
         self.side: Final[Side] = side
         self.target: Final = target
         self.call: Final = call
+        self.limit_s: Final = limit_s
         self.owner: Final = owner
         self.identity: Final = identity
         self._tell_suspended = suspended
         self.suspended = False
+        self.called: ServiceKey | None = None if call.handle is None else call.handle.key
+        """The service that it called last."""
         self.services: dict[ServiceKey, str] = {}
         self.fired = self.skipped = self.failures = 0
         self._in_a_row = 0
@@ -131,14 +137,23 @@ class AttachedHook:
             return self.target.key == record.key
         return self.target.matches(record)
 
-    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], allowed_s: float) -> None:
-        """Call the hook within this time. Whatever its outcome, the watched call continues."""
-        if self.call.label in chain or allowed_s <= 0:
+    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
+        """Call the hook within this time and its own. Whatever its outcome, the watched call continues."""
+        allowed_s = min(self.limit_s, left_s)
+        if allowed_s <= 0:
             self.skipped += 1
             return
         try:
-            home.require_call(self.identity, self.call)
-            self.call.with_(deadline_s=allowed_s).start(called).result(allowed_s)
+            call = self.call.now(home)
+            if call is None:
+                self.skipped, self.last_error = self.skipped + 1, f"no service matches {self.call.constraint}"
+                return
+            self.called = call.key
+            if call.label in chain:
+                self.skipped += 1
+                return
+            home.require_call(self.identity, call)
+            call.with_(deadline_s=allowed_s).start(called).result(allowed_s)
             self.fired += 1
             self._in_a_row = 0
         except TimeoutError:
@@ -146,14 +161,26 @@ class AttachedHook:
         except BaseException as error:  # noqa: BLE001 - an error of a hook never reaches the caller
             self._failed(f"{type(error).__name__}: {error}")
 
+    def joined(self, record: Record) -> None:
+        """A service has joined: a suspended hook continues if it is the one to call."""
+        if self.suspended and self.call.follows(record):
+            self.suspended, self._in_a_row = False, 0
+
     def _failed(self, text: str) -> None:
         self.failures += 1
         self._in_a_row += 1
         self.last_error = text
         if self._in_a_row >= _TRIES and not self.suspended:
             self.suspended = True
-            _logger.warning("hook %s is suspended after %d failures: %s", self.call.label, self._in_a_row, text)
+            _logger.warning("hook %s is suspended after %d failures: %s", self.call.text, self._in_a_row, text)
             self._tell_suspended(self)
+
+
+def require_limit(limit_s: float | None, where: str) -> None:
+    """Raises ConfigurationError if a hook cannot have that limit."""
+    if limit_s is not None and not 0 < limit_s <= LONGEST_HOOK_S:
+        problem = f"limit_s must be above 0 and at most {LONGEST_HOOK_S:g} seconds, not {limit_s:g}"
+        raise ConfigurationError(where=where, problem=problem)
 
 
 class CallCopies:
@@ -232,12 +259,12 @@ class HookInterceptor(Interceptor):
 
     def _call(self, hooks: Sequence[AttachedHook], called: HookEvent, context: CallContext) -> None:
         chain = (*context.chain, context.service)
-        until_ns = time.monotonic_ns() + int(_TOGETHER * self._limit_s * 1e9)
+        longest_s = max(self._limit_s, *(hook.limit_s for hook in hooks))
+        until_ns = time.monotonic_ns() + int(_TOGETHER * longest_s * 1e9)
         with as_the_container(context, context.service, context.chain, context.expires_ns):
             for hook in hooks:
                 if not hook.suspended:
-                    left_s = (until_ns - time.monotonic_ns()) / 1e9
-                    hook.tell(self._home, called, chain, min(self._limit_s, left_s))
+                    hook.tell(self._home, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
 
 
 def _error_text(service: ServedService, error: BaseException) -> str:
@@ -295,15 +322,28 @@ class Hooks:
         """Emitted with each hook that is suspended."""
 
     def attach(
-        self, name: str, side: Side, target: Handle | Constraint, call: Handle, owner: str, identity: str
+        self,
+        name: str,
+        side: Side,
+        target: Handle | Constraint,
+        call: Callee,
+        owner: str,
+        identity: str,
+        limit_s: float | None = None,
     ) -> list[str]:
         """Attach a hook; repeating it changes nothing. Returns the labels of the services it is attached to.
 
+        Args:
+            limit_s: how long it may take, in seconds; None: as the container's settings say.
+
         Raises:
             AccessDenied: its owner may instrument none of the services here.
-            ConfigurationError: the hook is to run before a stop service, or there are too many hooks.
+            ConfigurationError: the hook is to run before a stop service, its limit is out of range, or there are too
+                many hooks.
         """
-        hook = AttachedHook(name, side, target, call, owner, identity, self.suspended.emit)
+        require_limit(limit_s, self._home.name)
+        own_s = self._limit_s if limit_s is None else limit_s
+        hook = AttachedHook(name, side, target, call, own_s, owner, identity, self.suspended.emit)
         with self._lock:
             if (owner, name) not in self._attached and len(self._attached) >= _MOST:
                 raise ConfigurationError(where=self._home.name, problem=f"{_MOST} hooks are attached here already")
@@ -342,6 +382,9 @@ class Hooks:
 
     def changed(self, change: Change) -> None:
         """Called by the registry."""
+        for hook in list(self._attached.values()):
+            for record in change.joined:
+                hook.joined(record)
         if self._in_use and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
             self.recheck_access()
 
@@ -391,7 +434,7 @@ class Hooks:
                 id=hook.name,
                 side=hook.side,
                 target=hook.target.label if isinstance(hook.target, Handle) else str(hook.target),
-                call=hook.call.label,
+                call=hook.call.text,
                 owner=hook.owner,
                 container=self._home.name,
                 services=tuple(sorted(hook.services.values())),

@@ -5,6 +5,7 @@ import logging
 
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
+from trade._hooks.callee import Callee
 from trade._hooks.hook import AttachedHook, HookInfo, Hooks, Side
 from trade._notifications.services import NotificationServicesHost
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
@@ -29,14 +30,24 @@ class HookServices:
 
     @service
     def attach_hook(
-        self, name: str, side: Side, call: Handle, handle: Handle | None = None, constraint: Constraint | None = None
+        self,
+        name: str,
+        side: Side,
+        call: Handle | None = None,
+        handle: Handle | None = None,
+        constraint: Constraint | None = None,
+        call_where: Constraint | None = None,
+        limit_s: float = 0.0,
     ) -> list[str]:
         """Call a service before or after services of this container, now and later; returns the current ones."""
-        asked, target = served_call(), constraint if handle is None else handle
-        if target is None:
-            raise ConfigurationError(where="attach_hook", problem="it needs a handle or a constraint")
-        self._known.wait_until_known([call.key])  # calls under way do not wait for it
-        return self._hooks.attach(name, side, target, call, asked.session, asked.caller)
+        asked, target, which = served_call(), constraint if handle is None else handle, call or call_where
+        if target is None or which is None:
+            raise ConfigurationError(
+                where="attach_hook", problem="it needs a handle or a constraint, of each of the two"
+            )
+        if call is not None:
+            self._known.wait_until_known([call.key])  # calls under way do not wait for it
+        return self._hooks.attach(name, side, target, Callee(which), asked.session, asked.caller, limit_s or None)
 
     @service
     def detach_hook(self, name: str) -> bool:
@@ -64,4 +75,4 @@ class HookServices:
         owner = Address(*hook.owner.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # the owner has gone
             suspended = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
-            suspended.start(hook.name, hook.call.label, hook.last_error)
+            suspended.start(hook.name, hook.call.text, hook.last_error)

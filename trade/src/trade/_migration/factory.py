@@ -35,6 +35,15 @@ class FactoryHost(Protocol):
     def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
 
 
+_hosts: Final[dict[int, FactoryHost]] = {}
+"""The open containers of the process that host objects of others, in this order."""
+
+
+def first_host() -> FactoryHost | None:
+    """The first open container of the process that hosts objects of others; None if none does."""
+    return next(iter(list(_hosts.values())), None)
+
+
 class ProviderFactory:
     """Owns the objects created here: each is closed when a client terminates it, or with the container."""
 
@@ -54,6 +63,10 @@ class ProviderFactory:
         self._lock = threading.Lock()
         self._made: dict[int, _Made] = {}
 
+    def host(self) -> None:
+        """Let code of others in this process use this container by default."""
+        _hosts.setdefault(id(self), self._home)
+
     def find(self, class_path: str) -> type:
         """The class of a path, in the module that defines it; only modules of allowed classes are imported.
 
@@ -68,6 +81,7 @@ class ProviderFactory:
         if not _PATH.fullmatch(class_path):
             raise NoSuchClass(class_path=class_path, container=where, reason="a path looks like package.module:Class")
         module_name, _, qualified = class_path.partition(":")
+        self.host()
         try:
             found: Any = importlib.import_module(module_name)
         except Exception as error:
@@ -137,6 +151,7 @@ class ProviderFactory:
             made, self._made = list(self._made.values()), {}
         for one in reversed(made):
             end(one.provider)
+        _hosts.pop(id(self), None)
 
 
 def path_of(kind: type) -> str:

@@ -56,9 +56,9 @@ class States:
         for record in (record for record in change.left if _is_clock(record)):
             self.events.note("container_left", record.container, record.host, record)
 
-    def hook_suspended(self, hook: str, error: str, call: ServiceKey) -> None:
-        """A hook, which calls this service, failed too often."""
-        self.events.note("hook_suspended", hook, error, self._registry.get(call))
+    def hook_suspended(self, hook: str, error: str, call: ServiceKey | None) -> None:
+        """A hook, which last called this service, failed too often."""
+        self.events.note("hook_suspended", hook, error, None if call is None else self._registry.get(call))
 
     def listener_changed(self, key: ServiceKey, listener: tuple[str, str], came: bool) -> None:
         """A listener of a service, by its session and name, came or went."""

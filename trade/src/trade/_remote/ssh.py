@@ -1,11 +1,12 @@
 """Starts containers on other hosts, through the ``ssh`` program of this host."""
 
+import contextlib
 import re
 import shlex
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -15,6 +16,8 @@ from trade.errors import CannotStart, ConfigurationError, StartFailure
 
 CONNECT_S: Final = 10
 LONGEST_S: Final = 60.0
+_END_S: Final = 2.0 * CONNECT_S
+"""The timeout of an end in seconds, whatever time is left for the call that started the container."""
 _ASKED: Final = ("-o", "BatchMode=yes", "-o", "StrictHostKeyChecking=yes", "-o", f"ConnectTimeout={CONNECT_S}", "-T")
 """ssh prompts for nothing, and accepts only host keys that are known."""
 _HOST: Final = re.compile(r"(?:[A-Za-z0-9_][\w.+-]*@)?[A-Za-z0-9_\[][\w.:%\]-]*")
@@ -61,6 +64,13 @@ _REASONS: Final[Sequence[tuple[re.Pattern[str], StartFailure, str]]] = (
 )
 
 
+_END: Final = """
+args=$(2>/dev/null </proc/"$1"/cmdline tr '\\0' ' ' || ps -o args= -p "$1")
+case "$args" in *"$2"*) kill "$1";; *) exit 1;; esac
+"""
+"""Ends a process if its command line has these words: where the container runs, processes may have other numbers."""
+
+
 class Started(msgspec.Struct, frozen=True):
     """What ``trade container --detach --json`` prints when the container is up."""
 
@@ -69,22 +79,48 @@ class Started(msgspec.Struct, frozen=True):
     pid: int
 
 
+Info = TypeVar("Info")
+
+
 def start(
     host: str,
     name: str,
     *,
     system: str,
+    joined: Callable[[Started], Info | None],
+    wait_s: float,
     allow: Sequence[str] = (),
     connect: Sequence[str] = (),
     command: Sequence[str] = ("trade",),
     environment: Mapping[str, str] | None = None,
     ssh_config: Path | None = None,
-) -> Started:
-    """See `System.start_container`. Returns when the container is up."""
+) -> Info:
+    """See `System.start_container`. Returns what ``joined`` found; without that, the container is ended again."""
     dialled = [word for endpoint in connect for word in ("--connect", endpoint)]
     allowed = [word for pattern in allow for word in ("--allow", pattern)]
     words = ["--system", system, *dialled, "container", "--name", name, *allowed]
-    return launch(host, name, words, command=command, environment=environment, ssh_config=ssh_config)
+    started = launch(host, name, words, command=command, environment=environment, ssh_config=ssh_config)
+    try:
+        found = joined(started)
+    except BaseException:
+        _give_up(host, name, started.pid, words, ssh_config)
+        raise
+    if found is not None:
+        return found
+    outcome, hint = _give_up(host, name, started.pid, words, ssh_config)
+    said = f"it came up there as process {started.pid}, was not visible here within {wait_s:g} s, and {outcome}"
+    remedy = f"{hint}set its endpoints (connect=...), and give it the credentials or certificates of this system"
+    raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
+
+
+def _give_up(host: str, name: str, pid: int, words: Sequence[str], ssh_config: Path | None) -> tuple[str, str]:
+    """End a container that did not join; returns the outcome, and what is left to do."""
+    try:
+        if end_there(host, name, pid, words, ssh_config):
+            return "was ended again", ""
+    except CannotStart:
+        return "could not be ended", f"it still runs there; to end it: `ssh {host} kill {pid}`. Then "
+    return "was not found there to be ended", f"look for it: `ssh {host} pgrep -af {name}`. Then "
 
 
 def launch(
@@ -124,12 +160,20 @@ def missing_there(
     return [file for file in files if file in missing]
 
 
-def end_there(host: str, name: str, pid: int, ssh_config: Path | None) -> None:
-    """Shut down a process that was started there and is not in the system. Raises CannotStart if ssh fails."""
-    words = ["kill", str(pid)]
-    ended = _run(host, name, ssh_words(host, ssh_config, words))
+def end_there(host: str, name: str, pid: int, words: Sequence[str], ssh_config: Path | None) -> bool:
+    """Shut down a process that was started there with ``trade WORDS``, and is not in the system.
+
+    Returns:
+        Whether it got SIGTERM; False: that process is gone, or has another command line.
+
+    Raises:
+        CannotStart: ssh fails.
+    """
+    asked = ["sh", "-c", _END, "sh", str(pid), " ".join(words)]
+    ended = _run(host, name, ssh_words(host, ssh_config, asked), longest_s=_END_S)
     if ended.returncode == _SSH_FAILED:
-        raise _refusal(host, name, words[0], words, ended)
+        raise _refusal(host, name, asked[0], asked, ended)
+    return ended.returncode == 0
 
 
 def _assigned(environment: Mapping[str, str]) -> list[str]:
@@ -147,8 +191,10 @@ def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[
     return ["ssh", *config, *_ASKED, "--", host, shlex.join(words)]
 
 
-def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedProcess[str]":
-    longest_s = patience_s(LONGEST_S)
+def _run(
+    host: str, name: str, words: Sequence[str], longest_s: float | None = None
+) -> "subprocess.CompletedProcess[str]":
+    longest_s = patience_s(LONGEST_S) if longest_s is None else longest_s
     try:
         return subprocess.run(  # noqa: S603 - the host is checked, and the words are quoted for its shell
             words,
@@ -163,7 +209,8 @@ def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedPro
         remedy = "install it (Debian: apt-get install openssh-client)"
         raise CannotStart(host=host, container=name, reason="no ssh here", said="", remedy=remedy) from None
     except subprocess.TimeoutExpired:
-        said, remedy = f"not finished within {longest_s:.3g} s", "check whether it is up: `trade containers`"
+        said = f"not finished within {longest_s:.3g} s"
+        remedy = f"it may still come up there: `trade containers` shows it, or `ssh {host} pgrep -af {name}`"
         raise CannotStart(host=host, container=name, reason="timeout", said=said, remedy=remedy) from None
 
 
@@ -172,13 +219,14 @@ def _read(
 ) -> Started:
     if ended.returncode != 0:
         raise _refusal(host, name, command, words, ended)
-    try:
-        return msgspec.json.decode(ended.stdout.strip().splitlines()[-1], type=Started)
-    except (msgspec.DecodeError, IndexError):
-        remedy = f"it said {ended.stdout[-200:]!r}. Does its shell print something by itself?"
-        raise CannotStart(
-            host=host, container=name, reason="no answer", said=_complaint(ended), remedy=remedy
-        ) from None
+    for line in reversed(ended.stdout.splitlines()):
+        with contextlib.suppress(msgspec.DecodeError):  # output of its shell
+            return msgspec.json.decode(line, type=Started)
+    remedy = (
+        f"it said {ended.stdout[-200:]!r}, and may run there: `ssh {host} pgrep -af {name}` shows it. Does "
+        f"{command!r} there start this version of trade?"
+    )
+    raise CannotStart(host=host, container=name, reason="no answer", said=_complaint(ended), remedy=remedy)
 
 
 def _refusal(

@@ -322,8 +322,10 @@ def admit(
                 resource.check(tokens, caller, sessions[0] if sessions else "")
             if (ended := resource.gone(sessions)) is not None:
                 raise ended
-    except BaseException:
+    except BaseException as refused:
         permitted.close()
+        if isinstance(refused, Stopped):
+            refused.others = tuple(one.name for one in resources if one.latch and one.name != refused.resource)
         raise
     for resource in resources:
         resource.movers = sessions

@@ -1,11 +1,13 @@
 """``trade locks``, ``unlock`` and ``resume``: list locks, break them, and release groups after a stop."""
 
+from functools import partial, reduce
 from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Constraint, Container, LockInfo
+from trade._locks.api import RESUME_WAIT_S
 from trade._timestamps import clock
 from trade_gateway._usage import asked_for
 from trade_gateway.cli._completion import groups, locked_groups
@@ -14,7 +16,7 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
 
 _GROUP_HELP: Final = "A group, with the groups beneath it: rosie.head."
-Group = Annotated[str, typer.Argument(autocompletion=groups, help=_GROUP_HELP)]
+_GROUPS_HELP: Final = "Groups, each with the groups beneath it: rosie.head."
 Locked = Annotated[str, typer.Argument(autocompletion=locked_groups, help=_GROUP_HELP)]
 
 
@@ -87,20 +89,31 @@ def unlock(
 def _there(container: Container, group: str) -> Constraint:
     """Returns the constraint of a group that has services. Raises NoSuchService, with similar names."""
     constraint = asked_for(f"group {group!r}", group=group, name=None)
-    container.await_services(constraint, lambda: bool(container.services(constraint)), 0.0)
+    container.await_services(constraint, partial(_has_services, container, constraint), 0.0)
     return constraint
 
 
-def resume(context: typer.Context, group: Group) -> None:
-    """Let a group move again after another client's stop; move nothing.
+def _has_services(container: Container, which: Constraint) -> bool:
+    return bool(container.services(which))
 
+
+def resume(
+    context: typer.Context,
+    groups: Annotated[list[str], typer.Argument(metavar="GROUP...", autocompletion=groups, help=_GROUPS_HELP)],
+) -> None:
+    """Let groups move again after another client's stop; move nothing.
+
+    If a group does not exist, nothing is resumed.
     The exit code is 1 while an e-stop is open: nothing moves until it is cleared.
 
     For example: trade resume rosie.head
     """
     out = Output(as_json=False)
     with visitor_among_others(context) as container:
-        resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
+        wanted = [asked_for(f"group {group!r}", group=group, name=None) for group in groups]
+        for one in wanted if len(wanted) > 1 else ():
+            container.await_services(one, partial(_has_services, container, one), RESUME_WAIT_S)
+        resumed = container.resume(reduce(Constraint.__or__, wanted))
         still = container.estops()
     for estop in still:
         why = f": {escape(estop.reason)}" if estop.reason else ""
@@ -110,4 +123,8 @@ def resume(context: typer.Context, group: Group) -> None:
             out.say(f"resumed, for when it is: {escape(', '.join(resumed))}")
         out.say(f"when it is safe: [bold]trade estop --clear {' '.join(estop.id for estop in still)}[/]")
         raise typer.Exit(1)
-    out.say(f"may move again: {escape(', '.join(resumed))}" if resumed else f"nothing of {escape(group)} was held")
+    out.say(
+        f"may move again: {escape(', '.join(resumed))}"
+        if resumed
+        else f"nothing of {escape(', '.join(groups))} was held"
+    )

@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import CONNECTION, SECURITY, Json, room_of_extra
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import SystemChoice
@@ -38,6 +39,7 @@ def http(
         str,
         typer.Option(rich_help_panel=CONNECTION, help="HOST:PORT to listen on; other hosts need --tls and a policy."),
     ] = ("127.0.0.1:7080"),
+    port: Annotated[str | None, typer.Option("--port", hidden=True)] = None,
     tokens: TokenFile = _TOKENS,
     tls: Annotated[
         Path | None,
@@ -73,6 +75,8 @@ def http(
     """Serve HTTP and WebSocket clients until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
+    if port is not None:  # as other servers have it; click would suggest --host
+        raise UsageError(where="--port", problem=f"it is --listen HOST:PORT here: --listen 127.0.0.1:{port}")
     out = Output(as_json=as_json)
     opened = room_of_extra("http", "trade http")
     _check_agents(mcp=mcp, ask_first=ask_first or (), twin=twin)

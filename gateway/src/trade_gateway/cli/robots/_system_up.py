@@ -208,7 +208,10 @@ class Bringing:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(started.pid, signal.SIGTERM)
         else:
-            end_there(part.entry.host, part.name, started.pid, self._ssh_config)
+            if not end_there(part.entry.host, part.name, started.pid, part.words, self._ssh_config):
+                left = f"not ended: no process {started.pid} there runs `trade {' '.join(part.words)}`"
+                self._report(Report(container=part.name, host=part.entry.host, state=left, pid=started.pid))
+                return
         self._report(Report(container=part.name, host=part.entry.host, state="ended", pid=started.pid))
 
     def down(self, *, only_at_rest: bool) -> None:

@@ -152,6 +152,7 @@ def up(
         simulation = stack.enter_context(_simulation(whole, sim_log)) if sim else None
         ports: dict[str, str] = simulation.ports if simulation else named_ports
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
+        container.making.host()  # drivers of other packages may look for services
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
         if left_out:

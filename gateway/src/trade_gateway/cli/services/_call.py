@@ -29,6 +29,14 @@ COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
 _BRACKETS: Final = ("[", "{")
 _ANGLE = re.compile(r"_rad(_s2?)?$")
 _DEGREES = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)(?:deg|°)(?:/s2?)?(?![\w.])")
+_TAKEN: Final = {
+    "number": "a number",
+    "integer": "an integer",
+    "array": "a list",
+    "object": "an object",
+    "boolean": "true or false",
+}
+"""What a parameter takes, by JSON type."""
 _NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
 
 
@@ -53,6 +61,9 @@ def call(
         str | None,
         typer.Option(metavar="HOW", help="If several fit, call one: any, local, least_busy or nearest."),
     ] = None,
+    traceback: Annotated[  # noqa: ARG001 - `main` prints errors
+        bool, typer.Option("--traceback", help="If the service raises an error, print its whole traceback.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Call a service and print its result. Ctrl-C cancels a motion in progress.
@@ -136,9 +147,14 @@ def parse_arguments(texts: list[str], info: ServiceInfo) -> tuple[list[Any], dic
         named = _NAMED.fullmatch(text)
         name = named.group(1) if named else places[len(args)] if len(args) < len(places) else ""
         word = named.group(2) if named else text
+        kinds = _kinds(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
         try:
-            value = _value(word, name, schema)
+            value = _value(word, name, kinds)
         except msgspec.DecodeError as bad:
+            taken = " or ".join(sorted({_TAKEN[kind] for kind in kinds if kind in _TAKEN}))
+            if taken and _WORD.fullmatch(word) and not _NO_NUMBER.search(word):
+                problem = f"{name} takes {taken}, and {word!r} is a text"
+                raise UsageError(where=f"argument {text!r}", problem=problem) from None
             raise _no_json(text, word, bad, texts[place + 1 :]) from None
         if named:
             kwargs[name] = value
@@ -147,9 +163,8 @@ def parse_arguments(texts: list[str], info: ServiceInfo) -> tuple[list[Any], dic
     return args, kwargs
 
 
-def _value(text: str, name: str, schema: Mapping[str, Any]) -> Any:
-    """The value of a word for one parameter. Raises msgspec.DecodeError."""
-    kinds = _kinds(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
+def _value(text: str, name: str, kinds: set[str]) -> Any:
+    """The value of a word for one parameter of these JSON types. Raises msgspec.DecodeError."""
     in_radians = _DEGREES.sub(_radians, text) if _ANGLE.search(name) else text
     try:
         value = msgspec.json.decode(in_radians)

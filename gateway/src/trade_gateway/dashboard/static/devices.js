@@ -94,7 +94,7 @@ class Device {
   async act(name) {
     this.say("");
     try {
-      await gateway.call(this.group, name, {}, { deadline_s: ACTION_S });
+      await gateway.act(this.group, name, {}, { deadline_s: ACTION_S });
     } catch (error) {
       this.refused(error);
     }

@@ -1,9 +1,11 @@
 // The e-stop: always visible, and Esc presses it. It reports only what robots have confirmed.
+// In a text field, Esc leaves the field first, unless a call of this page that may move something is under way.
 
 import { gateway } from "./gateway.js";
 import { releaseAll } from "./jog.js";
 import { $, button, clock, make, show, tell } from "./page.js";
 
+const FIELD = "textarea, select, [contenteditable], input:not([type=range], [type=checkbox], [type=radio], [type=button], [type=submit])";
 const CUT = "use the switch that cuts the power.";
 
 let open_estops = [];
@@ -47,7 +49,7 @@ export async function lookForEstops() {
 function headline() {
   if (pressed?.wrong) return pressed.wrong;
   if (open_estops.some((one) => one.id === pressed?.id)) return "E-STOP: nothing moves until it is cleared.";
-  return open_estops.length ? "E-STOP: who has heard it moves nothing until it is cleared. Who has not is not known here." : "";
+  return open_estops.length ? "E-STOP: robots that have received it do not move until it is cleared. This page does not know whether all of them have received it." : "";
 }
 
 function showEstops() {
@@ -73,9 +75,16 @@ async function clearEstop(open) {
   await lookForEstops().catch(() => {}); // the next poll looks again anyway
 }
 
+function leftField(target) {
+  const field = gateway.acting ? null : target.closest?.(FIELD);
+  field?.blur();
+  return Boolean(field);
+}
+
 $("estop").onclick = pressEstop;
 addEventListener("keydown", (event) => {
   if (event.key !== "Escape" || event.repeat || event.isComposing || !gateway.me) return;
   event.preventDefault();
-  pressEstop();
+  if (leftField(event.target)) tell("You have left the field. Press Esc again for the e-stop.");
+  else pressEstop();
 }, true);

@@ -31,6 +31,11 @@ class Gateway {
     return this.#socket?.readyState === WebSocket.OPEN;
   }
 
+  /** Whether a call of this page that may move something is under way. */
+  get acting() {
+    return [...this.#under_way.values()].some((one) => one.acts);
+  }
+
   async request(method, path, body, within_ms) {
     const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
     if (body) headers["Content-Type"] = "application/json";
@@ -98,15 +103,15 @@ class Gateway {
     else waiting.resolve(message.result);
   }
 
-  /** Begin an operation; `heard` gets its messages, `ended` its result. */
-  begin(message, heard = () => {}) {
+  /** Begin an operation; `heard` gets its messages, `ended` its result. `acts`: whether it may move something. */
+  begin(message, heard = () => {}, acts = false) {
     const id = ++this.#number;
     const ended = new Promise((resolve, reject) => {
       if (!this.connected) {
         reject(lost());
         return;
       }
-      this.#under_way.set(id, { resolve, reject, heard });
+      this.#under_way.set(id, { resolve, reject, heard, acts });
       this.#socket.send(JSON.stringify({ ...message, id }));
     });
     return { id, ended };
@@ -118,6 +123,11 @@ class Gateway {
 
   call(group, name, args = {}, options = {}) {
     return this.ask({ do: "call", group, name, args, ...options });
+  }
+
+  /** The same for a service that may move something. */
+  act(group, name, args, options) {
+    return this.begin({ do: "call", group, name, args, ...options }, undefined, true).ended;
   }
 
   cancel(which) {

@@ -93,7 +93,7 @@ export class Jog {
         this.#moving = true;
         const next = sleep(JOG_EVERY_MS);
         const [name, args] = setpoint();
-        await gateway.call(group, name, { ...args, valid_s: JOG_VALID_S }, { deadline_s: 1 }); // one at a time: none piles up on a slow link
+        await gateway.act(group, name, { ...args, valid_s: JOG_VALID_S }, { deadline_s: 1 }); // one at a time: none piles up on a slow link
         await next;
       }
     } catch (error) {

@@ -60,7 +60,7 @@ function formOf(one) {
     try {
       const args = Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));
       const asked = { do: "call", group: one.group, name: one.name, container: one.container, args, deadline_s: 60 };
-      const { id, ended } = gateway.begin(asked, (message) => write(result, `… ${JSON.stringify(message.progress)}`));
+      const { id, ended } = gateway.begin(asked, (message) => write(result, `… ${JSON.stringify(message.progress)}`), one.effect !== "read");
       cancel.dataset.call = id;
       [cancel.hidden, run.disabled] = [false, true];
       write(result, "under way …");
