@@ -25,7 +25,7 @@ from trade.testing import MemorySystem, memory_system
 from trade_drivers import AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, events, motion_writes, writes
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 LEGS = (
     HEAD.replace("[group.head]", "[group.neck_only]")

@@ -15,7 +15,7 @@ from trade_drivers import Driver, drivers, load
 from trade_drivers.plugins import _driver as driver_module
 from trade_hil_sim import DynamixelBus, Servo
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 def refused(rig: Rig, **options: Any) -> str:
@@ -73,6 +73,7 @@ def test_a_port_that_is_not_there_is_named(head: Rig) -> None:
     assert "/dev/ttyNOWHERE" in text
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("kind", ["file", "folder", "device"])
 def test_a_path_that_is_no_serial_port_is_named_with_its_key(head: Rig, tmp_path: Path, kind: str) -> None:
     (tmp_path / "file").touch()

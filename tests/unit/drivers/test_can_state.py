@@ -16,6 +16,8 @@ from trade_drivers.bus.can._netlink import Link, look_at, parse_link
 from trade_drivers.joints import PortLost
 from trade_hil_sim import BadCrc, BusOff, Heal, Replug, Unplug
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["leg", "rig"]
 
 _numbers = itertools.count()
@@ -24,14 +26,12 @@ _numbers = itertools.count()
 # --- the service
 
 
-@pytest.mark.realtime
 def test_a_healthy_bus_says_so(leg: Leg) -> None:
     state = leg.attach().monitor("legs").bus_state()
     assert (state.name, state.port, state.up) == ("rosie.bus.legs", leg.sim.port, True)
     assert (state.state, state.error_frames, state.bus_offs) == ("error-active", 0, 0)
 
 
-@pytest.mark.realtime
 def test_the_load_is_that_of_the_frames_on_the_wire(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     began = leg.frames("sync")[-1].t
@@ -41,7 +41,6 @@ def test_the_load_is_that_of_the_frames_on_the_wire(leg: Leg) -> None:
     assert expected / 2 < load < expected * 2
 
 
-@pytest.mark.realtime
 def test_error_frames_are_counted(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     leg.sim.do(BadCrc(ids=(HIP,), instruction="tpdo1", count=5))
@@ -49,7 +48,6 @@ def test_error_frames_are_counted(leg: Leg) -> None:
     assert monitor.bus_state().state == "error-active"
 
 
-@pytest.mark.realtime
 def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     monitor = leg.attach().monitor("legs")
     leg.sim.do(BusOff())
@@ -62,7 +60,6 @@ def test_a_bus_off_is_reported_until_the_bus_is_heard_again(leg: Leg) -> None:
     assert not leg.goals(HIP)
 
 
-@pytest.mark.realtime
 def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call(
     leg: Leg, start_container: Callable[..., Container]
 ) -> None:
@@ -77,7 +74,6 @@ def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call
 # --- health
 
 
-@pytest.mark.realtime
 def test_joints_groups_and_the_bus_report_that_the_bus_is_unhealthy_and_healthy_again(leg: Leg) -> None:
     reported: list[tuple[object, str]] = []
     robot = leg.attach(set_health=lambda provider, health: reported.append((provider, health)))
@@ -149,6 +145,7 @@ def test_no_cut_in_an_answer_is_a_crash() -> None:
     assert {parse_link(whole[:end]).up for end in range(32, len(whole))} == {True}
 
 
+@pytest.mark.real_clock
 def test_an_existing_interface_is_found_and_a_missing_one_is_named() -> None:
     assert look_at("lo").state is None
     with pytest.raises(OSError, match="there is no interface nothere0"):

@@ -14,7 +14,7 @@ from trade import Container, Handle, Run, service, where
 from trade.errors import Cancelled, MotionStopped, SessionEnded, TradeError
 from trade_drivers import AttachedRobot, attach
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 FAR, SLOW = 1.2, 0.1
 """12 s away."""
@@ -144,6 +144,7 @@ with Container(Settings.read(system=sys.argv[1], container="caller")) as caller:
 """
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("how", ["look", "look_async", "look_apart", "look_about"])
 def test_S05_the_death_of_the_caller_ends_what_the_service_moves_elsewhere(
     head: Rig, mind: Mind, system: str, how: str, request: pytest.FixtureRequest

@@ -14,7 +14,7 @@ from trade_drivers import load
 from trade_hil_sim import Mute, Unplug
 from trade_hil_sim.cia402 import Cia402Bus
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 
@@ -103,6 +103,7 @@ def test_a_channel_that_is_not_there_is_named(leg: Leg) -> None:
     assert leg.sim.port in text
 
 
+@pytest.mark.realtime
 def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     hip.enable()

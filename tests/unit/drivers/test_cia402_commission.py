@@ -10,7 +10,7 @@ from trade_drivers import scan
 from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_hil_sim import Absent
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

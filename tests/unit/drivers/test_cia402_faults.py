@@ -21,7 +21,7 @@ from trade_hil_sim import (
     Truncate,
 )
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

@@ -5,7 +5,7 @@ import pytest
 from tests.unit.drivers.legs import HIP, Leg, leg, rig
 from trade.errors import ConfigurationError, WrongDevice
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

@@ -33,7 +33,7 @@ from trade_drivers.vendors.cia402._stream import Following, Turning, interpolati
 from trade_hil_sim import Entry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

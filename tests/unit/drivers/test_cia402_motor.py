@@ -12,7 +12,7 @@ from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, Limit
 from trade_drivers import JointGroup, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.vendors.cia402._motor import Drive
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

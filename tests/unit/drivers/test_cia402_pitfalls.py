@@ -12,7 +12,7 @@ from trade.errors import ConfigurationError, DeviceFault
 from trade_hil_sim import Echo, Emergency, Mute, Truncate
 from trade_hil_sim.cia402 import Abort, AbortCode, Cia402Bus
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 

@@ -22,7 +22,7 @@ from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import Stage
 from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, Mute, SimProcess, events, frames
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 
@@ -187,6 +187,7 @@ def robot(stand: Stand) -> Iterator[AttachedRobot]:
     attached.close()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("seconds", [0.3, 1, 3])
 def test_all_drives_come_back_by_themselves_from_a_silence_and_nothing_moves(
     stand: Stand, robot: AttachedRobot, seconds: float
@@ -204,6 +205,7 @@ def test_all_drives_come_back_by_themselves_from_a_silence_and_nothing_moves(
     assert group.move_to([0.1, 0.1]) == pytest.approx([0.1, 0.1], abs=0.01)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("seconds", [0.3, 1, 3])
 def test_a_driver_process_that_was_suspended_finds_its_drives_again_and_moves_nothing(
     stand: Stand, seconds: float
@@ -237,6 +239,7 @@ def ask(process: "subprocess.Popen[str]", line: str) -> str:
 # --- drives that network management has stopped
 
 
+@pytest.mark.realtime
 def test_a_drive_that_network_management_has_stopped_says_so_and_enable_takes_it_back(
     leg: Leg, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -16,7 +16,7 @@ from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["leg", "rig"]
 
@@ -35,6 +35,7 @@ def heartbeats(leg: Leg, since: float = 0.0) -> list[Entry]:
 # --- time
 
 
+@pytest.mark.realtime
 def test_S01_a_search_for_home_that_does_not_end_in_time_is_halted_before_its_deadline(
     rig: Leg, start_container: Callable[..., Container]
 ) -> None:

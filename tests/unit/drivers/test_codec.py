@@ -20,6 +20,8 @@ from trade_drivers.vendors.dynamixel._axis import CYCLIC, GRAIN, SLOW, Dynamixel
 from trade_drivers.vendors.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
 from trade_hil_sim.dynamixel import status
 
+pytestmark = pytest.mark.virtual_time
+
 
 def joint(**changes: object) -> Joint:
     values = {"id": 1, "min_rad": -1.0, "max_rad": 1.0, "max_speed_rad_s": 2.5, "max_accel_rad_s2": 20.0, **changes}

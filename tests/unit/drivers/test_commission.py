@@ -16,7 +16,7 @@ from trade_hil_sim import DynamixelBus, Gripper, Late, Mute, RobotiqBus, Servo, 
 from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 class Make(NamedTuple):

@@ -9,7 +9,7 @@ from trade_drivers import scan
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_hil_sim import MODELS, Jam, Servo, WrongModel, instructions
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 def plug(rig: Rig, pan: str, tilt: str) -> None:

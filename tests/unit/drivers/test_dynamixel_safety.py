@@ -22,7 +22,7 @@ from trade.errors import (
     OutcomeUnknown,
 )
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 WATCHDOG_S = 0.3
 
@@ -80,6 +80,7 @@ def child(head: Rig, tmp_path: Path) -> Iterator[Child]:
     made.close()
 
 
+@pytest.mark.realtime
 def test_S06_after_the_watchdog_only_an_explicit_enable_lets_it_move_again(head: Rig, child: Child) -> None:
     head.wait_for("motion_started", 1)
     child.signal(signal.SIGKILL)

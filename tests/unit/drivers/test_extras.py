@@ -7,6 +7,8 @@ from importlib.metadata import requires
 import pytest
 from packaging.requirements import Requirement
 
+pytestmark = pytest.mark.virtual_time
+
 MODULES = {"cffi", "can", "canopen", "dynamixel_sdk", "serial", "pymodbus", "rtde_control"}
 """What the libraries of the extras are imported as."""
 LIBRARIES = {"cffi", "python-can", "canopen", "dynamixel-sdk", "pyserial", "pymodbus", "ur-rtde", "trade-drivers"}

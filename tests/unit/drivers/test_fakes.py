@@ -30,6 +30,8 @@ from trade_drivers.testing import (
     SensorContract,
 )
 
+pytestmark = pytest.mark.virtual_time
+
 JOINTS = ["rosie.neck.pan", "rosie.neck.tilt"]
 ANGLES = [0.1, -0.2, 0.3, 0.0, 0.5, -0.6]
 

@@ -17,7 +17,7 @@ from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
 from trade_drivers.faults import FaultPoller
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._jobs import Enable, Relax
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 COUNT_RAD = 6.283185 / 4096
 

@@ -13,7 +13,7 @@ from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim.feetech import Servo
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "servo_arm.toml"
 

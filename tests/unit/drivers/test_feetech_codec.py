@@ -18,6 +18,8 @@ from trade_drivers.vendors.feetech._frames import Corrupt, Status, packet, take_
 from trade_drivers.vendors.feetech._jobs import GOAL_BLOCK, goal_block
 from trade_hil_sim.feetech import STS3215, PacketReader, encode, status
 
+pytestmark = pytest.mark.virtual_time
+
 REGISTERS = {name: value for name, value in vars(table).items() if isinstance(value, table.Register)}
 IDS = (1, 2, 3)
 BLIND_NS = 300_000_000

@@ -15,7 +15,7 @@ from tests.unit.drivers.tail_rig import TailRig, goal_of, tail_rig
 from trade.errors import DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 COUNT_RAD = 6.283185 / 4096
 OVERLOAD, OVERHEATING = 0x20, 0x04

@@ -15,7 +15,7 @@ from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, tail_rig
 from trade.errors import LockedByOther
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 SLOWLY_RAD_S = 0.3
 

@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError, DeviceFault, DeviceSilent, WrongDev
 from trade_drivers import Motor
 from trade_hil_sim import BrownOut, motion_writes
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from trade.testing import memory_system
 from trade_drivers import AttachedRobot, FollowProgress, JointGroup, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Servo
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 COUNTS_PER_RAD = 4096 / math.tau
 NAMES = ["rosie.neck.pan", "rosie.neck.tilt"]

@@ -25,7 +25,7 @@ from trade.errors import DeviceFault, MotionStopped
 from trade_drivers import JointGroup, Motor, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.joints import Steps, Work
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 SPEED_RAD_S = 0.5
 WATCHDOG_S = 0.4

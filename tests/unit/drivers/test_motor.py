@@ -7,7 +7,7 @@ from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade.errors import InvalidArgument, MotionStopped
 from trade_drivers import AttachedRobot
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 @pytest.fixture

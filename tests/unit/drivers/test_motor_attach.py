@@ -15,7 +15,7 @@ from trade_drivers import load
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["motor_rig", "wag"]
 

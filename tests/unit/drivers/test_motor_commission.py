@@ -23,7 +23,7 @@ from trade_hil_sim.cia402 import Drive
 from trade_hil_sim.damiao import Motor
 from trade_hil_sim.odrive import Axis
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["motor_rig", "wag"]
 

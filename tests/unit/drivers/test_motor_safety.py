@@ -8,7 +8,7 @@ from trade.errors import (
     TradeError,
 )
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["motor_rig", "wag"]
 

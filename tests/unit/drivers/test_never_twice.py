@@ -14,7 +14,7 @@ from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.damiao import DamiaoDriver
 from trade_drivers.vendors.odrive import OdriveDriver
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 RIGS: dict[str, type[Leg]] = {"cia402": Leg, **KINDS}
 COMMISSIONERS: dict[str, Callable[[], Commissioner]] = {

@@ -8,6 +8,8 @@ from trade_drivers.vendors.snapshot._http import Answer, Place, parse_answer, pl
 from trade_drivers.vendors.snapshot._picture import Picture, picture
 from trade_hil_sim.scene import png
 
+pytestmark = pytest.mark.virtual_time
+
 APP0 = b"\xff\xe0\x00\x10JFIF\0\1\1\0\0\1\0\1\0\0"
 TABLE = b"\xff\xc4\x00\x04ab"
 FRAME = b"\xff\xc2\x00\x0b\x08\x01\xe0\x02\x80\x01\x01\x11\x00"

@@ -12,6 +12,8 @@ from trade.errors import BusGone, ConfigurationError, DeviceSilent
 from trade_drivers import Measured, PolledSensor, SensorInfo
 from trade_drivers.testing import SensorContract
 
+pytestmark = pytest.mark.virtual_time
+
 INFO = SensorInfo(name="rosie.scale", model="S1", unit="kg", size=0, low=0.0, high=5.0, rate_hz=100.0)
 
 

@@ -16,7 +16,7 @@ from cantools.database import Database
 from tests.support.waiting import PATIENCE_S
 from tests.unit.drivers.legs import PATIENT, Leg, rig
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["rig"]
 

@@ -14,7 +14,7 @@ from trade.errors import (
 )
 from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 SLOW_M_S = 0.02
 

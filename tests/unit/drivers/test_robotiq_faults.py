@@ -12,7 +12,7 @@ from tests.unit.drivers.gripper_rig import HandRig, made_rig
 from trade.errors import BusGone, DeviceError, DeviceSilent, TradeError
 from trade_drivers import Gripper, GripperState
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 SLOW_M_S = 0.02
 
@@ -104,6 +104,7 @@ def test_fingers_held_fast_are_holding(hand: HandRig, gripper: Gripper) -> None:
     assert gripper.close().holding == "outside"
 
 
+@pytest.mark.realtime
 def test_clear_fault_reports_a_fault_that_stays(hand: HandRig, gripper: Gripper) -> None:
     hand.sim.do(sim.Mute(instruction="read_write"))
     with pytest.raises(DeviceSilent):

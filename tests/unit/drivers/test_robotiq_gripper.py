@@ -16,7 +16,7 @@ from trade_drivers.vendors.robotiq import _table as table
 from trade_hil_sim import DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 @pytest.fixture

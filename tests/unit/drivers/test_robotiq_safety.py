@@ -20,7 +20,7 @@ from trade.errors import (
 from trade_drivers import Gripper
 from trade_hil_sim import Heal, Mute, Put, instructions, received
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 SLOW_M_S = 0.02
 

@@ -14,7 +14,7 @@ from trade.errors import (
 )
 from trade_hil_sim import DynamixelBus
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 # --- S18 attach moves and resets nothing
 

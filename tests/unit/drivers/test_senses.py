@@ -32,7 +32,7 @@ from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.robot._robot import buses_of
 from trade_hil_sim.scene import LIMB, OBJECT, Field, fields
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 EYE = """
 [camera.eye]
@@ -158,6 +158,7 @@ def _gap(pixels: set[tuple[int, int]]) -> int:
     return max(right - left for left, right in pairwise(columns))
 
 
+@pytest.mark.realtime
 def test_the_example_is_seen_to_move_in_a_simulator_of_its_own() -> None:
     file = Path(__file__).parents[3] / "examples" / "eye.toml"
     with (

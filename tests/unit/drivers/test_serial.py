@@ -15,7 +15,7 @@ from trade_drivers.bus._serial_port import LONGEST_WAIT_S, SerialLine, SerialWir
 from trade_drivers.vendors.dynamixel._wire import Wire as ServoWire
 from trade_drivers.vendors.robotiq._wire import Wire as GripperWire
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 WIRES = pytest.mark.parametrize("kind", [ServoWire, GripperWire], ids=["dynamixel", "robotiq"])
 
@@ -60,6 +60,7 @@ def test_a_port_belongs_to_one_driver(kind: type[SerialWire], pair: Pair) -> Non
     second.close()
 
 
+@pytest.mark.realtime
 @WIRES
 def test_what_is_no_serial_port_is_refused_and_what_is_absent_may_come(kind: type[SerialWire], tmp_path: Path) -> None:
     (tmp_path / "file").touch()

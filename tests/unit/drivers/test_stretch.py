@@ -7,7 +7,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Rig, call, written_now
 from trade_drivers import parse
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 BAUD, JOINTS = 57_600, 6
 LONGEST_STRETCH_S = 0.020

@@ -16,6 +16,8 @@ from trade.testing import MemorySystem, memory_system
 from trade_gateway.cli import app
 from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Eyes:
     @service(effect="read", achieves=["see(?x)"])

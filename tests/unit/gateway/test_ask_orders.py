@@ -12,6 +12,8 @@ from trade_gateway.language import NotUnderstood, Talk, read_lexicon
 from trade_gateway.language import _dialogue as dialogue
 from trade_gateway.language._catalogue import REQUESTS
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["world"]
 
 POLICY = """

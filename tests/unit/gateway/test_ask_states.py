@@ -9,6 +9,8 @@ from tests.unit.gateway.asked_system import Arm, World, world
 from trade import where
 from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["world"]
 
 

@@ -11,6 +11,8 @@ import pytest
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade_gateway.process._signals import SignalEvent
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_it_is_heard_by_all_who_wait_and_until_it_is_cleared() -> None:
     asked, heard = SignalEvent(), list[bool]()

@@ -17,6 +17,8 @@ from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 
+pytestmark = pytest.mark.virtual_time
+
 
 def trade(*words: str | Path) -> Any:
     return CliRunner().invoke(app, [str(word) for word in words])

@@ -18,7 +18,7 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
 from trade_hil_sim import DynamixelBus, writes
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 def joint(**changes: Any) -> Joint:

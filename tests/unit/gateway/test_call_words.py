@@ -13,6 +13,8 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.services._call import parse_arguments
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Side(Enum):
     LEFT = "left"

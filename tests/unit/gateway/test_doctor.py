@@ -24,6 +24,8 @@ from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.pki._authority import Authority
 from trade_hil_sim import Arm, DynamixelBus, Mute, Place, UrBus, motion_writes, received, writes
 
+pytestmark = pytest.mark.virtual_time
+
 
 def only(found: Iterable[Finding]) -> Finding:
     [one] = found
@@ -31,6 +33,7 @@ def only(found: Iterable[Finding]) -> Finding:
     return one
 
 
+@pytest.mark.real_clock
 def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = tmp_path / "ttyUSB0"
     port.touch()
@@ -225,7 +228,6 @@ def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_fil
     )
 
 
-@pytest.mark.realtime
 def test_S23_a_joint_outside_the_devices_own_range_is_reported_with_both_angles(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].memory.set("max_position_limit", 3000)
@@ -256,6 +258,7 @@ def test_one_adapter_under_two_names_is_an_error_that_names_both_keys(tmp_path: 
     assert "bus.tail.port" in found.text and "bus.neck.port" in found.text and str(link) in found.text
 
 
+@pytest.mark.real_clock
 def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:
     (tmp_path / "neck").write_text("a file\n")
     found = only(of_devices(robot_file))
@@ -290,6 +293,7 @@ def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     assert "0 errors" in well.output
 
 
+@pytest.mark.real_clock
 def test_a_hub_that_has_ended_is_reported(system: str, start_container: Callable[..., Container]) -> None:
     member = start_container("member")
     assert [found.about for found in host.in_sight(member, system)] == [f"system {system}"]

@@ -17,6 +17,8 @@ from trade_gateway.drill._processes import DrillFailed
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
 from trade_gateway.drill._testbed import Judge
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLES = Path(__file__).parents[3] / "examples"
 DRILL_PAGE = EXAMPLES.parent / "docs" / "drill.md"
 BY_NAME = {scene.name: scene for scene in SCENES}
@@ -252,7 +254,6 @@ class ScriptedStand:
             file.writelines(line + b"\n" for line in lines)
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("script", "after_repair", "verdict"),
     [

@@ -30,6 +30,8 @@ from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.pki._authority import Authority
 from trade_gateway.process._addresses import addresses, forwarding
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "gateway.toml"
 POLICY = """
 revoked_file = "revoked.toml"

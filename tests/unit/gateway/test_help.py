@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app, build
 
+pytestmark = pytest.mark.virtual_time
+
 _WIDTH = 80
 _MOST_UNGROUPED = 5
 """The most options of a command that need no panel."""

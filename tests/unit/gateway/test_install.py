@@ -20,6 +20,8 @@ from trade_gateway.cli.operation import _install
 from trade_gateway.cli.operation._install import _closed_to
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, Needs, needs_of, unit_text
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLES = Path(__file__).parents[3] / "examples"
 FILE = """
 system = "lab"

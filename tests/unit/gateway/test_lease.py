@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -11,6 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._host_loads import HostLoads
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease, waits_s
+
+pytestmark = pytest.mark.virtual_time
 
 LEASE_S = 10.0
 KILL_S = 0.4

@@ -22,6 +22,8 @@ from trade_gateway.cli.rights._pki import app
 from trade_gateway.pki import _authority
 from trade_gateway.pki._authority import Authority, Issued, NameRevoked, NameTaken, NoAuthority
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:

@@ -10,7 +10,7 @@ from trade._telemetry.call_model import deviations, learn, sequences
 from trade.errors import ConfigurationError
 from trade_gateway.cli.watching._profile import read, statistics, write
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 def span(call_id: int, service: str, **others: Any) -> Span:

@@ -14,6 +14,8 @@ from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.process import _real_time
 from trade_gateway.process._real_time import PRIORITY, RealTime, refusal
 
+pytestmark = pytest.mark.virtual_time
+
 may = pytest.mark.skipif(bool(refusal()), reason=refusal() or "it may")
 
 HURRY = """

@@ -27,7 +27,7 @@ from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 class State(Struct):

@@ -17,6 +17,8 @@ from trade import Container, service, where
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
 
+pytestmark = pytest.mark.virtual_time
+
 StartContainer = Callable[..., Container]
 
 FILE = """

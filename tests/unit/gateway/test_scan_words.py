@@ -22,7 +22,7 @@ from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo
 from trade_hil_sim.odrive import Axis, OdriveBus
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 @pytest.fixture
@@ -184,6 +184,7 @@ def test_a_scan_that_finds_a_problem_ends_with_its_exit_code(tmp_path: Path) -> 
     assert said.exit_code == 1
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     "words",
     [

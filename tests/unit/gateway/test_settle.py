@@ -10,6 +10,8 @@ import pytest
 
 from trade_gateway.process._signals import settle
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture(autouse=True)
 def _thaw() -> Iterator[None]:

@@ -14,6 +14,8 @@ import pytest
 
 from trade_gateway.supervisor._store import StateStore
 
+pytestmark = pytest.mark.virtual_time
+
 BIG = "x" * 20_000
 """More than a page, so that a save takes several steps on the disk."""
 SAVER = """

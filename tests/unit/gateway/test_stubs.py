@@ -24,6 +24,8 @@ from trade_drivers.testing import FakeJointGroup
 from trade_gateway.cli import build
 from trade_gateway.stubs import write_stubs
 
+pytestmark = pytest.mark.virtual_time
+
 BEHAVIOUR = Path(__file__).with_name("stubbed_behaviour.py")
 NUMBER = {"type": "number"}
 

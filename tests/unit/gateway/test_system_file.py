@@ -12,6 +12,8 @@ from trade_gateway.cli import app
 from trade_gateway.config._system import read_system_file
 from trade_gateway.config._tables import line_of
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLES = Path(__file__).parents[3] / "examples"
 HEAD = '[system]\nname = "home"\n\n'
 LAMPS = '[container.lamps]\nproviders = [{ class = "lamp:Lamp", groups = ["hall"] }]\n'

@@ -8,6 +8,8 @@ from trade_gateway.cli._output import Output
 from trade_gateway.cli.motion._estop import _say
 from trade_gateway.cli.services._services import _containers_table
 
+pytestmark = pytest.mark.virtual_time
+
 OTHER = PROTOCOL + 1
 REPORT = EstopReport(
     id="abc",

@@ -11,6 +11,8 @@ from trade.testing import MemorySystem, memory_system
 from trade_gateway.cli.watching import _watch
 from trade_gateway.cli.watching._watch import Watched
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Arm:
     def __init__(self) -> None:

@@ -12,6 +12,8 @@ from trade import Container, HookEvent, service, where
 from trade.errors import NoSuchHook, NoSuchNotification
 from trade_gateway.cli import app
 
+pytestmark = pytest.mark.virtual_time
+
 StartContainer = Callable[..., Container]
 
 

@@ -34,7 +34,7 @@ from trade_hil_sim import (
     frames,
 )
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 
 class Parrot:
@@ -231,6 +231,7 @@ def test_a_wrong_channel_or_word_is_refused(make_can: Any) -> None:
     assert [e.detail for e in events(bus.log.entries, "misunderstood")] == ["rawmode", "not a frame: 999 1 1"]
 
 
+@pytest.mark.realtime
 def test_a_client_that_does_not_read_delays_no_other(make_can: Any, connect: Any) -> None:
     bus = make_can(1)
     awake = connect(bus)

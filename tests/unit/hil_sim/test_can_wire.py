@@ -10,6 +10,8 @@ from trade_hil_sim import (
 )
 from trade_hil_sim.can import Reader, Station, Wire, frame_text, parse_send
 
+pytestmark = pytest.mark.virtual_time
+
 # text
 
 

@@ -31,7 +31,7 @@ from trade_hil_sim import (
 )
 from trade_hil_sim.cia402 import OBJECTS, Cia402Bus, Drive, pdo_objects
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 KINDS = {"u8": 5, "i8": 2, "u16": 6, "i16": 3, "u32": 7, "i32": 4, "text": 9}
 LEG = """
@@ -341,6 +341,7 @@ def leg(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.realtime
 def test_a_robot_file_with_a_can_bus_is_simulated_in_a_process(leg: Path, connect: Any) -> None:
     with SimProcess(leg) as sim:
         port = sim.ports["leg"]
@@ -367,6 +368,7 @@ def test_a_robot_file_with_a_can_bus_is_simulated_in_a_process(leg: Path, connec
             assert control.device(5).hardware_error == 0x2310
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("change", "hint"),
     [

@@ -26,6 +26,8 @@ from tests.unit.hil_sim.drive_bench import (
 )
 from trade_hil_sim.cia402 import Command, Mode, State, command, next_state
 
+pytestmark = pytest.mark.virtual_time
+
 # states
 
 PATHS = {

@@ -29,6 +29,8 @@ from trade_hil_sim import (
 )
 from trade_hil_sim.cia402 import Mode, State
 
+pytestmark = pytest.mark.virtual_time
+
 SOD, RTSO, SO = State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.SWITCHED_ON
 OE = State.OPERATION_ENABLED
 

@@ -8,6 +8,8 @@ from tests.unit.hil_sim.drive_bench import MODEL, NODE, Bench
 from trade_hil_sim import Frame
 from trade_hil_sim.cia402 import Cia402Bus
 
+pytestmark = pytest.mark.virtual_time
+
 START, STOP, PRE_OP, RESET, RESET_COMM = "01", "02", "80", "81", "82"
 
 

@@ -5,6 +5,8 @@ import pytest
 from trade_drivers.vendors.cia402 import _table as theirs
 from trade_hil_sim.cia402 import OBJECTS
 
+pytestmark = pytest.mark.virtual_time
+
 OURS = {(entry.index, entry.sub): entry for entry in OBJECTS}
 
 

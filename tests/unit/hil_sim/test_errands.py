@@ -9,6 +9,8 @@ from tests.support.waiting import PATIENCE_S
 from trade_hil_sim import SimulationError
 from trade_hil_sim.robot._bus_thread import Mailbox, ready
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> None:
     errands = Mailbox("bus leg", PATIENCE_S)

@@ -7,6 +7,8 @@ import pytest
 
 from trade_hil_sim.feetech import STS3215, Servo, Status
 
+pytestmark = pytest.mark.virtual_time
+
 TORQUE, ACCELERATION, GOAL, SPEED, LOCK, POSITION, OFFSET = 40, 41, 42, 46, 55, 56, 31
 BY_ADDRESS = {register.address: register for register in STS3215.registers}
 

@@ -11,6 +11,8 @@ from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.robot._factory_devices import fresh_bus
 from trade_hil_sim.robotiq import RobotiqBus
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.mark.parametrize(
     ("words", "kind", "ids", "baud"),
@@ -53,7 +55,6 @@ def test_one_of_two_of_one_id_is_unplugged_by_its_number(tmp_path: Path) -> None
         bus.do(Absent(nth=3))
 
 
-@pytest.mark.realtime
 def test_where_ids_are_unique_there_is_no_number(tmp_path: Path) -> None:
     with Cia402Bus([Drive(1)]) as bus, pytest.raises(SimulationError, match="not by nth"):
         bus.do(Absent(nth=1))

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from trade_hil_sim import ByteLog, Entry, events, instructions, motion_writes, read_log, received, sent, writes
+
+pytestmark = pytest.mark.virtual_time
 
 STORY = [
     Entry(1.0, "neck", "received", hex="0102"),

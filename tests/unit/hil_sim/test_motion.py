@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
 
+pytestmark = pytest.mark.virtual_time
+
 POSITIONS = st.floats(-1e6, 1e6)
 SPEEDS = st.floats(-5000, 5000)
 TOPS = st.floats(1, 5000)

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from trade_hil_sim.dynamixel import Instruction, Packet, PacketReader, crc16, encode, status
 from trade_hil_sim.dynamixel._protocol import JoinedStatus, stuff, unstuff
 
+pytestmark = pytest.mark.virtual_time
+
 IDS = st.integers(0, 252) | st.just(254)
 # plenty of what stuffing is about
 PARAMS = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55]) | st.integers(0, 255), max_size=60).map(bytes)

@@ -9,6 +9,8 @@ import pytest
 
 from trade_hil_sim.robot._bus_thread import ready
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def pipe() -> Iterator[tuple[int, int]]:
@@ -22,6 +24,7 @@ def pipe() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
+@pytest.mark.real_clock
 def test_readable_state_is_reported_and_the_rest_waited_for(pipe: tuple[int, int]) -> None:
     reading, writing = pipe
     assert ready([reading], timeout_s=0.0) == []

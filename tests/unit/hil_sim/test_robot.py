@@ -8,6 +8,8 @@ import pytest
 from trade_hil_sim import DynamixelBus, SimulationError
 from trade_hil_sim.robot._robot import buses_of, find_simulator, read_robot
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_each_joint_is_a_servo_at_the_joints_zero(robot_file: Path, tmp_path: Path) -> None:
     neck, arm = buses_of(read_robot(robot_file), tmp_path)

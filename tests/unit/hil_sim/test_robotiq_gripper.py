@@ -5,6 +5,8 @@ import pytest
 from tests.unit.hil_sim.conftest import FakeClock
 from trade_hil_sim.robotiq import Gripper, Object
 
+pytestmark = pytest.mark.virtual_time
+
 COMMAND, STATUS = 0x03E8, 0x07D0
 ACTIVE, GOING = 0x31, 0x39
 CYCLE_S = 0.005

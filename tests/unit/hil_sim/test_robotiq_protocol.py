@@ -5,6 +5,8 @@ import pytest
 from trade_hil_sim.robotiq import ExceptionCode, Request, RequestReader, crc16, frame
 from trade_hil_sim.robotiq._protocol import GAP_S, PATIENCE_S, exception, read_answer, write_answer
 
+pytestmark = pytest.mark.virtual_time
+
 CLEAR = bytes.fromhex("091003E80003060000000000007330")
 STATUS = bytes.fromhex("090307D00003040E")
 STATUS_AS_INPUT = bytes.fromhex("090407D00003B1CE")

@@ -7,6 +7,8 @@ import pytest
 from trade_hil_sim import ArmTruth, BusState, DeviceState, GripperTruth
 from trade_hil_sim.scene import BACKGROUND, LIMB, OBJECT, Field, draw, fields, png
 
+pytestmark = pytest.mark.virtual_time
+
 WIDE, HIGH = 120, 80
 
 

@@ -20,6 +20,8 @@ from tests.unit.hil_sim.servo_rig import (
 from trade_hil_sim import XL430_W250, XM430_W350
 from trade_hil_sim.dynamixel import ErrorCode, Servo
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["refused", "rig"]
 
 

@@ -7,6 +7,8 @@ import pytest
 from tests.unit.hil_sim.servo_rig import GOAL, GOAL_PWM, GOAL_VELOCITY, TORQUE, VELOCITY, WATCHDOG, Rig, refused, rig
 from trade_hil_sim.dynamixel import ErrorCode, HardwareError
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["refused", "rig"]
 
 

@@ -8,6 +8,8 @@ import rustypot
 
 from trade_hil_sim.dynamixel import MODELS, Model
 
+pytestmark = pytest.mark.virtual_time
+
 FILES = Path(dynamixel_easy_sdk.__file__).parent / "control_table"
 
 

@@ -12,6 +12,8 @@ from trade.errors import Cancelled, ConfigurationError, DeviceFault, LockedByOth
 from trade_drivers.testing import FakeGripper
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
 
+pytestmark = pytest.mark.virtual_time
+
 DRIVE = "lab_msgs/action/Drive"
 FROM = f'[[from_ros.action]]\naction = "/drive"\ntype = "{DRIVE}"\ngroups = ["base"]\n'
 GO = {"distance_m": 2.0, "mode": "slow"}
@@ -120,6 +122,7 @@ def test_S01_what_another_client_has_locked_gets_no_goal(stand: Stand, base: Ros
         assert base.goals == []
 
 
+@pytest.mark.real_clock
 def test_an_action_that_moves_nothing_needs_no_lock_and_has_no_stop(stand: Stand, base: RosBase) -> None:
     stand.up(FROM + 'effect = "note"\n')
     assert drives(stand)(**GO).driven_m == 2.0

@@ -13,6 +13,8 @@ from trade.errors import AccessDenied
 from trade_drivers.testing import FakeGripper
 from trade_gateway.ros._graph import RosRefused
 
+pytestmark = pytest.mark.virtual_time
+
 TRIGGERS = '[[to_ros.service]]\ngroup = "rosie"\ntype = "std_srvs/srv/Trigger"\n'
 SWITCHES = '[[to_ros.service]]\ngroup = "rosie.head"\ntype = "std_srvs/srv/SetBool"\n'
 LOCKS = '[[to_ros.lock]]\ngroup = "rosie.head"\n'

@@ -9,6 +9,8 @@ from tests.support.waiting import wait_until
 from tests.unit.ros.robots import PATIENCE_S, Stand
 from trade import where
 
+pytestmark = pytest.mark.virtual_time
+
 FLOAT = "std_msgs/msg/Float64"
 COMMAND = '[[to_ros.command]]\ntopic = "/head"\ntype = "std_msgs/msg/Float64"\nservice = "rosie.head.go"\n'
 LONG = COMMAND + "deadman_s = 10\n"

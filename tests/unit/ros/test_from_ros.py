@@ -17,6 +17,8 @@ from trade_gateway.recording._sources import Sources, Wanted
 from trade_gateway.ros._goals import ACTION
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
 
+pytestmark = pytest.mark.virtual_time
+
 TRIGGER = "std_srvs/srv/Trigger"
 PART = '[[from_ros.service]]\nservice = "/lab/door"\ntype = "std_srvs/srv/SetBool"\ngroups = ["lab"]\n'
 DOOR = PART + 'effect = "actuate"\nstop = "/lab/stop"\n'
@@ -111,7 +113,6 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
     assert stand.container.locks() == []
 
 
-@pytest.mark.realtime
 def test_an_unanswered_ros_service_raises_ros_unreachable_before_the_deadline(stand: Stand) -> None:
     """By default the bridge waits as long as a call lasts."""
     lab = Lab(stand)

@@ -12,6 +12,8 @@ from trade import Handle, where
 from trade.errors import MotionStopped, TradeError
 from trade_gateway.ros._graph import RosUnreachable
 
+pytestmark = pytest.mark.virtual_time
+
 TRIGGERS = '[[to_ros.service]]\ngroup = "rosie"\ntype = "std_srvs/srv/Trigger"\n'
 SPIN, STOP = "/rosie/head/spin", "/rosie/head/stop"
 TWIST = "geometry_msgs/msg/Twist"
@@ -62,7 +64,6 @@ def test_a_topic_is_no_way_to_a_stop(stand: Stand) -> None:
     wait_until(lambda: any("Use [[to_ros.service]]" in line for line in stand.said))
 
 
-@pytest.mark.realtime
 def test_S14_while_ros_is_lost_stops_stay_pending_and_its_devices_count_as_moving(stand: Stand) -> None:
     bridge = stand.up(DRIVE)
     heard: list[Any] = []

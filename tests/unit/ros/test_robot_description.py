@@ -14,6 +14,8 @@ from trade.errors import ConfigurationError
 from trade_drivers.testing import FakeGripper
 from trade_gateway.ros._urdf import read_urdf
 
+pytestmark = pytest.mark.virtual_time
+
 URDF = """<?xml version="1.0"?>
 <!-- an arm with a camera and a gripper -->
 <robot name="arm">

@@ -10,6 +10,8 @@ from trade_gateway.ros._connect import join, planned
 from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._file import read_ros_file
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "ros.toml"
 HEAD = "[ros]\nversion = 2\n"
 SERVICE = '[[to_ros.service]]\ntype = "std_srvs/srv/Trigger"\n'

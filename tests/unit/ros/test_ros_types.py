@@ -10,6 +10,8 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._connect import planned
 from trade_gateway.ros._types import Types, installed_definitions
 
+pytestmark = pytest.mark.virtual_time
+
 NAVIGATE = "geometry_msgs/PoseStamped pose\nstring behavior_tree\n---\nnav_lab/Verdict verdict\n---\nfloat32 left_m\n"
 ENTRY = '[[from_ros.action]]\naction = "/go"\ntype = "nav_lab/action/Go"\ngroups = ["base"]\n'
 

@@ -10,6 +10,8 @@ from tests.unit.ros.arms import FakeJoints
 from tests.unit.ros.robots import Stand
 from trade_drivers.testing import FakeGripper
 
+pytestmark = pytest.mark.virtual_time
+
 ANGLE = (
     '[[to_ros.stream]]\nservice = "rosie.head.angle_rad"\ntopic = "/head"\ntype = "std_msgs/msg/Float64"\nhz = 100\n'
 )

@@ -15,6 +15,8 @@ from trade.errors import DeviceFault, ToleranceExceeded
 from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused
 
+pytestmark = pytest.mark.virtual_time
+
 ACTION = "control_msgs/action/FollowJointTrajectory"
 ARM = '[[to_ros.trajectory]]\ngroup = "rosie.arm"\naction = "/arm/follow"\n'
 
@@ -280,7 +282,6 @@ def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Limb) -> None:
     wait_until(lambda: stand.container.locks() == [])
 
 
-@pytest.mark.realtime
 def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     person = stand.memory.container("person")

@@ -8,6 +8,8 @@ import pytest
 
 from trade._discovery.grace_period import GracePeriods
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def reported() -> "queue.SimpleQueue[str]":

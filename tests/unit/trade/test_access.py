@@ -21,6 +21,8 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.virtual_time
+
 __all__ = ["memory", "policy"]
 
 Member = Callable[[str], Container]

@@ -25,6 +25,8 @@ from trade._security.zenoh_acl import acl
 from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 
+pytestmark = pytest.mark.virtual_time
+
 POLICY: Final = """
 revoked = ["thief"]
 
@@ -187,12 +189,14 @@ PUTS: Final = {
 }
 
 
+@pytest.mark.real_clock
 @pytest.mark.parametrize(("actor", "receiver", "key", "passes"), PUTS.values(), ids=list(PUTS))
 def test_the_rules_pass_what_the_policy_allows(star: Star, actor: str, receiver: str, key: str, passes: bool) -> None:
     fresh = key.replace("/e1", f"/e{next(star.numbers)}")  # what comes twice may still wait from the test before
     assert bool(star.put(actor, receiver, fresh)) is passes
 
 
+@pytest.mark.real_clock
 def test_a_session_declares_only_its_own_liveliness(star: Star) -> None:
     signs: queue.SimpleQueue[str] = queue.SimpleQueue()
     reader, forger = star.sessions["planner"].liveliness(), star.sessions["mallory"].liveliness()
@@ -328,6 +332,7 @@ def test_without_certificates_only_what_crosses_is_looked_at() -> None:
     assert keys_of(rules, "* eth0", "reply", "egress") == {"registry/*/*/*/*/*"}
 
 
+@pytest.mark.real_clock
 def test_calls_sent_at_once_all_pass_and_follow_behind_stops(star: Star) -> None:
     heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
     hear = zenoh.handlers.Callback(
@@ -346,6 +351,7 @@ def test_calls_sent_at_once_all_pass_and_follow_behind_stops(star: Star) -> None
         one.undeclare()
 
 
+@pytest.mark.real_clock
 def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Path) -> None:
     rules = acl(policy, namespace=SYSTEM, subject="usernames", calls_hz=10)
     with contextlib.ExitStack() as stack:

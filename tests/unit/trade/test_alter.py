@@ -14,6 +14,8 @@ from trade import Container, Handle, service, where
 from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, encode_message
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 
 

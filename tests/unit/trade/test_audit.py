@@ -14,6 +14,8 @@ from trade._services.local_service import LocalService
 from trade.auditing import AuditRow, verify
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument, LockedByOther, LockLost, Stopped
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 Start = Callable[..., Container]
 

@@ -17,7 +17,7 @@ from trade._audit.hash_chain import AuditRow, ChainCheck, verify
 from trade._audit.store import AuditStore, Keep, moved_aside_in, reading
 from trade._audit.writer import AuditWriter
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 Eventually = Callable[[Callable[[], bool]], bool]
 KEEP = Keep(90, 1_000_000)
@@ -186,6 +186,7 @@ def test_a_writer_closed_while_another_process_holds_its_file_ends(
     assert [row.what for row in rows(path)] == ["began"]
 
 
+@pytest.mark.realtime
 def test_a_disk_that_is_full_indeed_loses_what_does_not_fit_and_breaks_nothing(path: Path) -> None:
     program = f"""
 import resource, logging
@@ -217,6 +218,7 @@ writer.close()
     assert moved_aside_in(path.parent) == []
 
 
+@pytest.mark.realtime
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to mount a disk")
 def test_a_disk_without_space_and_a_disk_that_is_read_only(write: Write, path: Path, eventually: Eventually) -> None:
     path.parent.mkdir(parents=True)
@@ -343,6 +345,7 @@ def test_a_clock_that_jumped_far_drops_nothing_for_its_age(
 # --- its end
 
 
+@pytest.mark.realtime
 def test_killed_at_any_step_it_leaves_a_record_that_verifies(path: Path) -> None:
     """The writer is ended by the kernel before and after each thing that it asks of the database."""
     program = f"""
@@ -407,6 +410,7 @@ print(steps, verdict.head.seq)
     assert rows > steps  # most of those that were ended had added something
 
 
+@pytest.mark.realtime
 def test_its_process_killed_under_load_leaves_a_record_that_verifies_and_can_be_added_to(path: Path) -> None:
     program = f"""
 import trade._audit.writer as writing

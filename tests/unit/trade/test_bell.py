@@ -7,6 +7,8 @@ import pytest
 
 from trade._threads.condition import InterruptibleCondition
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_notify_all_wakes_all_waiting_threads() -> None:
     bell, rung, woken = InterruptibleCondition(), threading.Event(), threading.Semaphore(0)

@@ -14,6 +14,8 @@ from trade._protocol.keys import Address
 from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_call, encode_message
 from trade._transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 
+pytestmark = pytest.mark.virtual_time
+
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")
 SECOND_NS = 10**9

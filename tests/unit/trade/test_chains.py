@@ -11,6 +11,8 @@ from tests.support.waiting import wait_until
 from trade import Container, Handle, current_call, service, where
 from trade.errors import Cancelled, OutcomeUnknown
 
+pytestmark = pytest.mark.virtual_time
+
 
 def found(container: Container, name: str) -> Handle:
     return container.find(where(name=name, group="robot"), wait_s=20)
@@ -134,7 +136,6 @@ def test_an_asynchronous_service_commands_nothing_after_it_was_cancelled(
     assert (leaf.begun, type(outer.outcomes[0])) == (1, Cancelled)
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("leaf", ["elsewhere"], indirect=True)
 def test_the_deadline_calls_what_ends_a_call_that_does_not_end_by_itself(
     here: Container, outer: Outer, leaf: Leaf

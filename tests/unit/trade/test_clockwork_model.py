@@ -13,6 +13,8 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.trade.lock_table_rig import Now
 from trade._threads.scheduler import MOST_THREADS, ScheduledTask, Scheduler
 
+pytestmark = pytest.mark.virtual_time
+
 HOUR_NS = 3_600_000_000_000
 """So far apart is all that is due: no wait of a thread ends by itself while a test runs."""
 

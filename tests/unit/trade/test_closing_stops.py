@@ -11,6 +11,8 @@ from tests.support.waiting import wait_until
 from trade import Container, service, where
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lift:
     """Its stop takes a while, and longer than it takes a container to begin to close."""

@@ -19,6 +19,8 @@ from trade._services.decorator import ServiceMark
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.virtual_time
+
 _PLAIN = ServiceInfo(name="move", signature="move()")
 _CODEC = Codec(lambda value: value, lambda code, data: data)
 

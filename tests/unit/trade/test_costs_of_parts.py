@@ -39,6 +39,8 @@ from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.sharing import Border
 from trade.testing import Kind, MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 TIMES = 20
 LONG_S = 60.0
 """A lease that needs no renewal while a test runs."""

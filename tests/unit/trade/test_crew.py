@@ -10,6 +10,8 @@ import pytest
 from trade._threads.channel_workers import MOST_THREADS, WorkerPool
 from trade._transport.base import Channel, ChannelClosed, Message
 
+pytestmark = pytest.mark.virtual_time
+
 CALL = Message("call/a/b", b"")
 
 

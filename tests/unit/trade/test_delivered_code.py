@@ -14,6 +14,8 @@ from trade._migration.delivered_code import CodeStore, hash_of, pack
 from trade._transport.memory import MemoryTransport, Network
 from trade.errors import AccessDenied, CodeRefused, ConfigurationError, NoSuchClass
 
+pytestmark = pytest.mark.virtual_time
+
 LAMP = """
 from trade import service
 

@@ -5,6 +5,8 @@ import pytest
 from trade import Container, Handle, service, where
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lamp:
     @service(effect="read")

@@ -16,6 +16,8 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 def found(here: Container, name: str) -> Handle:
     return here.find(where(name=name, group="robot"), wait_s=20)
@@ -221,7 +223,6 @@ def test_an_async_service_that_cancels_itself_is_an_error_of_its_own(offer: Any)
         offer(Quitter())("quit")()
 
 
-@pytest.mark.realtime
 def test_closing_a_container_cancels_its_async_services(here: Container, there: Container) -> None:
     class Slow:
         def __init__(self) -> None:
@@ -322,7 +323,6 @@ class Endless:
         await asyncio.Event().wait()
 
 
-@pytest.mark.realtime
 def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """An interpreter that ends while a thread is on its way out of the transport is aborted."""
     read_again: list[str] = []

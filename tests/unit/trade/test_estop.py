@@ -23,6 +23,8 @@ from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 GENEROUS_S = 30.0
 
@@ -157,7 +159,6 @@ def test_S09_a_device_that_fails_to_stop_is_reported(system: MemorySystem) -> No
     assert not report.complete
 
 
-@pytest.mark.realtime
 def test_S09_a_device_still_moving_after_its_stop_is_reported(system: MemorySystem) -> None:
     axis = Axis("heavy.joint", stops=False)
     system.container("heavy").register(axis, "heavy")
@@ -190,7 +191,6 @@ def test_S09_an_estop_without_a_driver_is_incomplete_and_repeated_until_its_limi
     assert system.sent(Kind.DROPPABLE) >= 3
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("seed", range(3))
 def test_S09_it_is_repeated_until_it_gets_through_a_network_that_loses_most(seed: int) -> None:
     with memory_system(seed=seed) as system:
@@ -207,7 +207,6 @@ def test_S09_it_is_repeated_until_it_gets_through_a_network_that_loses_most(seed
         assert caller.estops() == []
 
 
-@pytest.mark.realtime
 def test_S09_an_unreachable_container_is_missing_and_latches_once_it_is_back(
     system: MemorySystem, eventually: Eventually
 ) -> None:

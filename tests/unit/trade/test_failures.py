@@ -15,7 +15,7 @@ from trade._protocol.messages import ErrorInfo
 from trade._protocol.remote_errors import RemoteTraceback, pack_error, unpack_error
 from trade.errors import CallerError, DeadlineExceeded, InvalidResult, LimitExceeded, RemoteError, TradeError
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 CONCRETE = [
     kind
@@ -171,6 +171,7 @@ def test_a_deadline_that_passed_inside_a_service_is_not_reported_as_its_own(here
     assert error.service == "inner"
 
 
+@pytest.mark.realtime
 def test_an_error_of_a_type_the_caller_does_not_know_says_what_it_was(start_program: Any, here: Container) -> None:
     program = start_program(
         """

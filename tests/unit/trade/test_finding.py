@@ -8,6 +8,8 @@ import pytest
 from trade import Container, service, where
 from trade.errors import NoSuchService, TooManyServices
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Arm:
     @service

@@ -14,6 +14,8 @@ from trade import Container, service, where
 from trade.errors import ConfigurationError, InvalidArgument, NoSuchService
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def me() -> Container:  # type: ignore[misc]
@@ -96,6 +98,7 @@ def test_a_script_serves_until_it_is_ended(
     wait_until(lambda: not me.services("sums"))
 
 
+@pytest.mark.real_clock
 def test_serving_ends_when_the_container_is_closed_elsewhere(system: str) -> None:
     running = trade.container()
     serving = threading.Thread(target=trade.serve)

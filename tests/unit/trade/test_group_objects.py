@@ -13,6 +13,8 @@ from trade import Container, GroupView, Handle, service, where
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Head:
     def __init__(self) -> None:

@@ -12,6 +12,8 @@ from tests.support.waiting import wait_until
 from trade import Container, Handle, HookEvent, errors, service, where
 from trade.errors import CallRefused, Cancelled, ConfigurationError, MotionStopped
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Arm:
     resources = ("arm",)

@@ -12,6 +12,8 @@ from trade._protocol.keys import ServiceKey
 from trade._registry import registry
 from trade.errors import ConfigurationError, ServiceGone
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Counter:
     def __init__(self) -> None:
@@ -83,6 +85,7 @@ def test_waiting_for_a_started_call_may_be_given_up_without_ending_it(offer: Any
     assert run.result(20) == "through"
 
 
+@pytest.mark.real_clock
 def test_a_started_call_is_cancelled_by_the_service_named_for_that(offer: Any) -> None:
     import threading
 
@@ -223,6 +226,7 @@ def test_a_handle_reaches_a_third_container_and_works_there(start_container: Any
     assert found(here, "use")(found(here, "value", group="counted")) == 0
 
 
+@pytest.mark.real_clock
 def test_a_handle_works_before_its_registry_entry_came(
     here: Container, there: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:

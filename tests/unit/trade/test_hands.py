@@ -10,6 +10,8 @@ from trade import Container, HookEvent, service, where
 from trade._threads import thread_pool
 from trade._threads.thread_pool import ThreadPool
 
+pytestmark = pytest.mark.virtual_time
+
 NUMBER: contextvars.ContextVar[int] = contextvars.ContextVar("NUMBER", default=0)
 Eventually = Callable[[Callable[[], bool]], bool]
 

@@ -18,6 +18,8 @@ from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Planner:
     def __init__(self) -> None:
@@ -399,7 +401,6 @@ def test_a_slow_hook_in_the_same_container_is_cut_off_too(here: Container, obser
     assert hook.infos()[0].failures == 1
 
 
-@pytest.mark.realtime
 @pytest.mark.usefixtures("usual_limit")
 def test_what_is_too_late_after_its_hooks_does_not_run(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer
@@ -433,7 +434,6 @@ def test_the_gates_are_checked_after_the_hooks(
     grabber.lock.release()
 
 
-@pytest.mark.realtime
 @pytest.mark.usefixtures("usual_limit")
 def test_nothing_comes_before_a_stop_and_what_comes_after_does_not_hold_it_up(
     here: Container, plan: Handle, planner: Planner, watch: Callable[[str], Handle], observer: Observer

@@ -10,6 +10,8 @@ import pytest
 from trade import Container, Handle, current_call, service, where
 from trade.errors import DeadlineExceeded
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Relay:
     """Calls on, at once or when it is too late."""
@@ -76,7 +78,6 @@ def test_deadline_and_chain_go_over_two_hops(hops: Any) -> None:
     assert 0 < remaining_s <= 5
 
 
-@pytest.mark.realtime
 def test_S01_what_expired_two_hops_away_runs_nowhere(hops: Any, start_container: Callable[..., Container]) -> None:
     last = start_container("last")
     counter = Counter()

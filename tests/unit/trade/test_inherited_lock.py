@@ -10,6 +10,8 @@ from tests.support.two_joint_robot import Joint
 from trade import Container, Settings, service, where
 from trade.errors import ConfigurationError, LockedByOther, LockLost, Stopped
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 
 

@@ -14,6 +14,8 @@ from trade._telemetry import load as module
 from trade._telemetry.load import LoadMeter
 from trade._threads.channel_workers import WorkerPool
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Clerk:
     def __init__(self, gate: Any) -> None:
@@ -102,6 +104,7 @@ def test_load_readings_less_than_a_second_apart_cover_a_longer_period() -> None:
     assert reported == [0.5, 2.5, 3.0, 1.0, 1.0]
 
 
+@pytest.mark.real_clock
 def test_a_figure_that_the_operating_system_does_not_have_is_none(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -11,6 +11,8 @@ from trade import Handle, service, where
 from trade._locks import api
 from trade.errors import IncompleteGroup, LockLost, NotLocked
 
+pytestmark = pytest.mark.virtual_time
+
 A, B, C = (where(group=f"robot.{name}") for name in "abc")
 
 

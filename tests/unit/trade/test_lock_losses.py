@@ -20,7 +20,7 @@ from trade.errors import (
     Stopped,
 )
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 # --- S12 and S14: loss
 

@@ -24,6 +24,8 @@ from trade.errors import (
 )
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_S13_services_of_several_containers_are_locked_together_or_not_at_all(robot: Robot) -> None:
     with robot.me.lock(WHOLE, purpose="walk") as lock:
@@ -136,7 +138,6 @@ def test_async_with_and_its_tasks(robot: Robot) -> None:
     assert asyncio.run(main()) == [0.1, 0.2]
 
 
-@pytest.mark.realtime
 def test_a_cancelled_async_with_leaves_nothing_locked(robot: Robot) -> None:
     async def main() -> None:
         async with robot.me.lock(WHOLE, wait_s=30):
@@ -373,7 +374,6 @@ def walker(robot: Robot) -> Callable[[str], Handle]:
     return lambda name: robot.me.find(where(name=name, group="walker"), wait_s=20).with_(deadline_s=1.5)
 
 
-@pytest.mark.realtime
 def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
@@ -384,7 +384,6 @@ def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     assert robot.me.locks() == []
 
 
-@pytest.mark.realtime
 def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) -> None:
     """As containers in other languages do, whose wait may be the deadline of the call."""
     acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
@@ -392,7 +391,6 @@ def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) 
         robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], LockRequest(wait_s=1.5))
 
 
-@pytest.mark.realtime
 def test_a_service_that_waits_in_vain_fails_before_the_deadline_of_its_call(
     walker: Callable[[str], Handle],
 ) -> None:

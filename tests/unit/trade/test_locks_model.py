@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Iterable
 
 import hypothesis
+import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -14,6 +15,8 @@ from trade._protocol.messages import Token
 from trade._resources.grants import Granted
 from trade._resources.resource import Permit
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped
+
+pytestmark = pytest.mark.virtual_time
 
 
 class Model(RuleBasedStateMachine):

@@ -9,6 +9,8 @@ import pytest
 from trade import Container, LogReader, current_call, service, where
 from trade._telemetry.log_buffer import Logbook
 
+pytestmark = pytest.mark.virtual_time
+
 _log = logging.getLogger("trade")
 
 BABBLES = """

@@ -21,6 +21,8 @@ from trade.errors import (
 )
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 MODULE = """
 import subprocess
 from subprocess import Popen

@@ -11,6 +11,8 @@ import trade
 from trade import Bound, Container, Outcome, service, where
 from trade.errors import InvalidArgument, NoSuchService, NotSerialisable, ServiceGone, TooManyServices
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lamp:
     def __init__(self, level: int = 0) -> None:
@@ -50,7 +52,6 @@ def test_a_constraint_is_called_like_the_one_service_it_means(here: Container, o
     assert here.call(where(name="set_level"), level=6) == 6
 
 
-@pytest.mark.realtime
 def test_a_constraint_that_means_none_or_several_is_not_called(here: Container) -> None:
     lamps = [Lamp(), Lamp()]
     for lamp in lamps:
@@ -63,6 +64,7 @@ def test_a_constraint_that_means_none_or_several_is_not_called(here: Container) 
         here.call(where(name="set_level"), 1)
 
 
+@pytest.mark.real_clock
 def test_all_are_called_at_once(here: Container, there: Container) -> None:
     meeting = Meeting(4)
     for container, name in ((here, "a"), (there, "b")):

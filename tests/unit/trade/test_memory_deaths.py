@@ -15,6 +15,8 @@ from trade._transport.memory import InFlightMessage
 from trade.errors import ConfigurationError, ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 # --- deaths, at every message
 
 

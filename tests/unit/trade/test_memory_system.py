@@ -20,6 +20,8 @@ from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import ContainerLost, ServiceGone
 from trade.testing import Kind, MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 
 
@@ -79,6 +81,7 @@ def test_over_slow_links_started_calls_can_be_driven_to_their_end() -> None:
         assert system.clock.monotonic_ns() == 4 * 3600 * 10**9
 
 
+@pytest.mark.real_clock
 def test_the_page_on_testing_does_what_it_says() -> None:
     page = Path(__file__).parents[3] / "docs" / "testing.md"
     known: dict[str, Any] = {"pytest": pytest, "errors": errors}

@@ -11,6 +11,8 @@ from trade import HookEvent, service, where
 from trade._migration import source as _departing
 from trade.errors import ConfigurationError, LockedByOther, NoSuchService, ServiceGone, TooManyServices
 
+pytestmark = pytest.mark.virtual_time
+
 
 def test_a_migrated_provider_keeps_its_state_its_groups_and_its_meta(scene: Scene) -> None:
     count, _ = scene.counter("hall", "hall.door", meta={"floor": 2})

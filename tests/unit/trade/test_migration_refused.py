@@ -29,6 +29,8 @@ from trade.errors import (
     TradeError,
 )
 
+pytestmark = pytest.mark.virtual_time
+
 
 def refused(scene: Scene, which: Handle, to: str = "new", **options: Any) -> BaseException:
     """Have it moved in vain; whatever was made there is closed, and nothing is left of it."""
@@ -88,7 +90,6 @@ def test_a_stop_that_holds_is_not_forgotten_by_moving(scene: Scene) -> None:
     assert scene.asker.migrate(services["turn"], to="new")
 
 
-@pytest.mark.realtime
 def test_nothing_migrates_during_an_e_stop(scene: Scene) -> None:
     count, _ = scene.counter()
     scene.asker.estop("smoke")

@@ -9,6 +9,8 @@ from trade._notifications.triggers import TriggerSpec
 from trade._timestamps import clock, day_and_clock
 from trade.errors import ConfigurationError, LockedByOther
 
+pytestmark = pytest.mark.virtual_time
+
 NO_MOMENTS = [1e300, -1e300, math.inf, -math.inf, math.nan]
 
 

@@ -12,6 +12,8 @@ from trade import Container, Handle, Resource, service
 from trade.errors import LockedByOther, LockLost, OutcomeUnknown
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 LONG_S = 600.0
 
 
@@ -72,6 +74,7 @@ def test_every_runs_once_for_each_period(system: MemorySystem, me: Container, ax
     assert noted.info().merged == 0
 
 
+@pytest.mark.real_clock
 def test_after_and_at_run_once_when_their_time_comes(
     system: MemorySystem, me: Container, axis: Axis, look: Handle
 ) -> None:
@@ -152,7 +155,6 @@ def test_a_lock_whose_owner_lives_is_renewed_all_the_time(system: MemorySystem, 
         assert [info.resources for info in me.locks()] == [("axis",)]
 
 
-@pytest.mark.realtime
 def test_S12_a_lease_ends_on_both_sides_when_it_cannot_be_renewed() -> None:
     with memory_system(lease_s=LONG_S) as system:  # the link is slower to notice
         system.container("robot").register(Axis(), "axis")

@@ -9,6 +9,8 @@ from tests.support.waiting import wait_until
 from trade import Container, Handle, service, where
 from trade.errors import ConfigurationError, ServiceGone
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lamp:
     @service

@@ -1,11 +1,14 @@
 """The middleware's own functions are part of the protocol: what they answer does not depend on who describes them."""
 
+import pytest
 from msgspec import structs
 
 from tests.support.waiting import wait_until
 from trade import Container, Resource, service, where
 from trade._protocol.messages import NO_SCHEMA, ProviderInfo
 from trade.testing import memory_system
+
+pytestmark = pytest.mark.virtual_time
 
 
 class Joint:

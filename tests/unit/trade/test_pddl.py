@@ -14,6 +14,8 @@ from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Record
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Arm:
     @service(needs=["see(?thing)", "at(?place)"], achieves=["holding(?thing)", "not(empty)"])

@@ -15,6 +15,8 @@ from trade._calls import picking
 from trade.errors import Busy, ConfigurationError, LockedByOther, NoSuchService, ServiceGone, TooManyServices
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.virtual_time
+
 NAMES = ("one", "two", "three")
 
 

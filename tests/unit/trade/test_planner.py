@@ -14,6 +14,8 @@ from trade import Container, errors, service
 from trade._transport.endpoints import free_endpoint
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Spot(Struct, frozen=True):
     x_m: float
@@ -270,6 +272,7 @@ def nothing_waits(container: Container) -> bool:
     return not container.reach.discovers and container.notifications() == []
 
 
+@pytest.mark.real_clock
 def test_a_missing_service_is_discovered_and_discovery_is_off_again(start_container: Any, robot: Robot) -> None:
     mind, eyes = apart(start_container, "mind"), apart(start_container, "eyes")
     mind.register(Arm(robot), "rosie.arm")
@@ -280,6 +283,7 @@ def test_a_missing_service_is_discovered_and_discovery_is_off_again(start_contai
     assert nothing_waits(mind)
 
 
+@pytest.mark.real_clock
 def test_discovery_is_off_again_after_a_search_in_vain_and_nothing_was_called(
     start_container: Any, robot: Robot
 ) -> None:
@@ -291,6 +295,7 @@ def test_discovery_is_off_again_after_a_search_in_vain_and_nothing_was_called(
     assert nothing_waits(mind)
 
 
+@pytest.mark.real_clock
 def test_a_service_that_joins_and_does_not_help_leaves_the_planner_searching(
     start_container: Any, robot: Robot
 ) -> None:

@@ -12,6 +12,8 @@ from trade._security.policy import VERBS, Policy, Role
 from trade._security.policy_file import read_policy
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.virtual_time
+
 POLICY = """
 revoked = ["mallory"]
 

@@ -12,7 +12,7 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.virtual_time
 
 __all__ = ["memory", "policy"]
 

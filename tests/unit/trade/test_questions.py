@@ -9,6 +9,8 @@ import pytest
 from trade import Container, Handle, Meta, service, where
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Eyes:
     @service(effect="read", achieves=["see(cup)"])

@@ -10,11 +10,14 @@ import pytest
 from trade import Container, Settings, service, where
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.virtual_time
+
 
 def read(**settings: Any) -> Settings:
     return Settings.read(environment={}, **settings)
 
 
+@pytest.mark.real_clock
 def test_S21_with_default_settings_a_container_listens_on_loopback_only(here: Container) -> None:
     listening = {
         connection.laddr.ip
@@ -69,6 +72,7 @@ def test_a_bridge_to_nowhere_is_refused(bridge: list[str]) -> None:
     assert read(bridge=bridge, connect=["tcp/127.0.0.1:7450"]).bridge == tuple(bridge)
 
 
+@pytest.mark.real_clock
 def test_a_bridge_of_an_interface_that_is_not_there_is_refused_and_leaves_nothing(system: str) -> None:
     with pytest.raises(ConfigurationError, match="bridge nosuch0: this host has no such interface, or not yet; it has"):
         Container(Settings.read(bridge=["nosuch0", "nosuch1"]))
@@ -165,6 +169,7 @@ def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
         assert client.find(where(name="echo"), wait_s=20)(3) == 3
 
 
+@pytest.mark.real_clock
 def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container, system: str) -> None:
     taken = next(
         connection.laddr.port
@@ -177,6 +182,7 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
         Container(Settings.read(container="second", listen=[f"tcp/127.0.0.1:{taken}"]))
 
 
+@pytest.mark.real_clock
 @pytest.mark.parametrize("listen", [[], ["tcp/127.0.0.1:0"]])
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch, listen: list[str]

@@ -13,6 +13,8 @@ from trade._discovery.host_folder import HostFolder
 from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def folder(system: str, tmp_path: Path) -> Path:
@@ -36,6 +38,7 @@ def test_a_container_writes_its_endpoint_and_removes_it(system: str, folder: Pat
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.real_clock
 def test_a_new_container_finds_those_that_listen(system: str, folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
@@ -106,6 +109,7 @@ def test_where_it_is_not_known_whether_the_writer_lives_the_file_counts_as_young
     assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
+@pytest.mark.real_clock
 def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, folder: Path) -> None:
     if not socket.has_ipv6:
         pytest.skip("this host has no IPv6")
@@ -129,6 +133,7 @@ def test_foreign_files_in_the_folder_disturb_nothing(system: str, folder: Path) 
     assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
 
 
+@pytest.mark.real_clock
 def test_a_container_takes_its_files_away(here: Container, folder: Path) -> None:
     assert sorted(re.split("[-_]", path.name)[0] for path in folder.iterdir()) == [".calls", "tcp"]
     here.close()
@@ -139,6 +144,7 @@ def test_the_folder_is_the_users_own(folder: Path) -> None:
     assert folder.stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.real_clock
 def test_a_folder_that_others_may_write_is_refused(system: str, tmp_path: Path) -> None:
     shared = tmp_path / "runtime" / "trade"
     shared.mkdir(parents=True)
@@ -147,6 +153,7 @@ def test_a_folder_that_others_may_write_is_refused(system: str, tmp_path: Path) 
         Container()
 
 
+@pytest.mark.real_clock
 def test_a_folder_that_is_a_link_is_refused(system: str, tmp_path: Path) -> None:
     (tmp_path / "runtime").mkdir()
     (tmp_path / "elsewhere").mkdir(mode=0o700)

@@ -20,6 +20,8 @@ from trade._protocol.messages import ServiceInfo
 from trade._protocol.schema import schema_message
 from trade._protocol.schema_types import type_from_schema
 
+pytestmark = pytest.mark.virtual_time
+
 PROGRAM = """
 import datetime, enum
 from dataclasses import dataclass
@@ -144,6 +146,7 @@ def schema(properties: dict[str, Any]) -> dict[str, Any]:
     return {"$ref": "#/$defs/Pose", "$defs": {"Pose": pose}}
 
 
+@pytest.mark.real_clock
 def test_a_type_the_caller_has_is_used() -> None:
     assert type_from_schema(schema({"x_m": {"type": "number"}}), {"Pose": PATH}) is Pose
 

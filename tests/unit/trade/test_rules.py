@@ -15,6 +15,8 @@ from trade.errors import AccessDenied, ConfigurationError
 from trade.rules import Rules, read_rules, rehearse
 from trade.rules import _engine as rules_module
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ from trade.rules import _engine as rules_module
 from trade.rules import _steps as causes
 from trade.rules._steps import LoopDetector, Mark, turns
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:

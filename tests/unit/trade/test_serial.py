@@ -11,6 +11,8 @@ from trade._stop_line.listener import Listener
 from trade._threads import fork_guard
 from trade.errors import Busy, Cancelled, ConfigurationError, DeadlineExceeded
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Bench:
     def __init__(self) -> None:
@@ -127,6 +129,7 @@ def test_local_and_remote_callers_share_one_queue(
     assert bench.most == 1
 
 
+@pytest.mark.real_clock
 def test_a_queued_call_that_is_cancelled_is_dropped_at_once(offer: Any, bench: Bench, eventually: Any) -> None:
     work = offer(bench)("work")
     first, second = work.start(0), None
@@ -171,6 +174,7 @@ def test_a_stop_cannot_be_serial() -> None:
         service(effect="stop", serial=True)
 
 
+@pytest.mark.real_clock
 def test_what_waits_when_its_container_closes_never_runs(
     here: Container, there: Container, bench: Bench, eventually: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,8 @@ import pytest
 from trade import Container, Resource, service, where
 from trade.errors import ConfigurationError, LockedByOther
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lamp:
     @service

@@ -12,6 +12,8 @@ from trade._resources.resource import Resource, admit
 from trade.errors import ConfigurationError, LockedByOther, LockLost, SessionEnded, Stopped
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def system() -> Iterator[MemorySystem]:

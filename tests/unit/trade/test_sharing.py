@@ -27,6 +27,8 @@ from trade.errors import (
 from trade.sharing import Border
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Point(Struct):
     x: float
@@ -358,7 +360,6 @@ def test_a_client_waiting_in_another_system_gets_the_lock_when_it_is_released_at
     lock.release()
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("how", ["broken at home", "broken there", "owner dies", "border dies"])
 def test_a_lock_that_is_lost_on_one_side_is_lost_on_both_and_what_it_moves_stops(two: Two, how: str) -> None:
     lost = threading.Event()

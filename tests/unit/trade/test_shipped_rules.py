@@ -17,6 +17,8 @@ from trade.errors import NoSuchService, ServiceGone
 from trade.rules import Firing, Rules, read_rules, rehearse
 from trade.rules import _engine as rules_module
 
+pytestmark = pytest.mark.virtual_time
+
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SHIPPED, CARE = EXAMPLES / "rules.toml", EXAMPLES / "care.toml"
 StartContainer = Callable[..., Container]

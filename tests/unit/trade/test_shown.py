@@ -11,6 +11,8 @@ from tests.support.waiting import wait_until
 from trade import Container, Table, service
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Head:
     @service

@@ -9,6 +9,8 @@ from msgspec import Struct
 
 from trade import Container, Handle, Meta, service, where
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Pose(Struct):
     x_m: float

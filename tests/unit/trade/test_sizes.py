@@ -8,6 +8,8 @@ from trade import Container, service, where
 from trade._protocol.messages import MOST_BYTES
 from trade.errors import TooLarge
 
+pytestmark = pytest.mark.virtual_time
+
 MIB = 1 << 20
 
 

@@ -17,6 +17,8 @@ from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Kitchen:
     """Does what a cook asks for, one thing after the other."""
@@ -74,6 +76,7 @@ def link(asking: Container, container: str, to: str) -> LinkInfo | None:
 # --- links
 
 
+@pytest.mark.real_clock
 def test_a_link_says_to_whom_it_leads_since_when_and_how_many_calls_were_answered(
     here: Container, there: Container
 ) -> None:
@@ -115,6 +118,7 @@ def test_a_link_that_is_cut_disappears_and_others_are_notified_of_its_end(
 # --- endpoints, switches, certificates
 
 
+@pytest.mark.real_clock
 def test_the_network_of_a_container_says_what_is_listened_on_dialled_searched_and_answered(
     start_container: Callable[..., Container], diary: Diary
 ) -> None:
@@ -144,6 +148,7 @@ def test_the_network_of_a_container_says_what_is_listened_on_dialled_searched_an
     assert [event.text for event in asked(other, "state_events", "one") if event.about == "one"] == ["on", "on", "off"]
 
 
+@pytest.mark.real_clock
 def test_a_certificate_is_reported_with_its_end_and_without_its_key(
     start_container: Callable[..., Container], tmp_path: Path
 ) -> None:
@@ -155,6 +160,7 @@ def test_a_certificate_is_reported_with_its_end_and_without_its_key(
     assert str(folder) not in repr(reach)
 
 
+@pytest.mark.real_clock
 def test_a_certificate_that_ends_soon_is_an_event(start_container: Callable[..., Container], tmp_path: Path) -> None:
     arm = start_container("arm", tls=Papers(tmp_path / "pki").of("arm", lasts=timedelta(hours=12)))
     assert [(one.kind, one.about) for one in asked(arm, "state_events", "arm")] == [("certificate_ends", "arm")]

@@ -9,6 +9,8 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade import errors, service, where
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Sick:
     def __init__(self) -> None:

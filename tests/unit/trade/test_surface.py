@@ -10,6 +10,8 @@ import pytest
 import trade
 from tests.docs.blocks import DOCS
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.mark.parametrize("name", trade.__all__)
 def test_every_public_name_exists_and_is_documented(name: str) -> None:

@@ -14,6 +14,8 @@ from trade import Container, Handle, service, where
 from trade.errors import ConfigurationError, LockLost, NoSuchService, TooManyServices
 from trade.testing import memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Joint:
     def __init__(self) -> None:

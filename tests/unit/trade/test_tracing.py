@@ -16,6 +16,8 @@ from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 
 
@@ -236,6 +238,7 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
     assert served["q.follow"].waited_s >= waited_s
 
 
+@pytest.mark.real_clock
 def test_what_is_secret_is_in_no_trace(here: Container, there: Container, arm: Arm) -> None:
     here.set_tracing(True)
     assert here.call(where(name="login"), "swordfish") == "swordfish"

@@ -16,6 +16,8 @@ from trade import Container, Handle, service, where
 from trade._protocol.messages import NO_SCHEMA, Parameter, ServiceInfo
 from trade._protocol.schema import fits, schema_message
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Point(Struct):
     x_m: float

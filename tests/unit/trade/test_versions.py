@@ -26,6 +26,8 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import NoSuchService, Stopped
 from trade.testing import MemorySystem, memory_system
 
+pytestmark = pytest.mark.virtual_time
+
 Eventually = Callable[[Callable[[], bool]], bool]
 OTHER: Final = PROTOCOL + 1
 GENEROUS_S: Final = 30.0
