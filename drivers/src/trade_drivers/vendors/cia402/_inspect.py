@@ -136,6 +136,7 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
         raise Unfit("it has no profile position mode (6502h)")
     low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
     high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
+    axis.own_range = (low, high) if low < high else None
     if low < high and (axis.low < low or axis.high > high):
         ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         joint = axis.joint
