@@ -137,7 +137,9 @@ BUSES: Final = (
     Bus("feetech", 100, _SERVOS + _joints('model = "STS3215"'), ("sync_read",)),
     Bus("cia402", 200, _CAN + _joints('model = "ACME-EC60"\ncounts_per_rev = 4096\ngear = 50'), ("sync",)),
     Bus("damiao", 200, _CAN + _joints('model = "DM4310"'), ("refresh",), 1),
-    Bus("odrive", 200, _CAN + _joints('model = "ODrive S1"\ngear = 8'), ("ask_get_encoder_estimates",), 1),
+    Bus(
+        "odrive", 200, _CAN + _joints('model = "ODrive S1"\ngear = 8\nzero = "last"'), ("ask_get_encoder_estimates",), 1
+    ),
     Bus("robotiq", 100, _GRIPPER, ("read_input",)),
     Bus("ur", 125, _ARM, ("servo_j",)),
 )

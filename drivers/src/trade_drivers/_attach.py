@@ -13,6 +13,7 @@ from trade import Measure
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
+from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.faults import FaultLog, FaultPoller, FaultStore
 from trade_drivers.faults._health import HEALTHY, HealthTeller
@@ -153,8 +154,9 @@ def attach(
             ``INTERFACE:CHANNEL`` of a CAN bus; camera or sensor name -> its driver's kind of port.
         healthy: called by each bus thread in each cycle; while it returns False, devices are commanded to hold once and
             the bus is silent, so that their own watchdogs stop them.
-        state_dir: the folder where faults outlive the process; by default the default container's state folder, or
-            none if ``register`` is given.
+        state_dir: the folder where faults and last known angles outlive the process; by default the default
+            container's state folder, or none if ``register`` is given. A bus with a port from ``ports`` saves no
+            angles.
 
     Raises:
         ConfigurationError: a driver is missing, a port cannot be opened, or a device is absent, another or set wrongly.
@@ -162,11 +164,16 @@ def attach(
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
         check(robot, ports)
-        faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
+        state_dir = state_dir if register is not None else state_dir or _default_state_dir()
+        faults = _fault_log(robot, state_dir, undo)
         poller = FaultPoller(faults, f"faults of {robot.name}")
         undo.callback(poller.close)  # closes after the devices, to record faults during their shutdown, too
         senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, no moving device is accessed
+        angles = _angle_store(robot, state_dir, undo)
         buses = _attach_buses(robot, ports or {}, healthy, undo)
+        for name, bus in buses.items():
+            if angles is not None and name not in (ports or {}):
+                bus.remember(angles)
         providers = _providers(robot, buses, senses)
         poller.start(providers, _unwatched(robot, buses, poller))
         for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
@@ -191,6 +198,14 @@ def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLo
     log = FaultLog(robot.name, None if path is None else FaultStore(path, _log.warning), devices=names)
     undo.callback(log.close)
     return log
+
+
+def _angle_store(robot: Robot, state_dir: Path | None, undo: ExitStack) -> AngleStore | None:
+    if state_dir is None or not robot.joints:
+        return None
+    angles = AngleStore(state_dir / "angles" / f"{robot.name}.sqlite", _log.warning)
+    undo.callback(angles.close)  # closes after the buses, to save where they left their joints, too
+    return angles
 
 
 def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], poller: FaultPoller) -> set[str]:

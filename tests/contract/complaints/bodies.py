@@ -202,10 +202,10 @@ def _cia402(_: Path, undo: ExitStack) -> Body:
     return Body(rig, ways)
 
 
-def _damiao(_: Path, undo: ExitStack) -> Body:
+def _damiao(_: Path, undo: ExitStack, *changes: tuple[str, str]) -> Body:
     rig = MOTOR_KINDS["damiao"](undo)
     before = 'watchdog_s = 0.4\nstale_after_s = 0.4\nleave = "relax"'
-    rig.configure((before, f'{_PATIENT}\nleave = "hold"'))
+    rig.configure((before, f'{_PATIENT}\nleave = "hold"'), *changes)
     ways = Ways(
         joint="tail.root",
         counts_per_rad=1000,
@@ -251,6 +251,7 @@ KINDS: dict[str, Callable[[Path, ExitStack], Any]] = {
     "feetech": _feetech,
     "cia402": _cia402,
     "damiao": _damiao,
+    "damiao of a wide range": lambda folder, undo: _damiao(folder, undo, ("max_rad = 1.0", "max_rad = 4.2")),
     "arm": _with_rtde(_arm),
     "controllers": _with_rtde(lambda _, undo: Controllers(undo)),
     "loopback": Loopback,

@@ -11,6 +11,7 @@ from trade_drivers.joints import Axis, Exchange, Ramp
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
+from trade_drivers.joints._zero import Zero
 from trade_drivers.joints.serial import ServoAxis, written
 from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 from trade_drivers.vendors.dynamixel import _table as dynamixel
@@ -104,3 +105,7 @@ def a_joint_outside_its_limits_is_refused(patch: pytest.MonkeyPatch) -> None:
 
 def a_servo_may_be_enabled_anywhere(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(ServoAxis, "outside", lambda self, position: "")
+
+
+def an_angle_after_a_loss_of_power_is_believed(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Zero, "doubt", lambda _, __: "")

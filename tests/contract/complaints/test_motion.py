@@ -9,7 +9,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from trade import where
 from trade.testing import memory_system
-from trade_hil_sim import Heal, Replug, Unplug
+from trade_hil_sim import BrownOut, Heal, Replug, Unplug
 
 pytestmark = pytest.mark.realtime
 
@@ -156,3 +156,23 @@ def test_enabling_outside_its_own_limits_moves_a_servo(body: Body) -> None:
     assert not body.events("motion_started"), f"it moved to {body.truth.position_rad:.2f} rad"
     assert refusal.startswith("DeviceFault")
     assert not body.moves()
+
+
+@complaint(
+    ("damiao of a wide range", mutants.an_angle_after_a_loss_of_power_is_believed, "it moved to 7"),
+    ("cia402", mutants.an_angle_after_a_loss_of_power_is_believed, "it moved to 1"),
+)
+def test_a_multi_turn_zero_is_lost_with_power(body: Body) -> None:
+    was_rad, zero = (3.6, "turn") if body.farthest_rad > 4 else (0.9, "lost")
+    motor = body.motor()
+    motor.move_to(was_rad)
+    body.strike(BrownOut(ids=(1,), zero=zero))
+    wait_until(
+        lambda: not outcome(motor.state) and motor.state().fault, "it is measured again, and says why it does not move"
+    )
+    outcome(motor.enable)
+    refused = outcome(lambda: motor.move_to(0.9))
+    here_rad = body.truth.position_rad
+    assert abs(here_rad - was_rad) < 0.05, f"it moved to {here_rad:.2f} rad, past the end of its range"
+    assert "in doubt" in refused
+    assert f"last known at {was_rad:.1f}" in refused

@@ -56,7 +56,7 @@ watchdog_s = 0.4
 stale_after_s = 0.4
 leave = "relax"
 """
-ODRIVE = _BUS.format(driver="odrive") + _JOINTS.format(model="ODrive S1", gear="8")
+ODRIVE = _BUS.format(driver="odrive") + _JOINTS.format(model="ODrive S1", gear='8\nzero = "last"')
 DAMIAO = _BUS.format(driver="damiao") + _JOINTS.format(model="DM4310", gear="1.0")
 
 

@@ -4,7 +4,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from math import ceil, floor
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from msgspec import Struct
 
@@ -12,6 +12,7 @@ from trade import Resource
 from trade.errors import DeviceFault, LimitExceeded
 from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._motion import MotorState
+from trade_drivers.joints._zero import Zero
 from trade_drivers.robotfile import Joint
 
 if TYPE_CHECKING:
@@ -91,6 +92,13 @@ class Scale:
 class Axis(BusDevice[Sample]):
     """The state of one joint."""
 
+    within_turn: ClassVar[bool] = True
+    """Whether its encoder keeps its angle within one turn of the motor without power."""
+    zero_remedy: ClassVar[str] = (
+        "turn it by hand to where it was, or correct its zero (the vendor's tool, offset_rad), then call enable()"
+    )
+    """The remedy if its zero may have been lost."""
+
     def __init__(self, name: str, bus: str, joint: Joint, grain: Grain, coupled: Sequence[str] = ()) -> None:
         super().__init__(name, bus, Resource(name, coupled=coupled))
         self.joint = joint
@@ -103,6 +111,8 @@ class Axis(BusDevice[Sample]):
         self.motion: Motion[Any] | None = None
         self.held_counts: int | None = None
         """The position of the last hold command."""
+        self.zero = Zero(joint, within_turn=self.within_turn)
+        self._doubted_zero = False
 
     def use(self, grain: Grain) -> None:
         """Uses a resolution: limits and ranges are in its counts."""
@@ -115,8 +125,9 @@ class Axis(BusDevice[Sample]):
         self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 
     def note(self, sample: Sample) -> None:
-        """Stores a cyclic measurement."""
+        """Stores a cyclic measurement, and compares its zero."""
         before, self.sample = self.sample, sample
+        self._compare_zero(sample, before)
         resting = abs(sample.velocity) <= self.grain.still_velocity and (
             before is not None and abs(sample.position - before.position) <= self.grain.still_counts
         )
@@ -141,6 +152,9 @@ class Axis(BusDevice[Sample]):
         under_way = self.motion is not None or self.halting_since_ns > 0
         if under_way or not (self.silent or self.doubted):
             self.resource.moving = under_way or (self.still < _AT_REST and self.may_hold_torque)
+        if not (self.silent or self.doubted) and (under_way or not self.still):
+            measured = 0 if self.sample is None else abs(self.sample.velocity) * self.grain.rad_s
+            self.zero.moving(self.joint.max_speed_rad_s if under_way else measured)
 
     @property
     def moved_since_held(self) -> bool:
@@ -183,9 +197,34 @@ class Axis(BusDevice[Sample]):
             DeviceSilent: the joint does not answer.
             DeviceFault: a fault is latched.
         """
+        self.check_zero()
         if self.fault:
             raise self.faulty()
         return self.fresh(now_ns, stale_after_ns)
+
+    def _compare_zero(self, sample: Sample, before: Sample | None) -> None:
+        elapsed_s = (sample.at_ns - before.at_ns) / 1e9 if before is not None else 0.0
+        angle_rad = self.scale.angle_rad(sample.position)
+        self.zero.measured(angle_rad, elapsed_s)
+        if not self._doubted_zero and (doubt := self.zero.doubt(angle_rad)):
+            self.doubt_zero(doubt)
+        self._doubted_zero = self.zero.in_doubt
+
+    def doubt_zero(self, doubt: str) -> None:
+        """Makes the joint unusable, whatever other fault it had, as it may be elsewhere than it reports."""
+        self.fault, self.ready = doubt, False
+
+    def check_zero(self, position: int | None = None) -> None:
+        """Raises ``DeviceFault`` with both angles if the joint's zero may have been lost.
+
+        It compares a position that was read just now, or the newest measurement.
+        """
+        if position is not None:
+            self.zero.measured(self.scale.angle_rad(position), 0.0)
+        elif self.sample is not None:
+            position = self.sample.position
+        if position is not None and (doubt := self.zero.doubt(self.scale.angle_rad(position))):
+            raise self._faulty(doubt, self.zero_remedy)
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
         """Returns the last measurement. Its age alone decides: a joint just found silent has one that is recent."""
@@ -195,9 +234,14 @@ class Axis(BusDevice[Sample]):
 
     def faulty(self, fault: str = "") -> DeviceFault:
         remedy = "remove the cause, then call enable()"
-        if not fault and self.remedy:
+        if not fault and self.zero.in_doubt:
+            remedy = self.zero_remedy
+        elif not fault and self.remedy:
             remedy = self.remedy
-        return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=remedy)
+        return self._faulty(fault or self.fault, remedy)
+
+    def _faulty(self, fault: str, remedy: str) -> DeviceFault:
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
     def measured(
         self,

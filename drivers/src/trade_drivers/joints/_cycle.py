@@ -5,17 +5,27 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 from trade.errors import MotionStopped, TradeError
+from trade_drivers.bus._angle_store import Span
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, Gate, Steps, Work
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Leave
 from trade_drivers.joints._motion import Motion
+from trade_drivers.robotfile import Bus
 
 __all__ = ["Exchange"]
 
 
 class Exchange(BusCycle[AxisT]):
     """The exchange with the joints of one bus. Any thread may also call ``stop``."""
+
+    def __init__(self, bus: Bus, devices: Sequence[AxisT], clock: Callable[[], int] | None = None) -> None:
+        super().__init__(bus, devices, clock)
+        self.save_angles: Callable[[Mapping[str, Span]], object] | None = None
+        """Saves where joints are, by their names in the robot file, without waiting."""
+        for axis in devices:
+            axis.zero.period_s = 1 / bus.rate_hz
+            axis.zero.unled_s = bus.watchdog_s + bus.stale_after_s
 
     # --- commands, which depend on the kind of device
 
@@ -158,6 +168,13 @@ class Exchange(BusCycle[AxisT]):
         for axis in self.devices:
             axis.tell_moving()
         self.answer_stops(now_ns)
+        self._save_angles()
+
+    def _save_angles(self) -> None:
+        if self.save_angles is not None:
+            changed = {axis.joint.name: span for axis in self.devices if (span := axis.zero.to_save()) is not None}
+            if changed:
+                self.save_angles(changed)
 
     def _watch_halt(self, axis: AxisT, now_ns: int, again: list[AxisT]) -> None:
         """Repeats the hold of a joint that still moves, unless it has a fault; a fault does not prove that it stopped.

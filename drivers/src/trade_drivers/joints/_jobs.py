@@ -31,6 +31,8 @@ class Enable(Command[AxisT, "Exchange[AxisT]"]):
 
     def steps(self) -> Steps:
         for axis in self.devices:
+            axis.check_zero()
+        for axis in self.devices:
             if axis.ready:
                 yield from self.exchange.looking(axis)
             if not axis.ready:

@@ -6,6 +6,7 @@ from typing import Any, Generic, TypeVar
 from trade import Resource
 from trade.errors import DeviceSilent, LimitExceeded
 from trade_drivers._validation import finite, one_each, valid, within
+from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._gate import Command, admitted, at_once, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
@@ -161,6 +162,13 @@ class AttachedJoints(ThreadedBus[Exchange[Any]]):
     def motor(self, joint: str) -> Motor:
         axis = self._axes[joint]
         return self._motor(axis.name, self._thread, [axis])
+
+    def remember(self, angles: AngleStore) -> None:
+        known = angles.load()
+        for axis in self._thread.exchange.devices:
+            if (span := known.get(axis.joint.name)) is not None and (sample := axis.sample) is not None:
+                axis.zero.restore(span, axis.scale.angle_rad(sample.position))
+        self._thread.exchange.save_angles = angles.save
 
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
         return BusGroup(name, self._thread, [self._axes[joint] for joint in joints])

@@ -11,6 +11,7 @@ from msgspec import Struct
 from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
+from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._thread import BusThread
@@ -68,6 +69,12 @@ class AttachedBus(ABC):
         Returns False if the bus does not report faults; then their ``state()`` is polled.
         """
         return False
+
+    def remember(self, angles: AngleStore) -> None:  # noqa: B027 - by default no device loses its zero
+        """Compares joints with their last known angles, and saves these from now on.
+
+        A joint whose zero may have been lost refuses to be enabled.
+        """
 
     def unseen(self) -> Sequence[str]:
         """Returns the names of devices that were not seen at rest when the driver left them, as far as it knows."""

@@ -124,6 +124,8 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Encoder counts per turn of the motor, for devices whose model does not determine them."""
     gear: Positive = 1.0
     """Turns of the motor per turn of the joint."""
+    zero: Literal["last", "kept"] | None = None
+    """How its zero is known after a loss of power: by its last known angle, or because the device keeps or finds it."""
     min_rad: float
     max_rad: float
     max_speed_rad_s: Positive

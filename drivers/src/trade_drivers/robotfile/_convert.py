@@ -15,7 +15,7 @@ __all__ = ["explain", "record_of", "wrong"]
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
-_CHOICES: Final = {"leave": '"hold" or "relax"', "process": '"shared" or "own"'}
+_CHOICES: Final = {"leave": '"hold" or "relax"', "process": '"shared" or "own"', "zero": '"last" or "kept"'}
 
 _EXAMPLES: Final = {
     "port": '"/dev/serial/by-id/..." (`ls /dev/serial/by-id` shows those there are); on CAN, interface and channel',

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from math import inf
+from math import inf, remainder, tau
 from typing import Protocol
 
 from trade_hil_sim.faults import _commands as faults
@@ -68,6 +68,8 @@ class JointDevice(JointModel):
         offset_rad: the joint's angle at position 0.
     """
 
+    turn: float = tau
+    """One turn of the motor, in units of the shaft's position."""
     counts_per_unit: float = 1000
     """Resolution in the log and in orders, where the device itself has no counts."""
 
@@ -102,6 +104,10 @@ class JointDevice(JointModel):
     def _restart(self, t: float) -> None:
         """Restart, as after a loss of power."""
 
+    @abstractmethod
+    def _lose_zero(self, position: float, t: float) -> None:
+        """Report another position from now on; the shaft stays where it is."""
+
     # where it is
 
     def _position(self, t: float) -> float:
@@ -113,7 +119,7 @@ class JointDevice(JointModel):
         return round(self._position(t) * self.counts_per_unit)
 
     def _units(self, t: float) -> tuple[float, float]:
-        return self._position(t), self._shaft.speed(t)
+        return self._shaft.position(t), self._shaft.speed(t)
 
     def _moving(self, t: float) -> bool:
         return self._shaft.moving(t)
@@ -129,6 +135,9 @@ class JointDevice(JointModel):
         if isinstance(command, faults.Absent):  # the bus disconnects its station
             raise self._refusal(command)
         super().do(command, t)
+        if isinstance(command, faults.BrownOut) and command.zero != "kept":
+            within = remainder(self._position(t), self.turn) if command.zero == "turn" else 0.0
+            self._lose_zero(within, t)
         self._plan(t)
 
     def _do_rare(self, command: faults.Command, t: float) -> None:

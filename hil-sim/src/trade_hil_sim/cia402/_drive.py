@@ -93,6 +93,7 @@ class Drive(JointDevice):
         self.store = Store([*named, *pdo_objects(device_id)], counts_per_rev)
         self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
         self._machine = Machine(self.store, self._shaft, self.modes, self.note)
+        self.turn = counts_per_rev
         self._mode_due = self._look_due = inf
         self._behind_since: float | None = None
         self.node = Node(device_id, self.store, self, t)
@@ -289,6 +290,9 @@ class Drive(JointDevice):
         """Identify as another product."""
         self.store.set("product_code", number)
 
+    def _lose_zero(self, position: float, t: float) -> None:
+        self.modes.zero = self._shaft.position(t) - position
+
     def _restart(self, t: float) -> None:
         self.node.reset(t)
 
@@ -314,9 +318,6 @@ class Drive(JointDevice):
 
     def _position(self, t: float) -> float:
         return self._shaft.position(t) - self.modes.zero
-
-    def _units(self, t: float) -> tuple[float, float]:
-        return self._shaft.position(t), self._shaft.speed(t)
 
     def _written(self, name: str, values: Sequence[tuple[Object, int]], moves: bool, t: float) -> None:
         self._journal(

@@ -316,6 +316,9 @@ class Motor(JointDevice):
         """Take the range of positions of another model."""
         self._registers[Register.POSITION_MAX] = float(number)
 
+    def _lose_zero(self, position: float, t: float) -> None:
+        self._zero = self._shaft.position(t) - position
+
     def _restart(self, t: float) -> None:
         self._switch_off(t, Status.DISABLED)
         self._power_on()

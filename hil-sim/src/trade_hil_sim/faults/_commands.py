@@ -231,8 +231,11 @@ class WrongModel(_Devices, frozen=True, kw_only=True, tag="wrong_model"):
     number: Annotated[int, Meta(ge=0, le=65_535)]
 
 
-class BrownOut(_Devices, frozen=True, tag="brown_out"):
+class BrownOut(_Devices, frozen=True, kw_only=True, tag="brown_out"):
     """The supply dips: RAM at its defaults, torque off, EEPROM kept."""
+
+    zero: Literal["kept", "turn", "lost"] = "kept"
+    """Of a motor on a CAN bus: its zero is kept, kept within a turn of the motor, or lost, so that it reads 0."""
 
 
 class HardwareFault(_Devices, frozen=True, kw_only=True, tag="hardware_fault"):

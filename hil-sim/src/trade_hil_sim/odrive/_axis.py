@@ -48,6 +48,7 @@ class Axis(JointDevice):
     """
 
     thing = "an ODrive"
+    turn = 1.0
     healthy = (24.0, 35)
 
     def __init__(
@@ -223,6 +224,12 @@ class Axis(JointDevice):
     def jam(self, on: bool, t: float) -> None:
         """Jam the shaft, or release it."""
         self._motor.jam(on, t)
+
+    def _lose_zero(self, position: float, t: float) -> None:
+        self._motor.zero = self._shaft.position(t) - position
+
+    def _position(self, t: float) -> float:
+        return self._shaft.position(t) - self._motor.zero
 
     def _place(self, position: float, t: float) -> None:
         self._motor.place(position, t)

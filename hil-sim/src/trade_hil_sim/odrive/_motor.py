@@ -36,6 +36,8 @@ class Motor:
         self.shaft = Shaft(turns, t)
         self.goal = turns
         """Its last target."""
+        self.zero = 0.0
+        """Where its shaft is when it reports 0."""
         self.forget_settings()
 
     def forget_settings(self) -> None:
@@ -80,7 +82,7 @@ class Motor:
 
     def arm(self, t: float) -> None:
         """Torque on: it holds its position, unless its input is a speed or a torque."""
-        self.goal = self.shaft.position(t)
+        self.goal = self.shaft.position(t) - self.zero
         if self.control != Control.POSITION:
             self._follow(Command.SET_CONTROLLER_MODE, t)
 
@@ -97,15 +99,15 @@ class Motor:
             pull = copysign(self._limit, self._torque) if self._torque else 0.0
             self.shaft.spin(t, pull, abs(self._torque) / INERTIA or COAST)
         elif self._input != Input.TRAP_TRAJ:
-            self.shaft.go(t, self.goal, self._limit, QUICK)
+            self.shaft.go(t, self.goal + self.zero, self._limit, QUICK)
         elif command is Command.SET_INPUT_POS:  # a trajectory begins with its goal, not with its mode
-            self.shaft.go(t, self.goal, self._trajectory_speed, self._trajectory_accel)
+            self.shaft.go(t, self.goal + self.zero, self._trajectory_speed, self._trajectory_accel)
 
     # faults
 
     def place(self, turns: float, t: float) -> None:
         """Turn it by hand."""
-        self.shaft.place(turns, t)
+        self.shaft.place(turns + self.zero, t)
         self.shaft.forget(t)
 
     def jam(self, on: bool, t: float) -> None:

@@ -7,7 +7,7 @@ from typing import Final
 from trade_drivers.joints import Axis, Grain, Sample, Unfit
 from trade_drivers.robotfile import Joint
 
-__all__ = ["STILL_RAD_S", "Another", "MotorAxis", "grain_of"]
+__all__ = ["STILL_RAD_S", "Another", "MotorAxis", "check_zero_known", "grain_of"]
 
 STILL_RAD_S: Final = 0.01
 """The maximum speed at rest."""
@@ -38,9 +38,27 @@ class Another(Unfit):
         self.expected, self.found = expected, found
 
 
+def check_zero_known(axis: "MotorAxis") -> None:
+    """Raises ``Unfit`` for a range wider than a turn of the motor, if the file does not say how the zero is known."""
+    joint, turn_rad = axis.joint, tau / axis.joint.gear
+    wide_rad = joint.max_rad - joint.min_rad
+    if joint.zero is None and wide_rad > turn_rad:
+        raise Unfit(
+            f"missing: the range is {wide_rad:.4g} rad, but without power {joint.model} keeps its place within "
+            f'{turn_rad:.4g} rad at most, a turn of the motor; write zero = "last" if the joint stays where it is '
+            'without power, or zero = "kept" if the device keeps or finds its zero',
+            ".zero",
+        )
+
+
 class MotorAxis(Axis):
     """One motor. While it is ``silent``, it is left out, and returns only after it was checked."""
 
+    within_turn = False
+    zero_remedy = (
+        "turn it by hand to where it was, or correct its zero (home(), the vendor's tool, offset_rad), then call "
+        'enable(); a device that keeps its zero is zero = "kept" in the robot file'
+    )
     beat_ns = 0
     """When a frame of the motor was last received."""
     asked_ns = 0
@@ -79,6 +97,7 @@ class MotorAxis(Axis):
 
     def forget(self, now_ns: int) -> None:
         """Leaves the motor out until it was checked again."""
+        self.tell_moving()
         if not self.silent:
             self.silent, self.silent_since_ns = True, now_ns
         self.asked_ns, self.hushed = 0, False
@@ -90,3 +109,4 @@ class MotorAxis(Axis):
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
         self.beat_ns = self.since_ns = now_ns
         self.asked_ns, self.stranger = 0, True
+        self.zero.interrupted()

@@ -141,8 +141,9 @@ class ServoAxis(Axis, Generic[_Health]):
         """Returns the goal with which torque is switched on at a measured position.
 
         Raises:
-            DeviceFault: the device cannot hold there.
+            DeviceFault: the device cannot hold there, or its zero may have been lost.
         """
+        self.check_zero(position)
         if problem := self.outside(position):
             raise self.faulty(f"{problem}; turn it back by hand with its torque off, or widen that register")
         return Goal(self.own_goal(position), self.accel_counts, self.speed_counts)

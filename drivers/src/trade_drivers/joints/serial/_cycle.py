@@ -137,6 +137,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             _log.info("%s answers again", axis.name)
             axis.misses = 0
         axis.silent = axis.doubted = False
+        axis.zero.interrupted()
         if axis.motion is None:
             self.stop_found_moving(axis)
 

@@ -91,6 +91,9 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
             if joint.counts_per_rev is not None or joint.gear != 1:
                 problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
+            if joint.zero is not None:
+                problem = "leave this key out: a servo knows its angle within its one turn, whatever its power does"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".zero', problem=problem)
             if joint.serial_number is not None:
                 problem = "these servos report no serial number; remove this key"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".serial_number', problem=problem)

@@ -159,6 +159,7 @@ class DriveAxis(MotorAxis):
     def welcome(self, now_ns: int) -> None:
         """Accepts it after its frames have arrived."""
         self.stage = Stage.HERE
+        self.zero.interrupted()
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
         self.controlword = self.raised_ns = self.asked_ns = 0
 

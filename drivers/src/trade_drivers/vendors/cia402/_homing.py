@@ -37,7 +37,9 @@ class Homing(Motion[DriveAxis]):
 
     def steps(self) -> Steps:
         axis = self._axis
-        axis.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
+        if not axis.zero.in_doubt:  # otherwise this is the remedy
+            axis.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
+        axis.zero.searching = True
         yield from jobs.resting(self._bus, self, axis)
         if not axis.ready or axis.stream is not None:
             yield from self.exchange.enabling(self, axis)
@@ -57,6 +59,11 @@ class Homing(Motion[DriveAxis]):
         self._bus.command(self._axis, machine.OPERATE | machine.NEW_SET_POINT)
         self.exchange.take_over(self)
         self._began_ns = self.exchange.clock()
+
+    def finish(self, error: TradeError | None = None) -> None:
+        if not self.ended and self._axis.zero.searching:
+            self._axis.zero.searched(found=error is None)
+        super().finish(error)
 
     def goal_of(self, axis: DriveAxis) -> int:
         return axis.sample.position if axis.sample is not None else 0

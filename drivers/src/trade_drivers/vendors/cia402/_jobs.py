@@ -32,6 +32,7 @@ def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: 
     if axis.stopped:
         yield from _take_back(bus, job, axis)
     yield from looking(bus, axis)
+    axis.check_zero()
     axis.check_place(axis.fresh(bus.clock(), bus.stale_after_ns))
     if axis.motion is not None and not axis.fault:
         bus.end_motion(axis, f"{axis.name} was enabled again")

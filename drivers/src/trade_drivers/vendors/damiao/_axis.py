@@ -41,6 +41,8 @@ def grain_of(joint: Joint, rate_hz: float) -> Grain:
 class DamiaoAxis(MotorAxis):
     """One motor."""
 
+    within_turn = True
+
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
         super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
         self.ranges = MODELS[joint.model]
@@ -93,6 +95,10 @@ class DamiaoAxis(MotorAxis):
             self.latch("its torque went off; has it restarted?")
         else:
             return
+        self.course = None
+
+    def doubt_zero(self, doubt: str) -> None:
+        super().doubt_zero(doubt)
         self.course = None
 
     # --- state

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import Frame, frame_bits
 from trade_drivers.joints import Steps, Unfit, check_joints, check_rate
-from trade_drivers.joints.can import Another
+from trade_drivers.joints.can import Another, check_zero_known
 from trade_drivers.joints.can._cycle import asked
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
@@ -55,6 +55,7 @@ def _check_joint(axis: DamiaoAxis) -> None:
             raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can report", key)
     if joint.serial_number is not None:
         raise Unfit("a Damiao motor reports no serial number here; leave this key out", ".serial_number")
+    check_zero_known(axis)
 
 
 def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:

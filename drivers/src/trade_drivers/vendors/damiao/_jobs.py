@@ -33,6 +33,7 @@ def enabling(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> 
         yield from until(bus, axis, lambda: not axis.failed, f"{complaint}; it cannot be cleared")
     yield from _set_up(bus, job, axis)
     yield from next_measurement(bus, axis)
+    axis.check_zero()
     job.gate()
     bus.stand(axis)
     bus.enable(axis)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import Frame, frame_bits
 from trade_drivers.joints import Steps, Unfit, check_joints, check_rate
-from trade_drivers.joints.can import Another
+from trade_drivers.joints.can import Another, check_zero_known
 from trade_drivers.joints.can._cycle import asked
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._axis import OdriveAxis
@@ -59,6 +59,7 @@ def _check_joint(axis: OdriveAxis) -> None:
         raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.serial_number is not None:
         raise Unfit("an ODrive reports no serial number here; leave this key out", ".serial_number")
+    check_zero_known(axis)
 
 
 def look_over(bus: "OdriveExchange", axis: OdriveAxis, *, first: bool) -> Steps:

@@ -40,6 +40,7 @@ def enabling(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> 
     if axis.torque:
         yield from until(bus, axis, lambda: axis.still >= _AT_REST, "it cannot be enabled while it moves", HALT_NS)
     here = axis.fresh(bus.clock(), bus.stale_after_ns).position
+    axis.check_zero()
     job.gate()
     bus.limit(axis, axis.speed_counts, axis.accel_counts)
     bus.tell(axis, Command.SET_MODE, frames.set_mode(Control.POSITION, Input.TRAJECTORY))

@@ -81,6 +81,7 @@ def _joint(one: Found) -> list[str]:
         if one.driver == "cia402":
             keys.append(_counts_per_rev(one.counts_per_rev))
         keys.append("gear = 1.0              # motor turns per joint turn")
+        keys.append('# zero = "last"         # or "kept": how its zero is known after a loss of power')
         measures = "to be measured"
     else:
         measures = "`trade calibrate` measures both"
