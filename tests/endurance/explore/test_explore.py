@@ -40,13 +40,13 @@ def _no_lease_ends(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mutate", "seed", "says"),
+    ("mutate", "says"),
     [
-        (_no_stop_holds, 4, "stop was confirmed"),
-        (_two_owners, 1, "and (worker|planner) held"),
-        (_no_lease_ends, 15, "still has"),
+        (_no_stop_holds, "stop was confirmed"),
+        (_two_owners, "and (worker|planner) held"),
+        (_no_lease_ends, "still has"),
     ],
 )
-def test_the_judge_sees_what_is_wrong(mutate: Any, seed: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_judge_sees_what_is_wrong(mutate: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     mutate(monkeypatch)
-    assert re.search(says, "\n".join(tell(seed).violations))
+    assert any(re.search(says, "\n".join(tell(seed).violations)) for seed in range(1, SEEDS))

@@ -167,8 +167,8 @@ def test_one_frame_alone_identifies_no_device() -> None:
 
 
 def test_another_firmware_than_the_files_is_refused(motor_rig: MotorRig) -> None:
-    motor_rig.configure(("id = 1\n", 'id = 1\nfirmware = "9.9"\n'))
     motor_rig.plug()
+    motor_rig.configure(("id = 1\n", 'id = 1\nfirmware = "9.9"\n'))
     with pytest.raises(WrongDevice) as refused:
         motor_rig.attach()
     assert (refused.value.key, refused.value.expected) == ("firmware", "9.9")

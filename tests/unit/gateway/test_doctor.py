@@ -228,6 +228,7 @@ def test_a_range_beyond_the_devices_setting_is_reported_as_by_trade_up(robot_fil
     )
 
 
+@pytest.mark.realtime
 def test_S23_a_joint_outside_the_devices_own_range_is_reported_with_both_angles(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
         sim.devices[0].memory.set("max_position_limit", 3000)

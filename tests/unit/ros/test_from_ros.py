@@ -14,6 +14,7 @@ from trade import Handle, where
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, MotionStopped, Stopped
 from trade_gateway.recording._channels import JointStates, Message
 from trade_gateway.recording._sources import Sources, Wanted
+from trade_gateway.recording._timeline import Timeline
 from trade_gateway.ros._goals import ACTION
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosRefused, RosUnreachable
 
@@ -288,7 +289,7 @@ def test_joints_of_ros_are_recorded_with_what_ros_knows_of_them(stand: Stand, ar
     arm.speeds = speeds
     arm.tell(0.1, 0.2)
     wait_until(lambda: _state(stand) == [0.1, 0.2])
-    sources = Sources(stand.robot.container, Wanted(groups=["lab"]), threading.Event())
+    sources = Sources(stand.robot.container, Wanted(groups=["lab"]), threading.Event(), Timeline())
     sources.look()
     assert sources.labels() == ["lab.arm.state"]
     messages: list[Message] = []

@@ -15,6 +15,7 @@ from trade_gateway.recording._recorder import Ring
 
 __all__ = ["SavedAtFault"]
 
+_MS_NS: Final = 1_000_000
 HOLD_OFF_S: Final = 10.0
 """A fault within this time after a saved one belongs to the same event, in seconds."""
 _decode: Final = msgspec.json.Decoder(Fault).decode
@@ -76,9 +77,9 @@ class SavedAtFault:
         if now < self._held_until:
             return
         self._held_until = now + HOLD_OFF_S
-        at = datetime.fromtimestamp(at_ns / 1e9, timezone.utc)
         name = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in fault.about)
-        path = self._folder / f"{at:%Y%m%dT%H%M%S}.{at_ns // 1_000_000 % 1000:03d}Z-{name}.mcap"
+        while (path := self._folder / f"{_stamp(at_ns)}-{name}.mcap").exists():  # the clock was set back
+            at_ns += _MS_NS
         why = f"{fault.about}: {fault.text}"
         try:
             count = self._ring.save(path, {**self._about, "fault": why}, self._attachments)
@@ -86,3 +87,8 @@ class SavedAtFault:
             self._failed(f"{path} is incomplete: {bad}")
         else:
             self._saved(path, why, count)
+
+
+def _stamp(at_ns: int) -> str:
+    at = datetime.fromtimestamp(at_ns / 1e9, timezone.utc)
+    return f"{at:%Y%m%dT%H%M%S}.{at_ns // _MS_NS % 1000:03d}Z"

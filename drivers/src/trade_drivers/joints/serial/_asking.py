@@ -58,16 +58,6 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
     raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s, reason=bus.why_silent())
 
 
-def zero_moved(axis: ServoAxis[Any], found: int) -> str:
-    """Returns what is wrong with a homing offset; empty if it is the one of the robot file's calibration."""
-    expected = axis.joint.homing_counts
-    if found == expected:
-        return ""
-    where = f"its homing offset (register {axis.homing.address})"
-    moved = "its zero has moved, or this is the calibration of another arm"
-    return f"{where} is {found}, but {expected} in the robot file: {moved}"
-
-
 def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
     """Raises ``WrongDevice`` for a servo with another zero; ``settings`` are its registers from address 0."""
     if problem := axis.zero_moved(settings):

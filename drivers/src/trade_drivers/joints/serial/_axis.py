@@ -120,7 +120,8 @@ class ServoAxis(Axis, Generic[_Health]):
         if found == expected:
             return ""
         where = f"its homing offset (register {self.homing.address})"
-        return f"{where} is {found}, but {expected} in the robot file: its zero has moved"
+        moved = "its zero has moved, or this is the calibration of another arm"
+        return f"{where} is {found}, but {expected} in the robot file: {moved}"
 
     def own_goal(self, position: int) -> int:
         """Returns the goal that holds a position: the end of the device's own range, if that is near."""
