@@ -19,7 +19,7 @@ def test_motion_keeps_its_rules_whatever_happens(seed: int) -> None:
     assert tell(seed).violations == []
 
 
-def test_the_same_seed_tells_the_same_story() -> None:
+def test_the_same_seed_gives_the_same_story() -> None:
     assert str(tell(7)) == str(tell(7))
 
 

@@ -395,13 +395,15 @@ def test_S09_one_identity_holds_a_bounded_number_and_each_of_its_orders_stops_an
         assert eventually(lambda: confirmed >= set(ids))
         assert more < 12
         kept = [*ids[: MOST_OF_ONE - 1], ids[-1]]  # the first ones, and the one that no reader can have seen
-        assert eventually(lambda: {estop.id for estop in one.estops()} == set(kept))  # others may report later
+        opened = {estop.id for estop in one.estops()}
+        assert opened >= set(kept)
+        assert len(opened) <= 2 * MOST_OF_ONE  # those of `caller`, which may have learnt of others, are in it
         assert eventually(lambda: sorted(path.stem for path in tmp_path.rglob("*.json")) == sorted(kept))
         stopped = axis.stopped
         report = caller.estop("of another client", limit_s=GENEROUS_S)
         assert report.complete
         assert axis.stopped >= stopped
-        assert caller.estop_clear(kept, limit_s=GENEROUS_S).complete
+        assert caller.estop_clear([*opened], limit_s=GENEROUS_S).complete
         with pytest.raises(Stopped, match="of another client"):
             call(caller, "move_to", "one", 0.1)
         assert caller.estop_clear([report.id], limit_s=GENEROUS_S).complete

@@ -30,11 +30,11 @@ class VirtualTime:
 
     @property
     def switches(self) -> int:
-        """How often another thread went on: the same for the same seed."""
+        """The number of switches to another thread: the same for the same seed."""
         return self._scheduler.switches
 
     def step_wall_clock(self, by_s: float) -> None:
-        """Set the wall clock ahead or back, in seconds; the monotonic clock goes on."""
+        """Set the wall clock ahead or back, in seconds; the monotonic clock continues."""
         self._scheduler.wall_step_ns += round(by_s * 1e9)
 
     def stall_threads(self, probability: float, longest_s: float = 2.0) -> None:
@@ -42,7 +42,7 @@ class VirtualTime:
 
         Args:
             probability: of each such place, from 0 (none, as at the beginning) to 1.
-            longest_s: the longest time for which one stands still, in seconds.
+            longest_s: the longest stall, in seconds.
         """
         self._scheduler.stall, self._scheduler.longest_stall_s = probability, longest_s
 
@@ -66,7 +66,7 @@ def virtual_time(
     Args:
         seed: draws the order of threads, and ids; the same seed gives the same run.
         switch: the probability of a switch to another thread where a lock is taken or an event is set, from 0 to 1.
-        packages: packages of yours whose modules use `threading`, `time` and their like.
+        packages: your packages, whose modules use `threading`, `time` and their like.
         limit_s: how much virtual time may pass, in seconds.
 
     Raises:

@@ -84,7 +84,7 @@ class Descriptors:
         return number
 
     def forget(self, number: int) -> None:
-        """The number stands for nothing any more."""
+        """Frees the number."""
         self._waitable.pop(number, None)
 
     def end(self, number: int) -> _End:
@@ -112,7 +112,7 @@ class Descriptors:
         self.end(number).blocking = blocking
 
     def write(self, number: int, data: bytes) -> int:
-        """As `os.write`; what nobody reads is kept without a limit."""
+        """As `os.write`; unread bytes are kept without a limit."""
         end = self.end(number)
         if not end.peer.open:
             code = errno.EIO if end.terminal else errno.EPIPE
@@ -142,7 +142,7 @@ class Descriptors:
             scheduler.wait([self._waitable[number].waiting for number in numbers], left_s)
 
     def is_open(self, number: int) -> bool:
-        """Whether a number stands for something."""
+        """Whether a number is in use."""
         return number in self._waitable
 
     def open_terminal(self, path: str) -> int | None:

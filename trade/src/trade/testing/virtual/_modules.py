@@ -48,7 +48,7 @@ _RLOCK: Final = type(threading.RLock())
 
 
 class Replacements:
-    """What stands in for what, by the identity of the real one."""
+    """The stand-ins, by the identity of what they replace."""
 
     def __init__(self, scheduler: Scheduler) -> None:
         self._of: dict[int, Any] = {}
@@ -87,7 +87,7 @@ class Replacements:
         return copy
 
     def get(self, value: Any) -> Any:
-        """What stands in for a value; None if nothing does. A lock is one that nobody holds."""
+        """The stand-in for a value, or None. That for a lock is a free one."""
         found = self._of.get(id(value))
         if found is None and type(value) is _LOCK:
             return self._lock()
@@ -189,7 +189,7 @@ def _set(owner: Any, name: str, value: Any, undo: contextlib.ExitStack) -> None:
     setattr(owner, name, value)
 
 
-# --- what stands in
+# --- stand-ins
 
 
 def _clocks(scheduler: Scheduler) -> dict[str, Any]:

@@ -49,7 +49,7 @@ class Task:
         self.gate: Final = _thread.allocate_lock()
         self.gate.acquire()
         self.turn = 0
-        """Counts its waits, so that the timer of an earlier wait wakes nobody."""
+        """Counts its waits, so that the timer of an earlier wait wakes no thread."""
         self.woken = False
         self.waits_in: tuple[WaitList, ...] = ()
         self.joiners: Final[WaitList] = deque()
@@ -75,7 +75,7 @@ class Scheduler:
         self.switches = 0
         self._switch = switch
         self.stall = 0.0
-        """The probability that a thread stands still where another one may run."""
+        """The probability of a stall where another thread may run."""
         self.longest_stall_s = 0.0
         self.importing = 0
         """How many imports are under way. They switch no threads, as only the first run of a process has them."""

@@ -24,7 +24,7 @@ class Network:
 
 
 class Socket:
-    """As `socket.socket`, for stream sockets. What nobody reads is kept without a limit."""
+    """As `socket.socket`, for stream sockets. Unread bytes are kept without a limit."""
 
     _network: Network
 
