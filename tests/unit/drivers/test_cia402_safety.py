@@ -9,12 +9,12 @@ import pytest
 
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.conftest import Outcome, sleep_past, written_now
-from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, HIP, KNEE, PATIENT, Leg, leg, rig
+from tests.unit.drivers.legs import HALT, HIP, KNEE, PATIENT, Leg, leg, rig
 from trade import Container, where
 from trade.errors import DeviceFault, LockedByOther, MotionStopped
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
-from trade_hil_sim import Entry, Place
+from trade_hil_sim import Entry
 
 pytestmark = pytest.mark.virtual_time
 
@@ -196,29 +196,3 @@ def test_S08_a_joint_with_a_fault_has_stopped_when_it_rests_and_not_before(rig: 
 
 
 # --- S23 what the device says about itself
-
-
-def test_S23_a_drive_outside_its_own_range_is_not_enabled_in_any_mode(rig: Leg) -> None:
-    """In a mode of cyclic set-points, a drive turns each target outside 607Dh into the end of the range."""
-    limit, at = round(1.46 * COUNTS_PER_RAD), round(1.614 * COUNTS_PER_RAD)
-    rig.plug()
-    rig.drive(HIP).store.set("position_limit_max", limit)
-    rig.drive(HIP).store.set("position_limit_min", -limit)
-    rig.sim.do(Place(ids=(HIP,), counts=at))
-    robot = rig.attach()
-    hip, group = robot.motor("leg.hip"), robot.group("leg")
-    mark = written_now()
-    for command in (
-        hip.enable,
-        lambda: hip.move_to(0.2),
-        lambda: hip.set_velocity(-0.1, 1.0),
-        lambda: group.servo([0.2, 0.0]),
-    ):
-        with pytest.raises(DeviceFault, match=r"1.614 rad, outside .* 1.460 rad \(607Dh\)"):
-            command()
-    assert not rig.controlwords(HIP, mark)
-    assert (rig.truth(HIP).position_counts, rig.truth(HIP).torque) == (at, False)
-    rig.sim.do(Place(ids=(HIP,), counts=limit - 50))
-    wait_until(lambda: hip.state().position_rad < 1.46, "it was turned back")
-    hip.enable()
-    assert rig.truth(HIP).torque

@@ -331,7 +331,7 @@ def test_S23_a_drive_beyond_its_own_range_is_not_enabled(rig: Leg, limit: str, a
     robot = rig.attach()
     motor, group = robot.motor("leg.hip"), robot.group("leg")
     place, end = drive.joint_rad(time.monotonic()), at / abs(at) * 1.02
-    complaint = f"it is at {place:.4g} rad, beyond its own limit {end:.4g} rad (607Dh)"
+    complaint = f"it is at {place:.3f} rad, outside its own range, which ends at {end:.3f} rad (607Dh)"
     mark = written_now()
     for act in (
         motor.enable,

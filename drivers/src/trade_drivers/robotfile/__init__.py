@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade._protocol.keys import DOMAIN
+from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile._convert import explain, record_of, wrong
@@ -31,6 +32,7 @@ __all__ = [
     "SerialBus",
     "UrBus",
     "parse",
+    "read_text",
 ]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
-from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse
+from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse, read_text
 from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.mechanics._truth import BusState
@@ -94,7 +94,7 @@ class SimulatedSenseClass(Protocol):
 
 def read_robot(path: Path) -> Robot:
     """Read a robot file; raises what `trade_drivers.robotfile.parse` raises, `OSError`, and `UnicodeDecodeError`."""
-    return parse(path.read_text(encoding="utf-8-sig"), str(path))
+    return parse(read_text(path), str(path))
 
 
 def buses_of(

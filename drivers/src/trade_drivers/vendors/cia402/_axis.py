@@ -46,8 +46,6 @@ class DriveAxis(MotorAxis):
         self.mode = 0
         self.modes: frozenset[int] = frozenset()
         """The supported modes of operation."""
-        self.own_range: tuple[int, int] | None = None
-        """The range that the drive says it has (607Dh); None if it limits nothing."""
         self.entered = 0
         """The mode in which it was enabled; 0 if unknown."""
         self.stream: Following | Turning | None = None
@@ -76,18 +74,6 @@ class DriveAxis(MotorAxis):
         """Whether it is operational, as far as its heartbeats and the commands to it say."""
         self.to_start = False
         """True if its heartbeat contradicts the start command: the frame was lost, or it fell back."""
-
-    def outside(self, position: int) -> str:
-        """Returns why the drive must not be enabled at a position; empty if it may."""
-        low, high = self.own_range or (position, position)
-        end = max(low, min(high, position))
-        if abs(position - end) <= self.grain.arrived:
-            return ""
-        here = self.scale.angle_rad
-        return (
-            f"it is at {here(position):.3f} rad, outside the drive's own range, which ends at {here(end):.3f} rad "
-            "(607Dh): a set-point there would drive it to that end; turn it back by hand, or widen 607Dh"
-        )
 
     # --- received frames
 
@@ -233,8 +219,8 @@ class DriveAxis(MotorAxis):
         if not low - self.grain.arrived <= place <= high + self.grain.arrived:
             end = self.scale.angle_rad(low if place < low else high)
             raise self.faulty(
-                f"it is at {self.scale.angle_rad(place):.4g} rad, beyond its own limit {end:.4g} rad (607Dh): "
-                "turn it back by hand, or widen that limit"
+                f"it is at {self.scale.angle_rad(place):.3f} rad, outside its own range, which ends at {end:.3f} rad "
+                "(607Dh): turn it back by hand, or widen 607Dh"
             )
 
     def absence(self, now_ns: int) -> DeviceError:

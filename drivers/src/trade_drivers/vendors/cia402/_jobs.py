@@ -36,8 +36,6 @@ def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: 
     axis.check_place(axis.fresh(bus.clock(), bus.stale_after_ns))
     if axis.motion is not None and not axis.fault:
         bus.end_motion(axis, f"{axis.name} was enabled again")
-    if axis.sample is not None and (problem := axis.outside(axis.sample.position)):
-        raise axis.faulty(problem)
     if not axis.statusword & machine.REMOTE:
         raise axis.faulty("it does not obey the bus (statusword bit 9), as if operated from its panel")
     if axis.state_now is State.FAULT:
