@@ -38,6 +38,8 @@ def refused(rig: TailRig) -> str:
         (33, (1,), "mode (register 33) is 1"),
         (18, (8,), "set bit 2"),
         (18, (28,), "clear bit 4"),
+        (18, (13,), "in the other direction by itself, and the file has reversed = "),
+        (18, (140,), "clear bits 0 and 7"),
         (9, (0, 0, 0, 0), "many turns"),
         (9, (0, 8, 255, 15), "more than the device's own range"),
     ],

@@ -61,10 +61,11 @@ def check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
     if mode != table.POSITION_MODE:
         _wrong(key, f"its operating mode (register 11) is {mode}; set it to 3, position control, with torque off")
     if drive & _OTHER_THAN_REVERSED:
-        problem = (
-            f"its drive mode (register 10) is {drive}; set it to {drive & 1}, with torque off: speeds as velocities"
-        )
+        problem = f"its drive mode (register 10) is {drive}; set it to 0, with torque off: speeds as velocities"
         _wrong(key, f"{problem}, torque switched on by nothing but us")
+    if drive:
+        problem = f"its drive mode (register 10) is {drive}: it counts in the other direction by itself, and the file"
+        _wrong(key, f"{problem} has reversed = {str(joint.reversed).lower()}; set it to 0, use reversed, and calibrate")
     if (shadow := table.SHADOW_ID.decode(settings)) <= _SHADOWS:
         _wrong(key, f"it also obeys what is sent to id {shadow} (register 12); set it to 255, with torque off")
     check_own_range(axis, settings, key)

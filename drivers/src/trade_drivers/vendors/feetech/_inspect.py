@@ -72,6 +72,10 @@ def check_settings(axis: FeetechAxis, settings: bytes, key: str) -> None:
         _wrong(key, f"its phase (register 18) is {phase}: speeds are in units of 0.732 rpm; set bit 2")
     if phase & table.FULL_TURNS:
         _wrong(key, f"its phase (register 18) is {phase}: positions count whole turns; clear bit 4")
+    if phase & table.DIRECTIONS:
+        problem = f"its phase (register 18) is {phase}: it turns or counts in the other direction by itself, and the"
+        stated = f"file has reversed = {str(axis.joint.reversed).lower()}"
+        _wrong(key, f"{problem} {stated}; clear bits 0 and 7, use reversed, and calibrate")
     low, high = table.MIN_ANGLE.decode(settings), table.MAX_ANGLE.decode(settings)
     if low == high == 0:
         _wrong(key, "its range (registers 9 and 11) is 0 to 0, which is many turns; set it to 0 and 4095")

@@ -108,6 +108,8 @@ SPEED_IN_STEPS: Final = 0x04
 """Bit of ``PHASE``: speeds are in steps/s, not in units of 0.732 rpm."""
 FULL_TURNS: Final = 0x10
 """Bit of ``PHASE``: positions count whole turns."""
+DIRECTIONS: Final = 0x81
+"""Bits of ``PHASE``: the motor turns, and the encoder counts, in the other direction."""
 
 STATUS_BITS: Final = {
     0x01: "input voltage out of range",
