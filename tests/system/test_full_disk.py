@@ -106,7 +106,7 @@ def test_a_robot_file_is_as_it_was(disk: SmallDisk) -> None:
     disk.fill()
     before = sorted(disk.folder.iterdir())
     with pytest.raises(ConfigurationError, match="it is unchanged"):
-        _write(Output(as_json=True), file, "zero_counts = 2048\n", "zero_counts = 2050\n", yes=True)
+        _write(Output(as_json=True), file, b"zero_counts = 2048\n", "zero_counts = 2050\n", yes=True)
     assert file.read_text() == "zero_counts = 2048\n"
     assert sorted(disk.folder.iterdir()) == before
 

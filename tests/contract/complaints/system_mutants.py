@@ -9,7 +9,7 @@ from trade._transport.base import ChannelClosed
 
 
 def the_devices_zero_is_taken_as_it_is(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.joints.serial._asking.zero_moved", lambda *_: "")
+    patch.setattr("trade_drivers.joints.serial._axis.ServoAxis.zero_moved", lambda *_: "")
 
 
 def one_thread_serves_all_calls(patch: pytest.MonkeyPatch) -> None:

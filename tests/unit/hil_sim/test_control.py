@@ -42,6 +42,7 @@ FIELDS: Final[dict[str, Any]] = {
     "width_m": 0.02,
     "stiffness_n_m": 900.0,
     "inside": True,
+    "zero": "turn",
 }
 """A value for each field that a fault has, other than what it is without."""
 

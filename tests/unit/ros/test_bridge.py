@@ -317,8 +317,8 @@ def test_an_entry_that_maps_nothing_is_no_problem_before_its_robot_is_up_and_aft
     stand.robot.container.register(Eye(), "rosie.eye")
     wait_until(lambda: bridge.bridged().problems)
     stand.robot.container.register(FakeGripper("rosie.eye.hand"), "rosie.eye.hand")
+    wait_until(lambda: "topic /joint_states" in bridge.bridged().to_ros)
     wait_until(lambda: not bridge.bridged().problems)
-    assert "topic /joint_states" in bridge.bridged().to_ros
 
 
 def test_closing_the_bridge_stops_what_its_nodes_move(stand: Stand) -> None:

@@ -233,6 +233,7 @@ def test_decoders_are_made_before_the_second_call(
     assert not made
 
 
+@pytest.mark.realtime  # other threads may ask it about a container that has just joined
 @pytest.mark.parametrize("name", CALL)
 def test_the_registry_is_not_asked_by_later_calls(
     offer: Callable[..., Callable[[str], Handle]], monkeypatch: pytest.MonkeyPatch, name: str

@@ -525,3 +525,26 @@ def test_a_call_succeeds_when_the_last_hook_is_detached_as_it_starts(
             setattr(service, name, getattr(hooked, name))
     context = CallContext(7, hooked.label, "ui", here.session, time.monotonic_ns() + 10**10)
     assert service.call(("tea", 1), {}, context) == ["tea"]
+
+
+class Slow:
+    def __init__(self) -> None:
+        self.released = threading.Event()
+
+    @service(effect="read")
+    def sleep(self, called: HookEvent) -> None:
+        self.released.wait(1000)
+
+
+def test_all_hooks_of_one_side_take_no_longer_together_than_two_and_a_half_of_them_may(
+    here: Container, plan: Handle
+) -> None:
+    here.register(slow := Slow(), "slow")
+    sleep = here.find(where(name="sleep"), wait_s=20)
+    for _ in range(3):
+        here.before_service(plan, sleep)
+    began = time.monotonic()
+    assert plan.with_(deadline_s=600)("tea", steps=1) == ["tea"]
+    limit_s = here.settings.hook_limit_s
+    assert 2.4 * limit_s < time.monotonic() - began < 2.6 * limit_s
+    slow.released.set()

@@ -69,6 +69,7 @@ def walk(start_container: Start) -> Callable[[float], list[ReadableSpan]]:
         call = user.find(where(name="walk"), wait_s=30)
         for asking in (user, mind):  # tracing begins in the containers that the user knows
             asking.find(where(name="step"), wait_s=30)
+        wait_until(lambda: len(user.services(where(name="set_tracing", group="trade"))) == 3)
         user.set_tracing(True)
         try:
             call(far_m)
