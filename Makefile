@@ -41,13 +41,13 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 ALONE := tests/system/peers/test_conformance.py tests/system/test_demo.py
 SYSTEM := $(RUN) pytest --rerun --durations=10 -m system
 
-test: $(UV) ## what decides whether a change lands: code, containers and zenoh within a process; 3 minutes on two cores
+test: $(UV) ## what decides whether a change lands: code, containers and zenoh within a process; 5 minutes on two cores
 	@$(RUN) pytest --durations=10 -n 4 --dist worksteal --hypothesis-profile ci -m "not realtime and not system" $(ARGS)
 
-test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 13 minutes
+test-realtime: $(UV) ## simulators on real clocks, child processes, programs of other people; 15 minutes
 	@$(RUN) pytest --rerun --real-time --durations=10 -n 4 --dist worksteal -m "realtime and not system" $(ARGS)
 
-test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 16 minutes (root)
+test-system: $(UV) ## whole systems: network namespaces, a browser, Rust, the demo; 15 minutes (root)
 	@failed=; part() { code=0; "$$@" $(ARGS) || code=$$?; case $$code in 0|5) ;; *) failed=1 ;; esac; }; \
 	part $(SYSTEM) -n 4 --dist worksteal tests $(ALONE:%=--ignore %); \
 	part $(SYSTEM) -n 2 --dist loadfile $(ALONE); test -z "$$failed"

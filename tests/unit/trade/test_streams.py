@@ -16,6 +16,8 @@ from trade._streams.source import RateRequest, Source
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 
+pytestmark = pytest.mark.virtual_time
+
 # --- what it costs
 
 
@@ -287,7 +289,6 @@ def test_the_latest_sample_can_be_read_without_taking_it(two: Two, eventually: A
         assert stream.next(PATIENCE_S).value == 1
 
 
-@pytest.mark.virtual_time
 def test_a_fast_listener_does_not_wait_for_a_slow_one(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=0.1, keep=10) as slow:
         slow.next(PATIENCE_S)

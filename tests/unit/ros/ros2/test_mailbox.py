@@ -8,6 +8,8 @@ import pytest
 from tests.support.waiting import wait_until
 from trade_gateway.ros._mailbox import Mailbox
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Slow:
     """Takes one item at a time, when the test lets it."""
