@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from tests.endurance.explore._story import tell
+from tests.endurance.explore._story import play
 from tests.system.siege_minimised import fewest
 
 
@@ -19,15 +19,15 @@ def main(words: Sequence[str] | None = None) -> int:
     only = None if asked.only is None else [int(number) for number in asked.only.split(",") if number]
     began, virtual_s, wrong = time.monotonic(), 0.0, 0
     for seed in range(asked.first, asked.first + asked.seeds):
-        told = tell(seed, only)
-        virtual_s += told.elapsed_s
-        if told.violations:
+        outcome = play(seed, only)
+        virtual_s += outcome.elapsed_s
+        if outcome.violations:
             wrong += 1
-            print(told, *told.violations, sep="\n  ")
-            fewest_of_them = _fewest(seed, told.troubles)
+            print(outcome, *outcome.violations, sep="\n  ")
+            fewest_of_them = _fewest(seed, outcome.troubles)
             print(f"  the fewest troubles: make explore SEEDS=1 ARGS='--first {seed} --only {fewest_of_them}'")
         elif not asked.quiet:
-            print(told, flush=True)
+            print(outcome, flush=True)
     print(f"{asked.seeds} stories, {virtual_s / 3600:.3f} virtual hours, {wrong} with a violation")
     print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
     return int(wrong > 0)
@@ -35,7 +35,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def _fewest(seed: int, troubles: Sequence[str]) -> str:
     numbers = [trouble.split()[0] for trouble in troubles]
-    return ",".join(fewest(numbers, lambda some: bool(tell(seed, [int(number) for number in some]).violations)))
+    return ",".join(fewest(numbers, lambda some: bool(play(seed, [int(number) for number in some]).violations)))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def violations(
         found += two_owners([one for one in held if one.group == group])
         for stop in (one for one in stopped if one.group == group):
             found += _moves_in(log, stop)
-        found += _moves_of_nobody(group, log, [one for one in moved if one.group == group])
+        found += _moves_without_call(group, log, [one for one in moved if one.group == group])
     return found
 
 
@@ -50,7 +50,7 @@ def _moves_in(log: Sequence[Entry], stop: Stopped) -> list[str]:
     ]
 
 
-def _moves_of_nobody(group: str, log: Sequence[Entry], moved: Sequence[Moved]) -> list[str]:
+def _moves_without_call(group: str, log: Sequence[Entry], moved: Sequence[Moved]) -> list[str]:
     """What begins to move without a call that moves it, or long after it."""
     starts = events(log, "motion_started")
     asked = [(one.since, one.until + _ENDING_S) for one in moved]

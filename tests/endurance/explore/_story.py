@@ -33,7 +33,7 @@ _REACH_RAD: Final = 0.6
 
 
 @dataclass
-class Told:
+class Outcome:
     """How a story went."""
 
     seed: int
@@ -51,26 +51,26 @@ class Told:
         return f"{said}switches; {', '.join(self.troubles)}"
 
 
-def tell(seed: int, only: Sequence[int] | None = None) -> Told:
+def play(seed: int, only: Sequence[int] | None = None) -> Outcome:
     """Play a story; ``only`` leaves out all of its troubles but those of these numbers."""
     drawn = random.Random(seed)
     troubles = [(number, *trouble) for number, trouble in enumerate(sorted(_drawn(drawn)))]
     troubles = [one for one in troubles if only is None or one[0] in only]
-    told = Told(seed, [f"{number} {name} at {at_s:.2f} s" for number, at_s, name, _ in troubles])
+    outcome = Outcome(seed, [f"{number} {name} at {at_s:.2f} s" for number, at_s, name, _ in troubles])
     silent = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
         with virtual_time(seed, switch=_SWITCH, packages=["tests"]) as clock:
-            _play(_Stage(clock, told, drawn), troubles)
-            told.elapsed_s, told.switches = clock.elapsed_s, clock.switches
+            _run(_Stage(clock, outcome, drawn), troubles)
+            outcome.elapsed_s, outcome.switches = clock.elapsed_s, clock.switches
     except Exception as failed:  # noqa: BLE001 - a deadlock, or a thread that does not end, is a finding
-        told.violations.append(f"{type(failed).__name__}: {failed}")
+        outcome.violations.append(f"{type(failed).__name__}: {failed}")
     finally:
         logging.disable(silent)
-    return told
+    return outcome
 
 
-def _play(stage: "_Stage", troubles: Sequence[tuple[int, float, str, str]]) -> None:
+def _run(stage: "_Stage", troubles: Sequence[tuple[int, float, str, str]]) -> None:
     with stage.up():
         clients = [threading.Thread(target=stage.plan, args=(name,), name=name) for name in ("planner", "worker")]
         for thread in clients:
@@ -83,7 +83,7 @@ def _play(stage: "_Stage", troubles: Sequence[tuple[int, float, str, str]]) -> N
         stage.clock.stall_threads(0.0)
         for thread in clients:
             thread.join(_ENDS_S)
-        stage.told.violations += [f"a call of {one.name} does not end" for one in clients if one.is_alive()]
+        stage.outcome.violations += [f"a call of {one.name} does not end" for one in clients if one.is_alive()]
         stage.judge()
 
 
@@ -95,9 +95,9 @@ def _drawn(drawn: random.Random) -> Iterator[tuple[float, str, str]]:
 class _Stage:
     """What takes part in a story, and what is noted down of it."""
 
-    def __init__(self, clock: VirtualTime, told: Told, drawn: random.Random) -> None:
+    def __init__(self, clock: VirtualTime, outcome: Outcome, drawn: random.Random) -> None:
         self.clock = clock
-        self.told = told
+        self.outcome = outcome
         self.drawn = drawn
         self.over = threading.Event()
         self.held: list[Held] = []
@@ -113,7 +113,7 @@ class _Stage:
     def up(self) -> Iterator[None]:
         with ExitStack() as undo:
             folder = Path(undo.enter_context(tempfile.TemporaryDirectory()))
-            self.system = undo.enter_context(memory_system(seed=self.told.seed))
+            self.system = undo.enter_context(memory_system(seed=self.outcome.seed))
             for name in ("planner", "worker", "operator"):
                 self.system.container(name)
             for group, (text, bus_class) in GROUPS.items():
@@ -145,15 +145,11 @@ class _Stage:
     def plan(self, name: str) -> None:
         """Lock a group and move it, again and again."""
         container = self.system.container(name)
-        drawn = random.Random(f"{self.told.seed} {name}")
+        drawn = random.Random(f"{self.outcome.seed} {name}")
         while not self.over.is_set():
             group = drawn.choice([*GROUPS])
-            try:
+            with suppress(errors.TradeError, TimeoutError):
                 self._move(container, group, drawn)
-            except errors.TradeError:
-                pass
-            except TimeoutError:
-                pass
             if self.over.wait(drawn.uniform(0.0, 0.2)):
                 return
 
@@ -176,7 +172,7 @@ class _Stage:
                 lock.release()
 
     def _call(self, client: str, group: str, call: Callable[[], object]) -> None:
-        self.told.calls += 1
+        self.outcome.calls += 1
         since, how = time.monotonic(), ""
         try:
             call()
@@ -191,13 +187,13 @@ class _Stage:
     def judge(self) -> None:
         self.clock.sleep(_LEFT_S)
         left = [f"{one.holder.session} still has {one.resources}" for one in self.operator.locks() if one.token.number]
-        self.told.violations += left
+        self.outcome.violations += left
         logs: dict[str, Sequence[Entry]] = {group: list(bus.log.entries) for group, bus in self.buses.items()}
-        self.told.bytes = sum(map(len, logs.values()))
-        self.told.violations += violations(GROUPS, logs, self.held, self.moved, self.stopped)
+        self.outcome.bytes = sum(map(len, logs.values()))
+        self.outcome.violations += violations(GROUPS, logs, self.held, self.moved, self.stopped)
         for group, bus in self.buses.items():
             if any(device.moving for device in bus.state().devices):
-                self.told.violations.append(f"{group} still moves at the end")
+                self.outcome.violations.append(f"{group} still moves at the end")
 
 
 def _close(close: Callable[[], None]) -> None:

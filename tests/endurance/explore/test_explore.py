@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.endurance.explore._story import tell
+from tests.endurance.explore._story import play
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 
@@ -16,11 +16,11 @@ SEEDS = 50
 
 @pytest.mark.parametrize("seed", range(1, SEEDS + 1))
 def test_motion_keeps_its_rules_whatever_happens(seed: int) -> None:
-    assert tell(seed).violations == []
+    assert play(seed).violations == []
 
 
 def test_the_same_seed_gives_the_same_story() -> None:
-    assert str(tell(7)) == str(tell(7))
+    assert str(play(7)) == str(play(7))
 
 
 def _no_stop_holds(patch: pytest.MonkeyPatch) -> None:
@@ -49,4 +49,4 @@ def _no_lease_ends(patch: pytest.MonkeyPatch) -> None:
 )
 def test_the_judge_sees_what_is_wrong(mutate: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     mutate(monkeypatch)
-    assert any(re.search(says, "\n".join(tell(seed).violations)) for seed in range(1, SEEDS))
+    assert any(re.search(says, "\n".join(play(seed).violations)) for seed in range(1, SEEDS))

@@ -151,6 +151,11 @@ def test_to_import_and_to_measure_are_not_mixed(bench: Bench, words: tuple[str, 
     assert isinstance(bench.run(*words).exception, UsageError)
 
 
+def test_a_calibration_in_another_encoding_is_refused_by_its_name(bench: Bench) -> None:
+    bench.source.write_bytes(json.dumps(ARM).encode("utf-16"))
+    bench.refused("byte-order mark of UTF-16")
+
+
 def test_to_measure_needs_a_joint(bench: Bench) -> None:
     error = CliRunner().invoke(app, ["calibrate", str(bench.file)]).exception
     assert isinstance(error, UsageError)

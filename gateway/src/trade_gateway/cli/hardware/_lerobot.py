@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._text_file import read_text
 from trade.errors import ConfigurationError
 from trade_drivers import Joint, Robot, SerialBus
 
@@ -39,9 +40,10 @@ def read_calibration(path: Path) -> dict[str, Calibrated]:
         ConfigurationError: the file cannot be read, or is none of LeRobot's calibrations.
     """
     try:
-        return msgspec.json.decode(path.read_bytes().removeprefix(b"\xef\xbb\xbf"), type=dict[str, Calibrated])
-    except OSError as bad:
-        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
+        return msgspec.json.decode(read_text(path), type=dict[str, Calibrated])
+    except (OSError, UnicodeDecodeError) as bad:
+        why = bad.strerror if isinstance(bad, OSError) else bad.reason
+        raise ConfigurationError(where=str(path), problem=f"cannot be read: {why}") from None
     except msgspec.MsgspecError as bad:
         form = "one table a motor with id, homing_offset, range_min and range_max"
         raise ConfigurationError(where=str(path), problem=f"is no calibration of LeRobot, {form}: {bad}") from None
