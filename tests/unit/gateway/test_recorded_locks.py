@@ -23,6 +23,10 @@ pytestmark = pytest.mark.virtual_time
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
+    return recording_of_the_head(tmp_path)
+
+
+def recording_of_the_head(folder: Path) -> Path:
     """A recording of the head alone, in which the head, one of its joints and the tail were locked."""
     ending = threading.Event()
     with memory_system() as system:
@@ -30,7 +34,7 @@ def recording(tmp_path: Path) -> Path:
         robot.register(FakeJoints("rosie.neck.pan", "rosie.neck.tilt"), "rosie.head")
         robot.register(FakeJoints("rosie.back.wag"), "rosie.tail")
         system.settle()
-        path = tmp_path / "nod.mcap"
+        path = folder / "nod.mcap"
         with RecordingFile(path, {}) as file, Recorder(recorder, Wanted(groups=["rosie.head"]), ending) as running:
             assert running.look() == ["rosie.head.state"]
             steps = locking(planner)
