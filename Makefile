@@ -108,7 +108,7 @@ audit-deps: $(UV) ## known vulnerabilities of all that is locked, from OSV (need
 
 sbom: $(UV) ## dist/trade.cdx.json: what the packages need to run, in CycloneDX 1.5, from the lock
 	@mkdir -p dist
-	@$(UV) export --quiet --locked --no-dev --preview-features sbom-export --format cyclonedx1.5 --output-file dist/trade.cdx.json
+	@$(UV) export --quiet --locked --no-dev --group robot --preview-features sbom-export --format cyclonedx1.5 --output-file dist/trade.cdx.json
 	@echo dist/trade.cdx.json
 
 screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a browser (needs chromium)

@@ -1,6 +1,7 @@
 """The image: what can be said of it without an engine, and where one answers, that it builds and runs the demo."""
 
 import fnmatch
+import os
 import re
 import secrets
 import shutil
@@ -66,7 +67,7 @@ def test_it_is_built_with_the_uv_of_this_project_and_from_its_lock() -> None:
     [version] = re.findall(r"'uv==([\d.]+)'", (ROOT / "Makefile").read_text(encoding="utf-8"))
     [install, sync, *_] = of("RUN")
     assert f"'uv=={version}'" in install
-    assert "sync --locked --no-dev --no-editable" in sync
+    assert "sync --locked --no-dev --group robot --no-editable" in sync
 
 
 def engine() -> str | None:
@@ -109,3 +110,18 @@ def test_the_image_builds_and_runs_the_demo() -> None:
         assert ended.returncode == 0, ended.stdout[-1000:] + ended.stderr[-1000:]
     finally:
         subprocess.run([name, "rmi", "--force", tag], capture_output=True, timeout=60, check=False)
+
+
+@pytest.mark.realtime
+def test_the_demo_installs_what_it_uses() -> None:
+    uv = os.environ.get("UV", "uv")
+    words = [uv, "export", "--quiet", "--frozen", "--no-hashes", "--no-annotate", "--no-dev", "--group"]
+
+    def installed(group: str) -> set[str]:
+        listed = subprocess.run([*words, group], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        return set(re.findall(r"^([a-z][\w.-]*)==", listed, re.MULTILINE))
+
+    unused = {"pyarrow", "foxglove-sdk", "numpy", "opentelemetry-sdk", "rosbags", "mcp"}
+    assert unused <= installed("robot")
+    assert not unused & installed("demo")
+    assert {"eclipse-zenoh", "dynamixel-sdk", "uvicorn"} <= installed("demo")
