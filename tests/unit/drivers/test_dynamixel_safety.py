@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -132,3 +133,44 @@ def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     with pytest.raises(LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()
+
+
+# --- enabling
+
+
+def test_a_servo_that_does_not_come_back_after_its_restart_ends_its_enabling(
+    head: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pan, servo = head.attach().motor("neck.pan"), head.sim.devices[0]
+    restart = servo.reboot
+
+    def and_stay_away(t: float) -> None:
+        restart(t)
+        head.sim.do(trade_hil_sim.Mute(ids=(1,)))
+
+    monkeypatch.setattr(servo, "reboot", and_stay_away)
+    head.sim.do(trade_hil_sim.HardwareFault(ids=(1,), bits=0x20))
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is reported")
+    enabling = Outcome(pan.enable)
+    wait_until(lambda: trade_hil_sim.instructions(head.log, "reboot"), "it restarts")
+    began = time.monotonic()
+    error = enabling.wait().error
+    assert isinstance(error, DeviceSilent)
+    assert "neck.pan did not answer" in str(error)
+    assert time.monotonic() - began < 5.0
+    assert not head.truth(1).torque
+
+
+def test_a_servo_that_lost_what_enabling_wrote_is_not_enabled(head: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    pan, servo = head.attach().motor("neck.pan"), head.sim.devices[0]
+    pan.relax()
+    switch_on = servo._torque_on
+
+    def with_too_weak_a_supply(t: float) -> None:
+        switch_on(t)
+        servo.reboot(t)
+
+    monkeypatch.setattr(servo, "_torque_on", with_too_weak_a_supply)
+    with pytest.raises(DeviceFault, match="did not keep what enabling it wrote"):
+        pan.enable()
+    assert not head.truth(1).torque
