@@ -14,7 +14,7 @@ import trade_hil_sim
 from tests.support.simulated_robots import HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, is_silent, written_now
-from trade import service
+from trade import permit, service
 from trade.errors import (
     ConfigurationError,
     DeviceFault,
@@ -22,6 +22,9 @@ from trade.errors import (
     LimitExceeded,
     OutcomeUnknown,
 )
+from trade_drivers.bus._gate import Terms
+from trade_drivers.joints._jobs import Enable
+from trade_drivers.vendors.dynamixel import DynamixelDriver
 
 pytestmark = pytest.mark.virtual_time
 
@@ -133,6 +136,32 @@ def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     with pytest.raises(LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()
+
+
+# --- S08
+
+
+@pytest.mark.parametrize(("still", "holds"), [(0, True), (1, True), (2, False)])
+def test_S08_a_stop_holds_a_joint_that_only_its_last_measurement_shows_at_rest(
+    head: Rig, still: int, holds: bool
+) -> None:
+    exchange = DynamixelDriver().open_exchange(head.robot, head.robot.buses[0], str(head.sim.port))
+    try:
+        pan = exchange.devices[0]
+        with permit([pan.resource]) as permitted:
+            job = Enable(exchange, [pan], Terms("test", 2**63, None, permitted))
+            exchange.submit(job)
+            while not job.ended:
+                exchange.cycle()
+        for _ in range(3):
+            exchange.cycle()
+        pan.still = still  # as at the turning point of a joint that swings
+        mark = written_now()
+        exchange.stop([pan])
+        exchange.cycle()
+        assert bool(trade_hil_sim.writes(head.log, device_id=1, register="goal_position", since=mark)) == holds
+    finally:
+        exchange.wire.close()
 
 
 # --- enabling
