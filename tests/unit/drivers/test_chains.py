@@ -113,6 +113,17 @@ def holds(head: Rig) -> Iterator[None]:
     assert not head.events("motion_started", 1, over)
 
 
+def test_a_caller_elsewhere_learns_why_its_motion_ended_before_its_deadline(
+    head: Rig, robot: AttachedRobot, start_container: Callable[..., Container]
+) -> None:
+    move = start_container("person").find(PAN & where(name="move_to"), wait_s=20)
+    run = move.with_(deadline_s=1.0).start(FAR, SLOW)
+    with holds(head):
+        wait_until(run.done, "it has ended")
+    with pytest.raises(MotionStopped, match="deadline"):
+        run.result()
+
+
 @pytest.mark.parametrize("how", ["look", "look_async", "look_apart", "look_about"])
 def test_S05_a_cancelled_call_ends_what_the_service_moves_elsewhere(
     head: Rig, mind: Mind, begin: Begin, how: str

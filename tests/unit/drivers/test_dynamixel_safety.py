@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import trade_hil_sim
 from tests.support.simulated_robots import HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, is_silent, written_now
-from trade import service
+from trade import permit, service
 from trade.errors import (
     ConfigurationError,
     DeviceFault,
@@ -21,6 +22,9 @@ from trade.errors import (
     LimitExceeded,
     OutcomeUnknown,
 )
+from trade_drivers.bus._gate import Terms
+from trade_drivers.joints._jobs import Enable
+from trade_drivers.vendors.dynamixel import DynamixelDriver
 
 pytestmark = pytest.mark.virtual_time
 
@@ -132,3 +136,70 @@ def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     with pytest.raises(LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()
+
+
+# --- S08
+
+
+@pytest.mark.parametrize(("still", "holds"), [(0, True), (1, True), (2, False)])
+def test_S08_a_stop_holds_a_joint_that_only_its_last_measurement_shows_at_rest(
+    head: Rig, still: int, holds: bool
+) -> None:
+    exchange = DynamixelDriver().open_exchange(head.robot, head.robot.buses[0], str(head.sim.port))
+    try:
+        pan = exchange.devices[0]
+        with permit([pan.resource]) as permitted:
+            job = Enable(exchange, [pan], Terms("test", 2**63, None, permitted))
+            exchange.submit(job)
+            while not job.ended:
+                exchange.cycle()
+        for _ in range(3):
+            exchange.cycle()
+        pan.still = still  # as at the turning point of a joint that swings
+        mark = written_now()
+        exchange.stop([pan])
+        exchange.cycle()
+        assert bool(trade_hil_sim.writes(head.log, device_id=1, register="goal_position", since=mark)) == holds
+    finally:
+        exchange.wire.close()
+
+
+# --- enabling
+
+
+def test_a_servo_that_does_not_come_back_after_its_restart_ends_its_enabling(
+    head: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pan, servo = head.attach().motor("neck.pan"), head.sim.devices[0]
+    restart = servo.reboot
+
+    def and_stay_away(t: float) -> None:
+        restart(t)
+        head.sim.do(trade_hil_sim.Mute(ids=(1,)))
+
+    monkeypatch.setattr(servo, "reboot", and_stay_away)
+    head.sim.do(trade_hil_sim.HardwareFault(ids=(1,), bits=0x20))
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is reported")
+    enabling = Outcome(pan.enable)
+    wait_until(lambda: trade_hil_sim.instructions(head.log, "reboot"), "it restarts")
+    began = time.monotonic()
+    error = enabling.wait().error
+    assert isinstance(error, DeviceSilent)
+    assert "neck.pan did not answer" in str(error)
+    assert time.monotonic() - began < 5.0
+    assert not head.truth(1).torque
+
+
+def test_a_servo_that_lost_what_enabling_wrote_is_not_enabled(head: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    pan, servo = head.attach().motor("neck.pan"), head.sim.devices[0]
+    pan.relax()
+    switch_on = servo._torque_on
+
+    def with_too_weak_a_supply(t: float) -> None:
+        switch_on(t)
+        servo.reboot(t)
+
+    monkeypatch.setattr(servo, "_torque_on", with_too_weak_a_supply)
+    with pytest.raises(DeviceFault, match="did not keep what enabling it wrote"):
+        pan.enable()
+    assert not head.truth(1).torque

@@ -3,11 +3,13 @@
 import itertools
 import sys
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import hypothesis
+import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
@@ -290,3 +292,23 @@ def test_a_job_submitted_while_all_are_ended_is_ended_or_still_pending() -> None
     finally:
         sys.setswitchinterval(before)
     assert [*ended, *inbox] == list(range(many))
+
+
+@pytest.mark.virtual_time
+def test_S07_a_stop_that_comes_when_the_stops_were_just_served_does_not_wait_for_the_next_cycle() -> None:
+    joint, halted = Joint("a"), list[tuple[str, float]]()
+
+    class Interrupted(Exchange):
+        def serve_stops(self) -> None:
+            super().serve_stops()
+            if len(halted) == 1:  # here another thread may run
+                self.order_stop([joint], "second", lambda: halted.append(("second", time.monotonic())))
+
+    bus = SimpleNamespace(rate_hz=1e9 / PERIOD_NS, stale_after_s=STALE_NS / 1e9, watchdog_s=0.3)
+    exchange = Interrupted(bus, [joint])  # type: ignore[arg-type]
+    began = time.monotonic()
+    exchange.order_stop([joint], "first", lambda: halted.append(("first", time.monotonic())))
+    exchange.idle(10.0)
+    exchange.idle(10.0)
+    assert [name for name, _ in halted] == ["first", "second"]
+    assert halted[-1][1] - began < 0.05

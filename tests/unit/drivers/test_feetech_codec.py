@@ -14,7 +14,7 @@ from trade_drivers.joints import Goal, Sample
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, SLOW, FeetechAxis
-from trade_drivers.vendors.feetech._frames import Corrupt, Status, packet, take_status
+from trade_drivers.vendors.feetech._frames import Corrupt, Status, checksum, packet, take_status
 from trade_drivers.vendors.feetech._jobs import GOAL_BLOCK, goal_block
 from trade_hil_sim.feetech import STS3215, PacketReader, encode, status
 
@@ -91,6 +91,21 @@ def test_a_damaged_answer_is_reported_and_the_next_one_read() -> None:
     with pytest.raises(Corrupt):
         take_status(buffer, IDS, 2)
     assert take_status(buffer, IDS, 2) == Status(1, 0, b"\1\2")
+
+
+@pytest.mark.parametrize(
+    "late",
+    [
+        b"",
+        b"\x07",
+        bytes((9, 3, checksum(bytes((1, 6, 0, 9, 3))), 5)),  # its first eight bytes look like an answer of two
+        b"\1\2\3\xff\xff\4",
+    ],
+)
+def test_a_whole_answer_of_another_length_is_passed_over_and_damages_nothing(late: bytes) -> None:
+    buffer = bytearray(status(1, 0, late) + status(1, 0, b"\1\2"))
+    assert take_status(buffer, IDS, 2) == Status(1, 0, b"\1\2")
+    assert not buffer
 
 
 @pytest.mark.parametrize("cut", range(1, 8))

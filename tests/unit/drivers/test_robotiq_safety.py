@@ -55,6 +55,30 @@ def test_S01_a_command_of_a_gripper_at_rest_that_expires_while_the_bus_is_held_u
     assert not hand.writes(mark)
 
 
+def test_S01_a_reset_that_expires_ends_no_motion_of_another_call(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+    gate.hold_up()
+    mark = written_now()
+    late = Outcome(gripper.clear_fault, 0.05)
+    with call(0.05) as expires_ns:
+        sleep_past(expires_ns)
+    gate.release()
+    assert isinstance(late.wait().error, DeadlineExceeded)
+    assert moving.wait().error is None
+    assert not hand.writes(mark)
+
+
+def test_S02_a_command_that_expires_after_it_was_sent_has_an_unknown_outcome(hand: HandRig) -> None:
+    gripper = hand.active()
+    hand.sim.do(Mute(instruction="read_write"))
+    mark = written_now()
+    error = Outcome(gripper.clear_fault, deadline_s=0.1).wait().error
+    assert hand.writes(mark)
+    assert isinstance(error, OutcomeUnknown)
+
+
 def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_stopped(hand: HandRig) -> None:
     gripper = hand.active()
     hand.sim.do(Mute(instruction="read_write"))

@@ -7,6 +7,8 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, service, where
+from trade._transport.memory import Kind
+from trade.testing import memory_system
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.services._states import State, say_state
 from trade_gateway.language import Memory, Talk, read_lexicon
@@ -68,3 +70,16 @@ def test_sentences_about_links_and_switches_are_answered(looking: Container) -> 
     assert talk.say("is discovery on?").text == (
         "lamps has discovery off and broadcasting off; mind has discovery off and broadcasting off."
     )
+
+
+@pytest.mark.virtual_time
+def test_a_container_that_has_not_listed_its_services_yet_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with memory_system() as system:
+        looking = system.container("looking")
+        system.lose(lambda message: message.kind is Kind.ANSWER and message.source == "lamps")
+        system.container("lamps").register(Lamp(), "lamp")
+        looking.find("lamp.lit")
+        say_state(Output(as_json=False), looking, State.NETWORK)
+        assert capsys.readouterr().err == "warning: lamps did not answer: it has not listed its services\n"
+        answer = Talk(looking, read_lexicon(), Memory()).say("is discovery on?")
+        assert "of lamps it is not known, it does not answer" in answer.text

@@ -1,7 +1,10 @@
 """Registering and deregistering from anywhere, through the middleware's own services."""
 
+import contextlib
+
 import pytest
 
+from tests.support.waiting import wait_until
 from trade import Container, Handle, service, where
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone
 
@@ -89,3 +92,26 @@ def test_a_name_that_was_not_withdrawn_is_refused_with_those_that_were(
     with pytest.raises(ConfigurationError, match="is no group"):
         switch(here, "register", "there")(name, ("trade.mine",))
     assert switch(here, "register", "there")(name)[0]() == 0.5
+
+
+@pytest.mark.parametrize("where_it_is", ["local", "remote"])
+def test_what_is_deregistered_while_it_is_looked_up_is_not_called_afterwards(
+    here: Container, there: Container, lamp: Lamp, monkeypatch: pytest.MonkeyPatch, where_it_is: str
+) -> None:
+    caller = there if where_it_is == "local" else here
+    handle, allowed, calls = brightness(caller), caller.access.require_call, list[None]()
+
+    def meanwhile(*asked: str) -> None:
+        allowed(*asked)
+        if not calls:
+            calls.append(None)
+            there.deregister(lamp)
+            wait_until(lambda: not handle.alive, "it is gone")
+
+    monkeypatch.setattr(caller.access, "require_call", meanwhile)
+    with contextlib.suppress(ServiceGone):
+        handle()
+    assert calls
+    assert handle.key not in caller._known
+    with pytest.raises(ServiceGone):
+        handle()

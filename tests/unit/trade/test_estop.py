@@ -4,6 +4,7 @@ import os
 import random
 import tempfile
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._audit.events import Event
 from trade._estop.ledger import MOST_OF_ONE
-from trade._estop.worker import SHARED_S
+from trade._estop.worker import SHARED_S, Worker
 from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
 from trade._protocol.keys import Address, alive_key, registry_key
 from trade._protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
@@ -663,3 +664,17 @@ def test_S09_a_container_whose_registry_is_unread_is_reported_as_missing() -> No
         report = me.estop("smoke", limit_s=0.5)
         assert not report.complete
         assert [name.rpartition("/")[2] for name in report.missing] == ["far"]
+
+
+def test_work_that_comes_while_the_last_step_ends_is_done() -> None:
+    steps: list[float] = []
+
+    def step() -> None:
+        steps.append(time.monotonic())
+        if len(steps) == 1:
+            worker.wake()  # another e-stop: the thread is about to end
+
+    worker = Worker(step, "one e-stop after the other")
+    worker.wake()
+    worker.close()
+    assert len(steps) == 2

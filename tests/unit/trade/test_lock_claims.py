@@ -1,14 +1,20 @@
 """A lock with a constraint holds a part of each alternative, says what, and lets nothing else of it be commanded."""
 
 import threading
+import time
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from tests.support.two_joint_robot import Joint, Robot
 from tests.support.waiting import PATIENCE_S
+from tests.unit.trade.lock_table_rig import Table
 from trade import Handle, service, where
 from trade._locks import api
+from trade._locks.remote_locks import RemoteLocks, SharedResource
+from trade._protocol.keys import Address
+from trade._resources.grants import LockRequest
 from trade.errors import IncompleteGroup, LockLost, NotLocked
 
 pytestmark = pytest.mark.virtual_time
@@ -152,3 +158,25 @@ def test_a_lost_lock_says_that_it_is_lost(robot: Robot) -> None:
     with pytest.raises(LockLost), robot.me.lock(A | B):
         robot.other.break_lock(A, "test")
         robot.find("a")(0.1)
+
+
+def test_locks_in_several_systems_share_the_time_that_the_request_may_wait() -> None:
+    patience = list[float]()
+
+    class Lender:
+        """Another system, in which a lock takes two seconds."""
+
+        def lock(self, _call: object, _wanted: object, terms: LockRequest, *_: object) -> Mock:
+            patience.append(terms.wait_s)
+            time.sleep(2.0)
+            return Mock()
+
+    address = Address("tester", "home", "1")
+    resources = [SharedResource(f"arm{number}", address, "arm", Lender()) for number in range(3)]  # type: ignore[arg-type]
+    table = Table()
+    try:
+        with RemoteLocks(table.table, "1").behind(Mock(), resources, LockRequest(wait_s=3.0), Mock()) as loan:
+            assert loan.waited_s == pytest.approx(6.0, abs=0.1)
+    finally:
+        table.close()
+    assert patience == pytest.approx([3.0, 1.0, 0.0], abs=0.1)

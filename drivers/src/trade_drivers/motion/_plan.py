@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from msgspec import Struct
 
@@ -10,9 +10,6 @@ from trade import progress
 from trade_drivers.motion._spline import Curve
 
 __all__ = ["Course", "FollowProgress", "JointLimits", "Plan", "Tolerances", "Track"]
-
-_LEAD_NS: Final = 50_000_000
-"""The time from the readiness of the last bus to the start, so that each bus has a cycle in between."""
 
 
 class JointLimits(Struct, frozen=True, kw_only=True):
@@ -59,19 +56,19 @@ class Course:
         """The error that ended the plan on all buses."""
         self._errors_rad = dict.fromkeys(joints, 0.0)
         self._lock = threading.Lock()
-        self._parts = self._awaited = 1
+        self._awaited = 1
         self._began_ns: int | None = None
 
     def split(self, parts: int) -> None:
         """Sets the number of buses that execute the plan; it starts when all of them are ready."""
-        self._parts = self._awaited = parts
+        self._awaited = parts
 
     def ready(self, now_ns: int) -> None:
         """Reports that one bus is ready to start; the last one starts the clock."""
         with self._lock:
             self._awaited -= 1
             if self._awaited == 0:
-                self._began_ns = now_ns + (_LEAD_NS if self._parts > 1 else 0)
+                self._began_ns = now_ns
 
     def elapsed_s(self, at_ns: int) -> float:
         """Returns the seconds since the start; negative before it."""

@@ -174,14 +174,16 @@ def _switches(asker: Asker, gaps: Gaps) -> Answer:
 
 def _states(asker: Asker, state: str, gaps: Gaps) -> tuple[list[Any], list[str]]:
     """What all other containers, or one of them, answer about a state, and sentences about those that do not."""
-    asked = asker.container.services(where(name=state, group="trade") & ~where.local)
-    name = one_of("container", gaps.get("container"), [handle.container for handle in asked])
+    present = asker.container.everywhere(state)
+    asked, unlisted = [one for one in present.handles if not one.local], [one.container for one in present.silent]
+    name = one_of("container", gaps.get("container"), [*(handle.container for handle in asked), *unlisted])
     asked = [handle for handle in asked if name in ("", handle.container)]
     outcomes = asker.container.call_all(asked)
     denied = next((outcome.error for outcome in outcomes if isinstance(outcome.error, AccessDenied)), None)
     if denied is not None:
         raise denied
-    silent = sorted(outcome.handle.container for outcome in outcomes if not outcome.ok)
+    silent = [outcome.handle.container for outcome in outcomes if not outcome.ok]
+    silent = sorted([*silent, *(one for one in unlisted if name in ("", one))])
     unknown = [f"of {one} it is not known, it does not answer" for one in silent]
     return [outcome.result for outcome in outcomes if outcome.ok], unknown
 

@@ -188,6 +188,7 @@ class Container:
     call = delegated("_lookup", Lookup.call)
     call_all = delegated("_lookup", Lookup.call_all)
     call_sequence = delegated("_lookup", Lookup.call_sequence)
+    everywhere = delegated("_lookup", Lookup.everywhere)
     afind: Afind = cast("Afind", in_thread(cast("Any", find)))
     acall: Acall = cast("Acall", adelegated("_lookup", Lookup.acall))
     acall_all = adelegated("_lookup", Lookup.acall_all)

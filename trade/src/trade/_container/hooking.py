@@ -19,6 +19,8 @@ from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuch
 
 _logger = logging.getLogger("trade")
 
+_EVERYWHERE: Final = where(name="attach_hook", group=DOMAIN)
+
 
 class Hook:
     """A hook that this container has attached; it ends when it is detached or this container ends."""
@@ -51,15 +53,17 @@ class Hook:
                 self._home.lookup.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
             ).result()
             return
-        everywhere = where(name="attach_hook", group=DOMAIN)
-        runs = [self._attach(handle) for handle in self._home.lookup.services(everywhere)]
+        present = self._home.lookup.everywhere("attach_hook")
+        for address in present.silent:
+            _logger.warning("hook %s is not attached in %s yet: it has not listed its services", self.id, address.who)
+        runs = [self._attach(handle) for handle in present.handles]
         errors = [error for error in (run.exception() for run in runs) if error is not None]
         refusal = next((error for error in errors if isinstance(error, AccessDenied | ConfigurationError)), None)
         if refusal is not None:
             self.detach()
             raise refusal
         # Present containers are reported, too: a second attachment of the same hook has no effect.
-        self._later = self._home.notifying.joined(everywhere, self._join, existing=True)
+        self._later = self._home.notifying.joined(_EVERYWHERE, self._join, existing=True)
 
     def _attach(self, handle: Handle) -> Run:
         terms: dict[str, Any] = {"handle" if isinstance(self.target, Handle) else "constraint": self.target}

@@ -6,19 +6,20 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, ParamSpec, Protocol, TypeVar, cast, overload
 
 from trade._calls import batch
+from trade._calls.everywhere import Everywhere, answers, everywhere
 from trade._calls.handle import Bound, CallHost, Handle, service_of
 from trade._calls.picking import Pick, Picker, narrowed, required
 from trade._container.group_view import GroupView, Members
 from trade._container.reachability import Reachability, look_around
 from trade._context.call_context import patience_s
 from trade._discovery.dialer import Dialer
-from trade._protocol.keys import DOMAIN, ServiceKey
+from trade._protocol.keys import ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, group_at, service_at, services_at, where
 from trade._registry.registry import Change, Record, Registry
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services
 from trade._security.authorizer import Authorizer
 from trade._table import Table
-from trade.errors import AccessDenied, ConfigurationError
+from trade.errors import ConfigurationError
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -378,16 +379,18 @@ class Lookup:
         return await batch.sequence_async(self._bound(calls, (), {}), go_on=go_on)
 
     def ask_all(self, name: str, *args: Any) -> list[Any]:
-        """The results of one of the middleware's own services in all containers, except those that leave meanwhile.
+        """The results of `asked`."""
+        return [outcome.result for outcome in self.asked(name, *args)]
 
-        Raises:
-            AccessDenied: one of them does not allow it.
-        """
-        outcomes = self.call_all(where(name=name, group=DOMAIN), *args)
-        denied = next((outcome.error for outcome in outcomes if isinstance(outcome.error, AccessDenied)), None)
-        if denied is not None:
-            raise denied
-        return [outcome.result for outcome in outcomes if outcome.ok]
+    def asked(self, name: str, *args: Any, container: str = "*") -> list[batch.Outcome]:
+        """The successful calls of one of the middleware's own services in all containers; see `answers`."""
+        present = self.everywhere(name, container=container)
+        return answers(name, self.call_all(present.handles, *args), present.silent)
+
+    def everywhere(self, name: str, *, container: str = "*") -> Everywhere:
+        """One of the middleware's own services in all present containers."""
+        self._check_open()
+        return everywhere(self.home, self._registry, name, container)
 
     def _bound(
         self, which: Constraint | str | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]

@@ -7,13 +7,13 @@ from typing import Final, Protocol
 from msgspec import Struct
 
 from trade._calls.batch import Outcome
+from trade._calls.everywhere import Everywhere, answers
 from trade._calls.handle import Bound, Handle
 from trade._container.lookup import Lookup
-from trade._protocol.keys import DOMAIN, ServiceKey
-from trade._registry.constraints import Constraint, where
+from trade._protocol.keys import Address, ServiceKey
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
-from trade.errors import AccessDenied, NoSuchCall
+from trade.errors import NoSuchCall
 
 NOT_TRACED: Final = "(not traced)"
 
@@ -50,8 +50,8 @@ class Trace(Struct, frozen=True, kw_only=True):
 class SystemLookup(Protocol):
     """Finds and calls services of the system, as a container does."""
 
-    def services(self, constraint: Constraint | None = None, /) -> list[Handle]: ...
-    def call_all(self, which: Constraint | Iterable[Handle | Bound], /) -> list[Outcome]: ...
+    def everywhere(self, name: str, *, container: str = "*") -> Everywhere: ...
+    def call_all(self, which: Iterable[Handle | Bound], /) -> list[Outcome]: ...
 
 
 class LogReader:
@@ -59,7 +59,9 @@ class LogReader:
 
     def __init__(self, lookup: SystemLookup, container: str) -> None:
         self._lookup = lookup
-        self._where = where(name="log_lines", group=DOMAIN, container=container)
+        self._container = container
+        self._silent = set[Address]()
+        """The containers that the last reading missed: the log names them once."""
         self._read: dict[ServiceKey, int] = {}
         self._known: dict[str, int] = {}
         """The last returned line of each process."""
@@ -70,10 +72,11 @@ class LogReader:
         Raises:
             AccessDenied: the policy does not let this container read group ``trade``.
         """
-        handles = self._lookup.services(self._where)
-        outcomes = self._lookup.call_all([handle.bind(self._read.get(handle.key, 0)) for handle in handles])
+        present = self._lookup.everywhere("log_lines", container=self._container)
+        outcomes = self._lookup.call_all([handle.bind(self._read.get(handle.key, 0)) for handle in present.handles])
+        named, self._silent = self._silent, set(present.silent)
         new: dict[tuple[str, int], LogLine] = {}
-        for outcome in granted(outcomes):
+        for outcome in answers("log_lines", outcomes, sorted(self._silent - named, key=str)):
             lines: list[LogLine] = outcome.result
             if lines:
                 self._read[outcome.handle.key] = lines[-1].number
@@ -107,8 +110,8 @@ class Tracing:
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
         """
-        outcomes = self._lookup.call_all(where(name="set_tracing", group=DOMAIN, container=container), on)
-        return sorted(outcome.handle.container for outcome in granted(outcomes))
+        outcomes = self._lookup.asked("set_tracing", on, container=container)
+        return sorted(outcome.handle.container for outcome in outcomes)
 
     def spans(self, *, container: str = "*") -> list[Span]:
         """The spans that the containers recorded while they were traced, by time.
@@ -147,19 +150,8 @@ class Tracing:
         return LogReader(self._lookup, container).read()
 
     def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
-        outcomes = self._lookup.call_all(where(name="spans", group=DOMAIN, container=container), calls)
-        return sorted(itertools.chain.from_iterable(one.result for one in granted(outcomes)), key=_when)
-
-
-def granted(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """The successful outcomes; containers that leave meanwhile have none. Raises AccessDenied if one forbids it."""
-    found: list[Outcome] = []
-    for outcome in outcomes:
-        if isinstance(outcome.error, AccessDenied):
-            raise outcome.error
-        if outcome.ok:
-            found.append(outcome)
-    return found
+        outcomes = self._lookup.asked("spans", calls, container=container)
+        return sorted(itertools.chain.from_iterable(one.result for one in outcomes), key=_when)
 
 
 def _when(span: Span) -> tuple[float, int]:

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple, Protocol
 
+from trade._calls.everywhere import Everywhere
 from trade._calls.handle import Handle
 from trade._calls.run import Run
 from trade._context.outgoing import Claim
@@ -66,7 +67,7 @@ class LockHost(Protocol):
     def handle(self, key: ServiceKey) -> Handle: ...
     def services(self, constraint: Constraint | None = None, /) -> list[Handle]: ...
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None: ...
-    def addresses(self) -> list[Address]: ...
+    def everywhere(self, name: str) -> Everywhere: ...
 
 
 class LockApi:
@@ -187,10 +188,11 @@ class LockApi:
     def known(self) -> LockOverview:
         """The known locks of the system, and the containers that did not answer."""
         runs: list[tuple[Address, Run]] = []
-        found, silent = list[LockInfo](), list[Address]()
-        for address in self._home.addresses():
+        present = self._home.everywhere("locks")
+        found, silent = list[LockInfo](), list(present.silent)
+        for handle in present.handles:
             with contextlib.suppress(TradeError):  # it left meanwhile
-                runs.append((address, self._service(address, "locks").with_(deadline_s=_ANSWER_S).start()))
+                runs.append((handle.key.address, handle.with_(deadline_s=_ANSWER_S).start()))
         for address, run in runs:
             try:
                 found.extend(run.result())

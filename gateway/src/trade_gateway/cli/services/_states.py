@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from msgspec import Struct
 
-from trade import Container, LinkInfo, ListenerInfo, NetworkInfo, StateEvent, where
+from trade import Container, LinkInfo, ListenerInfo, NetworkInfo, StateEvent
 from trade._timestamps import clock
 from trade.errors import AccessDenied
 from trade_gateway.cli._output import Output, complain
@@ -50,7 +50,10 @@ def _ask_each(container: Container, name: str) -> list[Any]:
     Raises:
         AccessDenied: one of them does not allow it.
     """
-    outcomes = container.call_all(where(name=name, group="trade") & ~where.local)
+    present = container.everywhere(name)
+    for address in present.silent:
+        complain(f"{address.container} did not answer: it has not listed its services")
+    outcomes = container.call_all([handle for handle in present.handles if not handle.local])
     for outcome in outcomes:
         if isinstance(outcome.error, AccessDenied):
             raise outcome.error

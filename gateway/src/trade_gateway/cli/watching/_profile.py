@@ -10,7 +10,7 @@ import typer
 from msgspec import Struct
 from rich.markup import escape
 
-from trade import CallDeviation, CallModel, Span, where
+from trade import CallDeviation, CallModel, Span
 from trade._atomic_file import replace
 from trade._telemetry.call_model import deviations, learn
 from trade._text_file import read_text
@@ -94,7 +94,10 @@ def profile(
 def _watch(context: typer.Context, out: Output, container: str, usual: CallModel) -> None:
     """Gives containers a model to compare their calls with."""
     with visitor_among_others(context) as member:
-        asked = member.call_all(where(name="watch_calls", group="trade", container=container) & ~where.local, usual)
+        present = member.everywhere("watch_calls", container=container)
+        asked = member.call_all([handle for handle in present.handles if not handle.local], usual)
+    for address in present.silent:
+        complain(f"{address.container} did not answer: it has not listed its services")
     for outcome in asked:
         if not outcome.ok:
             complain(f"{outcome.handle.container} did not answer: {outcome.error}")
@@ -103,7 +106,7 @@ def _watch(context: typer.Context, out: Output, container: str, usual: CallModel
         out.data({"watched": watched})
     else:
         out.say(f"these compare the calls that they make: {escape(', '.join(watched)) or 'none'}")
-    if len(watched) < len(asked):
+    if present.silent or len(watched) < len(asked):
         raise typer.Exit(1)
 
 
