@@ -216,10 +216,15 @@ class Components:
         leaving.callback(self.subscriptions.close)
 
     def _build_estop(self, leaving: contextlib.ExitStack) -> None:
-        state_dir = self._settings.state_dir
-        kept = None if state_dir is None else state_dir / self._settings.system / "estop"
         self.estop = EstopController(
-            self.transport, self._address, self.registry, self.locks, self.providers, kept, self._access, self.audit
+            self.transport,
+            self._address,
+            self.registry,
+            self.locks,
+            self.providers,
+            self._settings,
+            self._access,
+            self.audit,
         )
         leaving.callback(self.estop.close)
         self.deadman = self.estop.deadman
