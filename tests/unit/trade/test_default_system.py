@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Settings, service, where
-from trade._default_system import default_system, is_of_user
+from trade._default_system import default_system, is_of_user, take_over
 from trade._transport.memory import MemoryTransport
 from trade.errors import Stopped
 from trade.testing import Network
+from trade_drivers.bus._angle_store import AngleStore
 
 pytestmark = pytest.mark.virtual_time
 
@@ -171,3 +172,21 @@ def test_S09_an_open_estop_latches_whatever_home_the_environment_names(
             assert container.estop_clear([estop], limit_s=30).complete
         with robot(settings(second)) as (container, _):
             assert move(container) == 0.3
+
+
+@pytest.mark.real_clock
+@pytest.mark.parametrize("folder", ["user{uid}-ffffffff", "lab"])
+def test_S23_last_known_angles_of_an_earlier_name_are_taken_over(tmp_path: Path, folder: str) -> None:
+    """Without them, a zero that was lost with power would not be noticed. An explicit system takes nothing over."""
+    own = tmp_path / folder.format(uid=os.getuid())
+    for name, angle in (("tom@oldest", 1.0), ("tom@newest", 2.0)):
+        store = AngleStore(tmp_path / name / "angles" / "rosie.sqlite", print)
+        assert store.save({"rosie.pan": (angle, angle)}).result()
+        store.close()
+    os.utime(tmp_path / "tom@oldest" / "angles" / "rosie.sqlite", (1, 1))
+    for _ in range(2):  # the second time, it is there, and keeps its own
+        take_over(own, "angles/rosie.sqlite")
+        store = AngleStore(own / "angles" / "rosie.sqlite", print)
+        assert store.load() == ({} if folder == "lab" else {"rosie.pan": (2.0, 2.0)})
+        store.close()
+        os.utime(tmp_path / "tom@oldest" / "angles" / "rosie.sqlite")

@@ -5,13 +5,14 @@ import getpass
 import hashlib
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 from trade._protocol.keys import as_chunk
 
-__all__ = ["account_home", "account_name", "default_system", "earlier_folders", "is_of_user"]
+__all__ = ["account_home", "account_name", "default_system", "earlier_folders", "is_of_user", "take_over"]
 
 _MACHINE_IDS: Final = (Path("/etc/machine-id"), Path("/var/lib/dbus/machine-id"))
 _MACHINE_ID: Final = re.compile(r"[0-9a-f]{32}")
@@ -39,6 +40,30 @@ def earlier_folders(base: Path, system: str) -> Iterator[Path]:
     """The folders in a base folder that belong to default systems of this user, without that of the system itself."""
     with contextlib.suppress(OSError):
         yield from (one for one in sorted(base.iterdir()) if one.name != system and is_of_user(one.name))
+
+
+def take_over(folder: Path, database: str) -> None:
+    """Copies a database (SQLite) to a default system's folder from its newest earlier name, unless it is there.
+
+    Args:
+        folder: of the system; that of an explicit system takes nothing over.
+        database: the name of its file in that folder, such as ``angles/rosie.sqlite``.
+    """
+    wanted = folder / database
+    if wanted.exists() or not folder.name.startswith(_of_user()):
+        return
+    found = [one / database for one in earlier_folders(folder.parent, folder.name) if (one / database).exists()]
+    if not found:
+        return
+    newest = max(found, key=lambda one: max(part.stat().st_mtime_ns for part in _parts(one)))
+    wanted.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for part in reversed(_parts(newest)):  # the database itself comes last: without it, it is taken over again
+        shutil.copy2(part, wanted.with_name(part.name))
+
+
+def _parts(database: Path) -> list[Path]:
+    log = database.with_name(f"{database.name}-wal")
+    return [database, log] if log.exists() else [database]
 
 
 def account_name() -> str:
