@@ -184,7 +184,7 @@ def test_S23_last_known_angles_of_an_earlier_name_are_taken_over(tmp_path: Path,
         assert store.save({"rosie.pan": (angle, angle)}).result()
         store.close()
     os.utime(tmp_path / "tom@oldest" / "angles" / "rosie.sqlite", (1, 1))
-    for _ in range(2):  # the second time, it is there, and keeps its own
+    for _ in range(2):  # the second time, it exists, and stays
         take_over(own, "angles/rosie.sqlite")
         store = AngleStore(own / "angles" / "rosie.sqlite", print)
         assert store.load() == ({} if folder == "lab" else {"rosie.pan": (2.0, 2.0)})

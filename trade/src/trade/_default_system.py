@@ -43,7 +43,7 @@ def earlier_folders(base: Path, system: str) -> Iterator[Path]:
 
 
 def take_over(folder: Path, database: str) -> None:
-    """Copies a database (SQLite) to a default system's folder from its newest earlier name, unless it is there.
+    """Copies a database (SQLite) to a default system's folder from its newest earlier name, unless it has its own.
 
     Args:
         folder: of the system; that of an explicit system takes nothing over.

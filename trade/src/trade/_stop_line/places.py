@@ -6,6 +6,8 @@ import ssl
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from trade._default_system import earlier_folders
+from trade._paths import runtime_folders
 from trade._security.certificates import line_context
 from trade._settings import Settings
 from trade._transport.endpoints import Endpoint
@@ -49,13 +51,22 @@ def places(settings: Settings) -> list[Place]:
     """The stop lines of this system's containers: those of this user on this host, and those it connects to."""
     found: list[Place] = []
     with contextlib.suppress(OSError, ConfigurationError):
-        found += [Place(path.name, path=path) for path in host_sockets(settings.system, _MARK)]
+        for system in (settings.system, *_earlier(settings)):
+            found += [Place(path.name, path=path) for path in host_sockets(system, _MARK)]
     certificate = settings.certificate()
     if certificate is not None:
         context = line_context(certificate, server=False)
         ends = map(Endpoint.read, settings.connect)
         found += [Place(str(end), endpoint=end, context=context) for end in ends if end.protocol == "tls"]
     return found
+
+
+def _earlier(settings: Settings) -> list[str]:
+    """The earlier names of the default system: a container that runs since then, or of an earlier release, has one."""
+    if settings.explicit_system:
+        return []
+    names = (one.name for folder in runtime_folders() for one in earlier_folders(folder, settings.system))
+    return sorted(set(names))
 
 
 def host_socket(system: str) -> tuple[socket.socket, Path] | None:
