@@ -22,7 +22,8 @@ from trade._stop_line import StopLines, StopReport
 from trade._stop_line.group_stop import together
 from trade._stop_line.listener import MOST_STRANGERS
 from trade._stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
-from trade._stop_line.places import line_port, places
+from trade._stop_line.places import Place, line_port, places
+from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import listen_on_host
 
 StartContainer = Callable[..., Container]
@@ -381,3 +382,62 @@ def test_a_stranger_has_a_second(driver: Container) -> None:
         began = time.monotonic()
         assert sock.recv(1) == b""
         assert time.monotonic() - began >= 0.5  # not at once: who is slow is no flood
+
+
+# --- when a report is enough
+
+
+@pytest.fixture
+def dead() -> Iterator[Place]:
+    """A place on a network where nothing listens."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    yield Place(f"tls/127.0.0.1:{port - 1000}", endpoint=Endpoint("tls", "127.0.0.1", port - 1000))
+
+
+@pytest.mark.parametrize("ask", ["stop", "estop"])
+def test_a_dead_endpoint_keeps_no_report_waiting(
+    driver: Container, lamp: Lamp, dead: Place, ask: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = [*places(driver.settings), dead]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    line = lines(driver)
+    asked = line.stop("rosie", "", 60) if ask == "stop" else line.estop("abc", "", 60)
+    assert asked.wait_enough().complete
+    assert asked.is_enough()
+    assert asked.unreached() == [dead.name]
+    assert lamp.stops >= 1
+
+
+def test_a_place_that_accepts_and_does_not_answer_is_waited_for(
+    driver: Container, dead: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of a robot in a flood, or frozen: the others' confirmations do not speak for it."""
+    assert dead.endpoint is not None
+    known = [*places(driver.settings), dead]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    with socket.create_server(("127.0.0.1", line_port(dead.endpoint.port))):
+        asked = lines(driver).estop("abc", "", 1.5)
+        assert asked.wait_enough().complete  # what is confirmed, is confirmed
+        assert not asked.is_enough()
+        assert asked.over() or asked.wait().complete
+        assert dead.name not in asked.unreached()
+
+
+def test_a_place_that_refuses_the_request_makes_no_report_enough(
+    driver: Container, lamp: Lamp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = [*places(driver.settings), Place(".stop-1-gone", path=runtime_folder() / ".stop-1-gone")]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    asked = lines(driver).estop("abc", "", 3)
+    assert asked.wait_enough().complete
+    assert not asked.is_enough()
+
+
+def test_endpoints_without_a_stop_line_are_reported_by_whether_they_answer(driver: Container, dead: Place) -> None:
+    assert dead.endpoint is not None
+    gone = f"tcp/127.0.0.1:{dead.endpoint.port}"
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        there = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+        settings = Settings.read(system=driver.settings.system, container="panel", connect=[there, gone])
+        assert StopLines(settings).without_line() == {there: True, gone: False}

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any, Final
 
@@ -121,6 +121,12 @@ REMEDIES: Final = {
 _FRAMES: Final = re.compile(r'^  File "(.+)", line (\d+), in (.+)\n((?:    .*\n)?)', re.MULTILINE)
 """The entries of a Python traceback: file, line, function and code."""
 _CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
+
+
+def say_unreached(endpoints: Iterable[str]) -> None:
+    """Prints on standard error which endpoints did not answer a stop that all others have confirmed."""
+    for endpoint in endpoints:
+        complain(f"{endpoint} (TRADE_CONNECT) does not answer; a robot that is reached only there heard nothing")
 
 
 def as_commands(device: str, remedy: str) -> str:

@@ -35,13 +35,21 @@ class Place(NamedTuple):
 
     def connect(self, limit_s: float) -> socket.socket:
         """Connects to it. Raises OSError if no container accepts within that time (seconds, for each step)."""
+        return self.secured(self.dial(limit_s))
+
+    def dial(self, limit_s: float) -> socket.socket:
+        """The first step: a plain connection. Raises OSError."""
         if self.path is not None:
             return dial_on_host(self.path, limit_s)
-        assert self.endpoint is not None and self.context is not None  # noqa: S101 - one or the other
-        host = self.endpoint.host
-        plain = socket.create_connection((host, line_port(self.endpoint.port)), timeout=limit_s)
+        assert self.endpoint is not None  # noqa: S101 - one or the other
+        return socket.create_connection((self.endpoint.host, line_port(self.endpoint.port)), timeout=limit_s)
+
+    def secured(self, plain: socket.socket) -> socket.socket:
+        """The second step: that connection with TLS, if it needs it. Closes it on failure. Raises OSError."""
+        if self.endpoint is None or self.context is None:
+            return plain
         try:
-            return self.context.wrap_socket(plain, server_hostname=host)
+            return self.context.wrap_socket(plain, server_hostname=self.endpoint.host)
         except BaseException:
             plain.close()
             raise
