@@ -55,12 +55,17 @@ class Place(NamedTuple):
             raise
 
 
+def host_places(system: str) -> list[Place]:
+    """The stop lines of a system's containers of this user on this host. Raises OSError, ConfigurationError."""
+    return [Place(path.name, path=path) for path in host_sockets(system, _MARK)]
+
+
 def places(settings: Settings) -> list[Place]:
     """The stop lines of this system's containers: those of this user on this host, and those it connects to."""
     found: list[Place] = []
     with contextlib.suppress(OSError, ConfigurationError):
         for system in (settings.system, *_earlier(settings)):
-            found += [Place(path.name, path=path) for path in host_sockets(system, _MARK)]
+            found += host_places(system)
     certificate = settings.certificate()
     if certificate is not None:
         context = line_context(certificate, server=False)

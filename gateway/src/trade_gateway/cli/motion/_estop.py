@@ -11,7 +11,7 @@ from trade._stop_line import StopLines
 from trade.errors import NoSuchEstop
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_unreached
+from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
 from trade_gateway.cli._system_choice import choice_of, visitor
 
 
@@ -57,11 +57,19 @@ def estop(
             _say(out, report, system, "cleared" if clear else "stopped", container.address.who)
         if reachability is None:
             reachability = container.reachability(limit_s=0)  # only now, so that it does not delay the e-stop
-    if reachability.apart and not clear:
-        raise reachability.as_error(system, "containers there were not stopped; use the switch that cuts the power")
-    if clear and not reachability.complete:
-        raise reachability.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
-    if not report.complete or not (clear or _known(report, container.address.who)):
+    _end(report, reachability, container, clear=clear)
+
+
+def _end(report: EstopReport, found: Reachability, container: Container, *, clear: bool) -> None:
+    """Ends the command with an error or another exit code than 0, unless all containers are known to have done it."""
+    system, known = container.settings.system, _known(report, container.address.who)
+    if not (clear or known):
+        say_elsewhere(container.settings)
+    if found.apart and not clear:
+        raise found.as_error(system, "containers there were not stopped; use the switch that cuts the power")
+    if clear and not found.complete:
+        raise found.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
+    if not report.complete or not (clear or known):
         raise typer.Exit(1)
 
 
@@ -89,6 +97,7 @@ def _stopped_by_line(context: typer.Context, out: Output, estop_id: str, reason:
     else:
         _say(out, report, settings.system, "stopped", "")
     say_unreached([*asked.unreached(), *linked])
+    say_elsewhere(settings, earlier=True)  # the e-stop has to be cleared there, too
     return True
 
 
@@ -102,6 +111,7 @@ def _clear(container: Container, found: Reachability, ids: list[str] | None, lim
     system, cannot_tell = container.settings.system, "so it is unknown whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
     if not found.others or not (wanted or found.complete):
+        say_elsewhere(container.settings)
         raise found.as_error(system, cannot_tell)
     try:
         return container.estop_clear(wanted, limit_s=limit_s) if wanted else None

@@ -9,7 +9,7 @@ from trade import StopReport
 from trade._stop_line import StopLines, together
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_unreached
+from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
 from trade_gateway.cli._system_choice import choice_of, visitor
 
 
@@ -44,6 +44,8 @@ def stop(
         _say(out, report, settings.system)
     if asked.is_enough():
         say_unreached(asked.unreached())
+    if not (report.stopped or report.failed):
+        say_elsewhere(settings)
     if not report.complete:
         raise typer.Exit(1)
 
