@@ -1,5 +1,6 @@
 """What the page of the wire protocol says of defaults, types and folders is what the codec and the folders are."""
 
+import os
 import re
 import tempfile
 from pathlib import Path
@@ -60,19 +61,24 @@ def test_what_a_service_leaves_out_is_understood_as_the_page_says() -> None:
         assert decode_provider(msgspec.msgpack.encode(reported)).services[0].cancel == cancel
 
 
-@pytest.mark.parametrize("named", ["TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"])
+@pytest.mark.parametrize("named", ["TRADE_RUNTIME_DIR", "/run/user/<uid>", "neither"])
 def test_the_runtime_folder_is_where_the_page_says(named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reported = {row[0].strip("`"): row[1] for row in rows("The runtime folder is")}
-    assert set(reported) == {"TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"}
+    assert set(reported) == {"TRADE_RUNTIME_DIR", "/run/user/<uid>", "neither"}
+    uid = str(os.getuid())
+    for place in ("run/user", "tmp", "named"):
+        (tmp_path / place).mkdir(parents=True)
+    monkeypatch.setattr("trade._paths._OF_LOGINS", tmp_path / "run" / "user")
+    monkeypatch.setattr("trade._paths._ALWAYS", tmp_path / "tmp")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "elsewhere"))
     monkeypatch.delenv("TRADE_RUNTIME_DIR", raising=False)
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "other"))  # it does not count
+    if named == "TRADE_RUNTIME_DIR":
+        monkeypatch.setenv(named, str(tmp_path / "named"))
     if named != "neither":
-        monkeypatch.setenv(named, str(tmp_path))
+        (tmp_path / "run" / "user" / uid).mkdir()
     folder = runtime_folder()
-    expected = (
-        reported[named].split("`")[1].replace(f"${named}", str(tmp_path)).replace("<uid>", f"{folder.stat().st_uid}")
-    )
-    assert folder == tmp_path / expected
+    expected = reported[named].split("`")[1].replace("$TRADE_RUNTIME_DIR", "named").replace("<uid>", uid)
+    assert folder == tmp_path / expected.lstrip("/")
     user, password = user_secret()
     assert (user, password) == ("host", (folder / "@secret").read_text(encoding="ascii").strip())

@@ -10,6 +10,7 @@ from typing import Final, TypeVar
 
 import trade
 from trade import Measure
+from trade._default_system import take_over
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
@@ -203,6 +204,10 @@ def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLo
 def _angle_store(robot: Robot, state_dir: Path | None, undo: ExitStack) -> AngleStore | None:
     if state_dir is None or not robot.joints:
         return None
+    try:
+        take_over(state_dir, f"angles/{robot.name}.sqlite")
+    except OSError as bad:
+        _log.warning("the last known angles of an earlier name of this system cannot be copied: %s", bad)
     angles = AngleStore(state_dir / "angles" / f"{robot.name}.sqlite", _log.warning)
     undo.callback(angles.close)  # closes after the buses, to save where they left their joints, too
     return angles

@@ -1,5 +1,9 @@
 """What naive code makes of calibration, calls within calls, discovery and rights. Each changes one function."""
 
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 
 from tests.contract.complaints.hosts import Wifi
@@ -42,3 +46,14 @@ def a_check_has_rules_of_its_own(patch: pytest.MonkeyPatch) -> None:
         return Policy(policy.roles.values(), policy.identities).decide(who, verb, what)  # revoked or not
 
     patch.setattr("trade_gateway.cli.rights._policy._decision", decision)
+
+
+def the_default_system_is_named_after_the_host(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade._settings.default_system", lambda: f"tom@{socket.gethostname()}")
+
+
+def estops_of_earlier_names_are_ignored(patch: pytest.MonkeyPatch) -> None:
+    def none(_base: Path, _system: str) -> Iterator[Path]:
+        return iter(())
+
+    patch.setattr("trade._estop.store.earlier_folders", none)

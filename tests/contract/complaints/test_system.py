@@ -11,7 +11,8 @@ from tests.contract.complaints.hosts import Loopback, Wifi
 from tests.contract.complaints.table import complaint
 from tests.support import waiting
 from tests.support.waiting import wait_until
-from trade import Handle, service, where
+from trade import Container, Handle, Settings, service, where
+from trade._transport.memory import MemoryTransport, Network
 from trade.testing import memory_system
 from trade_gateway.cli import app
 
@@ -115,3 +116,35 @@ class Spare:
     @service
     def grant(self) -> bool:
         return True
+
+
+class Axis:
+    @service
+    def move_to(self, angle_rad: float) -> float:
+        return angle_rad
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+@complaint(
+    ("folder", mutants.the_default_system_is_named_after_the_host, "a renaming of the host renames the system"),
+    ("folder", mutants.estops_of_earlier_names_are_ignored, "an open e-stop of an earlier name is ignored"),
+)
+def test_a_robot_is_lost_when_its_host_is_renamed(folder: Path) -> None:
+    environment = {"TRADE_STATE_DIR": str(folder)}
+    with pytest.MonkeyPatch.context() as patch:
+        before = Settings.read(container="rosie", environment=environment)
+        patch.setattr("socket.gethostname", lambda: "renamed")
+        after = Settings.read(container="rosie", environment=environment)
+    assert after.system == before.system, "a renaming of the host renames the system"
+    note = folder / "tom@oldname" / "estop" / "tom" / "rosie" / "abc.json"
+    note.parent.mkdir(parents=True)
+    note.write_text('["abc", "anna/desk/e1", "spill", 1.5]')
+    with Container(after, transport=MemoryTransport(Network(), "rosie")) as rosie:
+        rosie.register(Axis(), "rosie.head")
+        refusal = outcome(lambda: rosie.find(where(name="move_to"))(0.1))
+        assert refusal.startswith("Stopped"), "an open e-stop of an earlier name is ignored"
+        assert rosie.estop_clear(["abc"]).complete
+        assert outcome(lambda: rosie.find(where(name="move_to"))(0.1)) == ""
+    assert not note.exists()

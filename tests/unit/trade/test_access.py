@@ -93,6 +93,20 @@ def test_S09_containers_that_may_offer_nothing_keep_no_estop_from_being_complete
     assert len(report.apart) == 64
     assert len(driver.addresses()) < 2 * 64
     assert chief.estop_clear([report.id], limit_s=30).complete
+    around = chief.reachability(limit_s=0)  # this is what `trade estop --clear` waits for
+    assert around.complete, around
+    assert not [name for name in around.others if name.startswith("stranger/")]
+
+
+def test_S09_a_container_that_may_offer_nothing_is_no_answer(
+    memory: MemorySystem, member: Member, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    """Alone, it does not mean that no e-stop is open."""
+    chief = member("chief")
+    raw = MemoryTransport(memory.network, "raw")
+    _sign = raw.appear(alive_key(Address("stranger", "x", "e")))
+    assert eventually(lambda: any(address.identity == "stranger" for address in chief.addresses()))
+    assert not chief.reachability(limit_s=0).complete
 
 
 def test_S09_a_container_that_may_offer_and_says_nothing_is_missing(
@@ -105,6 +119,9 @@ def test_S09_a_container_that_may_offer_and_says_nothing_is_missing(
     report = chief.estop(limit_s=0.5)
     assert report.missing == ("drv/x",)
     assert not report.complete
+    around = chief.reachability(limit_s=0)
+    assert around.silent == ("drv/x",)
+    assert not around.complete
 
 
 def test_without_a_policy_a_service_asks_for_no_role(memory: MemorySystem) -> None:

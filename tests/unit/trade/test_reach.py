@@ -29,8 +29,8 @@ def test_S21_with_default_settings_a_container_listens_on_loopback_only(here: Co
 
 
 def test_S21_the_default_system_is_the_users_on_this_host() -> None:
-    user, at, host = read().system.partition("@")
-    assert user and at and host
+    user, dash, host = read().system.partition("-")
+    assert user and dash and host
     assert not read().explicit_system
 
 

@@ -2,7 +2,10 @@
 
 import os
 import re
+import shutil
 import socket
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +25,31 @@ def folder(system: str, tmp_path: Path) -> Path:
     return tmp_path / "runtime" / "trade" / system
 
 
+@pytest.fixture
+def enter(system: str) -> Iterator[Callable[[str], list[str]]]:
+    """Enters as another container, which lives until the end of the test; returns what it sees."""
+    entered: list[HostFolder] = []
+
+    def enter(endpoint: str) -> list[str]:
+        entered.append(HostFolder(system))
+        return entered[-1].enter(endpoint)
+
+    yield enter
+    for one in entered:
+        one.leave()
+
+
+def write(folder: Path, endpoint: str) -> Path:
+    """The file of an earlier release, which keeps no lock."""
+    path = folder / "tcp_early"
+    path.write_text(f"{endpoint}\n{os.getpid()}\n{time.monotonic()}\n")
+    return path
+
+
 def old(path: Path) -> None:
     """Have it be written long ago."""
-    endpoint, *writer = path.read_bytes().split(b"\n")[:2]
-    path.write_bytes(b"\n".join([endpoint, *writer, b"-1000.0"]))
+    lines = [*path.read_bytes().split(b"\n"), b"", b""]
+    path.write_bytes(b"\n".join([*lines[:2], b"-1000.0", *lines[3:]]))
     os.utime(path, (1, 1))
 
 
@@ -39,47 +63,49 @@ def test_a_container_writes_its_endpoint_and_removes_it(system: str, folder: Pat
 
 
 @pytest.mark.real_clock
-def test_a_new_container_finds_those_that_listen(system: str, folder: Path) -> None:
+def test_a_new_container_finds_those_that_listen(system: str, folder: Path, enter: Callable[[str], list[str]]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
-        HostFolder(system).enter(endpoint)
-        old(next(folder.iterdir()))
-        assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
+        old(write(folder, endpoint))
+        assert enter("tcp/127.0.0.1:1") == [endpoint]
 
 
-def test_endpoints_without_a_listener_are_pruned(system: str, folder: Path) -> None:
-    stale = HostFolder(system)
-    stale.enter(free_endpoint())
-    old(next(folder.iterdir()))
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
+def test_endpoints_without_a_listener_are_pruned(system: str, folder: Path, enter: Callable[[str], list[str]]) -> None:
+    old(write(folder, free_endpoint()))
+    assert enter("tcp/127.0.0.1:1") == []
     assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:1"]
 
 
-def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder: Path) -> None:
+def test_endpoints_of_those_that_are_just_starting_are_kept(
+    system: str, folder: Path, enter: Callable[[str], list[str]]
+) -> None:
     starting = free_endpoint()
-    HostFolder(system).enter(starting)
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [starting]
+    write(folder, starting)
+    assert enter("tcp/127.0.0.1:1") == [starting]
 
 
 @pytest.mark.parametrize("at_s", [1, 4e9], ids=["forward", "back"])
-def test_a_clock_that_is_set_while_containers_start_hides_none(system: str, folder: Path, at_s: float) -> None:
+def test_a_clock_that_is_set_while_containers_start_hides_none(
+    system: str, folder: Path, at_s: float, enter: Callable[[str], list[str]]
+) -> None:
     """As on a computer that has none of its own and asks the network when it starts."""
     starting = free_endpoint()
-    HostFolder(system).enter(starting)
-    os.utime(next(folder.iterdir()), (at_s, at_s))
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [starting]
+    os.utime(write(folder, starting), (at_s, at_s))
+    assert enter("tcp/127.0.0.1:1") == [starting]
 
 
-def test_a_file_of_before_this_host_was_started_is_old(system: str, folder: Path) -> None:
+def test_a_file_of_before_this_host_was_started_is_old(
+    system: str, folder: Path, enter: Callable[[str], list[str]]
+) -> None:
     endpoint = free_endpoint()
     for entered in ("1e9", "nan", "inf", "-1"):
         (folder / "tcp_early").write_text(f"{endpoint}\n{os.getpid()}\n{entered}\n")
-        assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
+        assert enter("tcp/127.0.0.1:1") == []
 
 
 @pytest.mark.realtime
 def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
-    system: str, folder: Path, start_program: Any
+    system: str, folder: Path, start_program: Any, enter: Callable[[str], list[str]]
 ) -> None:
     program = start_program(
         """
@@ -92,13 +118,13 @@ def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
     [path] = folder.glob("tcp_*")
     program.kill()
     assert path.exists()
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
+    assert enter("tcp/127.0.0.1:1") == []
     assert not path.exists()
 
 
 @pytest.mark.parametrize("writer", ["", "\nrubbish", "\n1"])
 def test_where_it_is_not_known_whether_the_writer_lives_the_file_counts_as_young(
-    system: str, folder: Path, writer: str, monkeypatch: pytest.MonkeyPatch
+    system: str, folder: Path, writer: str, monkeypatch: pytest.MonkeyPatch, enter: Callable[[str], list[str]]
 ) -> None:
     def refuse(pid: int, signal: int) -> None:
         raise PermissionError
@@ -106,11 +132,13 @@ def test_where_it_is_not_known_whether_the_writer_lives_the_file_counts_as_young
     monkeypatch.setattr(os, "kill", refuse)  # another user's process
     endpoint = free_endpoint()
     (folder / "tcp_early").write_text(endpoint + writer)
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
+    assert enter("tcp/127.0.0.1:1") == [endpoint]
 
 
 @pytest.mark.real_clock
-def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, folder: Path) -> None:
+def test_endpoints_on_the_newer_loopback_address_are_not_pruned(
+    system: str, folder: Path, enter: Callable[[str], list[str]]
+) -> None:
     if not socket.has_ipv6:
         pytest.skip("this host has no IPv6")
     try:
@@ -119,18 +147,19 @@ def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, fol
         pytest.skip("this host has no IPv6 loopback")
     with listening:
         endpoint = f"tcp/[::1]:{listening.getsockname()[1]}"
-        HostFolder(system).enter(endpoint)
-        old(next(folder.iterdir()))
-        assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
+        old(write(folder, endpoint))
+        assert enter("tcp/127.0.0.1:1") == [endpoint]
 
 
-def test_foreign_files_in_the_folder_disturb_nothing(system: str, folder: Path) -> None:
+def test_foreign_files_in_the_folder_disturb_nothing(
+    system: str, folder: Path, enter: Callable[[str], list[str]]
+) -> None:
     (folder / "tcp_rubbish").write_bytes(b"\xff\x00")
     (folder / "tcp_more").write_text("not an endpoint")
     (folder / "tcp_folder").mkdir()
     old(folder / "tcp_rubbish")
     old(folder / "tcp_more")
-    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
+    assert enter("tcp/127.0.0.1:1") == []
 
 
 @pytest.mark.real_clock
@@ -183,12 +212,67 @@ def test_containers_that_start_at_the_same_moment_see_each_other(start_program: 
 
 
 def test_a_known_container_that_does_not_listen_yet_is_dialled_until_it_does(
-    here: Container, start_container: Any
+    here: Container, start_container: Any, enter: Callable[[str], list[str]]
 ) -> None:
     """Its file was there first; it read the folder before ours was."""
     endpoint = free_endpoint()
-    HostFolder(here.settings.system).enter(endpoint)
+    enter(endpoint)
     early = start_container("early")
     late = start_container("late", listen=[endpoint], connect=[free_endpoint()])
     assert early.find(where(name="clock", container="late"), wait_s=30)() > 0
     assert late.find(where(name="clock", container="early"), wait_s=30)() > 0
+
+
+def test_a_living_container_keeps_its_file_though_it_does_not_accept(
+    folder: Path, enter: Callable[[str], list[str]]
+) -> None:
+    """As while strangers flood it with connections, or for a program in another process namespace."""
+    endpoint = free_endpoint()
+    enter(endpoint)
+    [path] = folder.iterdir()
+    path.write_text(path.read_text().replace(f"{os.getpid()}", "4194400"))  # no process of this namespace
+    old(path)
+    assert enter("tcp/127.0.0.1:1") == [endpoint]
+    assert path.exists()
+
+
+@pytest.mark.parametrize("emptied", ["folder", "file", "replaced"])
+def test_a_file_that_vanished_is_written_again(
+    system: str, folder: Path, enter: Callable[[str], list[str]], emptied: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A session manager empties the folder at the last logout."""
+    rendezvous = HostFolder(system)
+    rendezvous.enter("tcp/127.0.0.1:7450")
+    rendezvous.keep()
+    assert not caplog.records  # control: nothing has happened
+    [path] = folder.iterdir()
+    if emptied == "folder":
+        shutil.rmtree(folder.parent)
+    else:
+        path.unlink()
+    if emptied == "replaced":
+        write(folder, "tcp/127.0.0.1:7451").rename(path)
+    rendezvous.keep()
+    rendezvous.keep()
+    assert "has vanished, and is written again" in caplog.messages[0]
+    assert len(caplog.records) == 1
+    assert enter("tcp/127.0.0.1:1") == ["tcp/127.0.0.1:7450"]
+    rendezvous.leave()
+    rendezvous.keep()
+    assert not path.exists()
+
+
+def test_a_container_that_could_not_write_its_file_tries_again(
+    system: str, folder: Path, enter: Callable[[str], list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    rendezvous = HostFolder(system)
+    folder.rmdir()
+    folder.write_text("in the way")
+    rendezvous.enter("tcp/127.0.0.1:7450")
+    for _ in range(3):
+        rendezvous.keep()
+    assert len(caplog.records) == 1
+    folder.unlink()
+    rendezvous.keep()
+    assert enter("tcp/127.0.0.1:1") == ["tcp/127.0.0.1:7450"]
+    rendezvous.leave()

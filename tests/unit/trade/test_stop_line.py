@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import os
+import shutil
 import socket
 import threading
 import time
@@ -11,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.waiting import wait_until
-from trade import Container, Settings, service
+from trade import Container, Settings, service, where
 from trade._audit.events import Event
 from trade._estop.broadcast import EstopReport, all_of
 from trade._paths import runtime_folder
@@ -20,7 +22,9 @@ from trade._stop_line import StopLines, StopReport
 from trade._stop_line.group_stop import together
 from trade._stop_line.listener import MOST_STRANGERS
 from trade._stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
-from trade._stop_line.places import line_port, places
+from trade._stop_line.places import Place, line_port, places
+from trade._transport.endpoints import Endpoint
+from trade._transport.host_socket import listen_on_host
 
 StartContainer = Callable[..., Container]
 
@@ -167,12 +171,66 @@ def test_the_socket_is_for_this_user_and_goes_with_its_container(driver: Contain
 
 
 def test_the_socket_of_a_killed_container_is_removed(driver: Container) -> None:
-    left = (
-        runtime_folder() / driver.settings.system / ".stop-4194400-00000000"
-    )  # beyond the highest process there can be
-    left.write_bytes(b"")
+    opened = listen_on_host(driver.settings.system, ".stop-")
+    assert opened is not None
+    server, left = opened
+    server.close()
+    assert left.exists()
     assert [place.path for place in places(driver.settings)] == [stop_socket(driver)]
     assert not left.exists()
+
+
+@pytest.mark.parametrize("process", ["4194400", "1"], ids=["of no process here", "of another one"])
+def test_the_socket_of_a_living_container_stays_whatever_its_process_id_means_here(
+    driver: Container, process: str, lamp: Lamp
+) -> None:
+    """A client in another process namespace, as in another container with the same folder, does not know the id."""
+    path = stop_socket(driver)
+    elsewhere = path.rename(path.with_name(f".stop-{process}-{path.name[-8:]}"))
+    assert [place.path for place in places(driver.settings)] == [elsewhere]
+    assert lines(driver).stop("rosie", "", 3).wait().complete
+    assert lamp.stops == 1
+
+
+def test_a_stop_line_that_vanished_is_back_within_a_beat(
+    driver: Container, lamp: Lamp, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A session manager empties the folder at the last logout, for example."""
+    before = set(threading.enumerate())
+    assert not lines(driver).stop("rosie", "", 0.1).problems  # control
+    shutil.rmtree(runtime_folder())
+    assert places(driver.settings) == []
+    wait_until(lambda: bool(places(driver.settings)), "it listens again")
+    wait_until(lambda: len(set(threading.enumerate()) - before) <= 1, "its old thread has ended")
+    assert sum("has vanished, and is made again" in text for text in caplog.messages) == 1
+    lamp.stops = 0
+    assert lines(driver).stop("rosie", "", 3).wait().complete
+    assert lamp.stops == 1
+
+
+def test_after_the_folder_was_emptied_a_new_program_finds_the_robot_and_has_its_secret(
+    driver: Container, start_container: StartContainer
+) -> None:
+    secret = (runtime_folder() / "@secret").read_bytes()
+    shutil.rmtree(runtime_folder())
+    wait_until((runtime_folder() / "@secret").exists, "its files are back")
+    wait_until(lambda: bool(places(driver.settings)), "it listens again")
+    assert (runtime_folder() / "@secret").read_bytes() == secret
+    assert start_container("late").find(where(name="on"), wait_s=10) is not None
+
+
+@pytest.mark.parametrize("name", ["tom@oldname", "user{uid}-local", "user{uid}-ffffffff", "lab"])
+def test_a_stop_in_the_default_system_also_reaches_robots_that_run_under_an_earlier_name(
+    name: str, system: str, lamp: Lamp, tmp_path: Path
+) -> None:
+    """As after an upgrade, or when the host got its machine id late. An explicit system is another one: the control."""
+    default = Settings.read(container="panel", environment={"TRADE_STATE_DIR": str(tmp_path)})
+    earlier = Settings.read(system=name.format(uid=os.getuid()), container="robot")
+    with Container(earlier) as robot:
+        robot.register(lamp, groups=["rosie.lamp"])
+        report = StopLines(default).estop("abc", "smoke", 3).wait()
+        assert report.confirmed == (() if name == "lab" else (robot.address.who,))
+        assert lamp.stops == (name != "lab")
 
 
 def test_a_container_with_nothing_to_stop_does_not_listen(start_container: StartContainer) -> None:
@@ -324,3 +382,62 @@ def test_a_stranger_has_a_second(driver: Container) -> None:
         began = time.monotonic()
         assert sock.recv(1) == b""
         assert time.monotonic() - began >= 0.5  # not at once: who is slow is no flood
+
+
+# --- when a report is enough
+
+
+@pytest.fixture
+def dead() -> Iterator[Place]:
+    """A place on a network where nothing listens."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    yield Place(f"tls/127.0.0.1:{port - 1000}", endpoint=Endpoint("tls", "127.0.0.1", port - 1000))
+
+
+@pytest.mark.parametrize("ask", ["stop", "estop"])
+def test_a_dead_endpoint_keeps_no_report_waiting(
+    driver: Container, lamp: Lamp, dead: Place, ask: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = [*places(driver.settings), dead]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    line = lines(driver)
+    asked = line.stop("rosie", "", 60) if ask == "stop" else line.estop("abc", "", 60)
+    assert asked.wait_enough().complete
+    assert asked.is_enough()
+    assert asked.unreached() == [dead.name]
+    assert lamp.stops >= 1
+
+
+def test_a_place_that_accepts_and_does_not_answer_is_waited_for(
+    driver: Container, dead: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of a robot in a flood, or frozen: the others' confirmations do not speak for it."""
+    assert dead.endpoint is not None
+    known = [*places(driver.settings), dead]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    with socket.create_server(("127.0.0.1", line_port(dead.endpoint.port))):
+        asked = lines(driver).estop("abc", "", 1.5)
+        assert asked.wait_enough().complete  # what is confirmed, is confirmed
+        assert not asked.is_enough()
+        assert asked.over() or asked.wait().complete
+        assert dead.name not in asked.unreached()
+
+
+def test_a_place_that_refuses_the_request_makes_no_report_enough(
+    driver: Container, lamp: Lamp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = [*places(driver.settings), Place(".stop-1-gone", path=runtime_folder() / ".stop-1-gone")]
+    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    asked = lines(driver).estop("abc", "", 3)
+    assert asked.wait_enough().complete
+    assert not asked.is_enough()
+
+
+def test_endpoints_without_a_stop_line_are_reported_by_whether_they_answer(driver: Container, dead: Place) -> None:
+    assert dead.endpoint is not None
+    gone = f"tcp/127.0.0.1:{dead.endpoint.port}"
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        there = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+        settings = Settings.read(system=driver.settings.system, container="panel", connect=[there, gone])
+        assert StopLines(settings).without_line() == {there: True, gone: False}

@@ -4,7 +4,6 @@ import difflib
 import logging
 import os
 import re
-import socket
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
 from trade._chosen_system import chosen_settings
+from trade._default_system import account_home, account_name, default_system
 from trade._protocol.keys import as_chunk, is_chunk
 from trade._protocol.samples import STEPS_HZ
 from trade._security.certificates import Certificate
@@ -111,6 +111,8 @@ class Settings:
     """SHA-256 of the archives of code that the container takes from others, in hexadecimal digits."""
     state_dir: Path | None = None
     """Folder for what must outlive a process, such as open e-stops; none: nothing is kept."""
+    estop_dirs: tuple[Path, ...] = ()
+    """Further folders of that kind, with each open e-stop, too: a process with another ``HOME`` finds it there."""
     trace: bool = False
     """Trace calls from the start; see `Container.set_tracing`."""
     otlp: str = ""
@@ -314,7 +316,7 @@ class Settings:
         folder = tls or environment.get("TRADE_TLS")
         certified = Path(folder).absolute() if folder else None
         return cls(
-            system=named or f"{_user()}@{as_chunk(socket.gethostname())}",
+            system=named or default_system(),
             identity=identity or environment.get("TRADE_IDENTITY") or _who(certified),
             container=container or environment.get("TRADE_CONTAINER") or _program(),
             listen=tuple(_split(environment, "TRADE_LISTEN") if listen is None else listen),
@@ -332,6 +334,7 @@ class Settings:
             instantiable=tuple(_split(environment, "TRADE_INSTANTIABLE") if instantiable is None else instantiable),
             code=tuple(_split(environment, "TRADE_CODE")),
             state_dir=_state_dir(environment),
+            estop_dirs=_estop_dirs(environment),
             trace=environment.get("TRADE_TRACE") == "1" or bool(environment.get("TRADE_OTLP")),
             otlp=environment.get("TRADE_OTLP", ""),
             audit=audit or _path(environment.get("TRADE_AUDIT")),
@@ -399,6 +402,12 @@ def _state_dir(environment: Mapping[str, str]) -> Path | None:
         return None
 
 
+def _estop_dirs(environment: Mapping[str, str]) -> tuple[Path, ...]:
+    home = None if environment.get("TRADE_STATE_DIR") else account_home()
+    found = () if home is None else (home / ".local" / "state" / "trade",)
+    return tuple(folder for folder in found if folder != _state_dir(environment))
+
+
 def _split(environment: Mapping[str, str], name: str) -> list[str]:
     return [part.strip() for part in environment.get(name, "").split(",") if part.strip()]
 
@@ -419,16 +428,7 @@ def _can_be_stored(user: str, password: str) -> bool:
 
 
 def _who(certified: Path | None) -> str:
-    return _user() if certified is None else Certificate.read(certified).identity
-
-
-def _user() -> str:
-    import getpass  # noqa: PLC0415 - it loads modules that some operating systems lack
-
-    try:
-        return as_chunk(getpass.getuser())
-    except (OSError, KeyError):  # a container image without a user name
-        return "nobody"  # plain: nobody
+    return account_name() if certified is None else Certificate.read(certified).identity
 
 
 def _program() -> str:

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any, Final
 
@@ -12,7 +12,10 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 
+from trade._default_system import is_of_user
 from trade._protocol.remote_errors import RemoteTraceback
+from trade._settings import Settings
+from trade._stop_line import elsewhere
 from trade.errors import DeviceFault, RemoteError, TradeError
 
 NOT_FOUND: Final = 3
@@ -121,6 +124,24 @@ REMEDIES: Final = {
 _FRAMES: Final = re.compile(r'^  File "(.+)", line (\d+), in (.+)\n((?:    .*\n)?)', re.MULTILINE)
 """The entries of a Python traceback: file, line, function and code."""
 _CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
+
+
+def say_unreached(endpoints: Iterable[str]) -> None:
+    """Prints on standard error which endpoints did not answer a stop that all others have confirmed."""
+    for endpoint in endpoints:
+        complain(f"{endpoint} (TRADE_CONNECT) does not answer; a robot that is reached only there heard nothing")
+
+
+def say_elsewhere(settings: Settings, *, earlier: bool = False) -> None:
+    """Prints on standard error which robots of this user on this host are in other systems than the command.
+
+    Args:
+        settings: of the command.
+        earlier: only those that run under an earlier name of the default system, where stops reach them, too.
+    """
+    for system, containers in elsewhere(settings).items():
+        if not earlier or (is_of_user(system) and not settings.explicit_system):
+            complain(f"system {system} has {', '.join(containers)}; commands reach it with: trade --system {system}")
 
 
 def as_commands(device: str, remedy: str) -> str:

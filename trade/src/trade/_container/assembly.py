@@ -60,7 +60,7 @@ from trade._telemetry.spans import Spans, new_spans
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade._transport.base import Transport
-from trade._transport.credentials import user_secret
+from trade._transport.credentials import keep_secret, user_secret
 from trade._transport.host_socket import host_sockets, listen_on_host
 from trade._transport.local_greeting import Passport
 from trade._transport.zenoh import ZenohTransport
@@ -129,6 +129,9 @@ class Components:
         leaving.callback(self.transport.close)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
+        own_pair = not self._given and self._settings.tls is None and self._settings.credentials is None
+        self._secret = user_secret()[1] if own_pair else ""
+        """The secret of this user on this host, if the container's links use it."""
         self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
         if isinstance(self.transport, ZenohTransport):
             self.dialer = Dialer(self.transport.links, self._settings.check_may_dial, self._settings.connect)
@@ -216,10 +219,15 @@ class Components:
         leaving.callback(self.subscriptions.close)
 
     def _build_estop(self, leaving: contextlib.ExitStack) -> None:
-        state_dir = self._settings.state_dir
-        kept = None if state_dir is None else state_dir / self._settings.system / "estop"
         self.estop = EstopController(
-            self.transport, self._address, self.registry, self.locks, self.providers, kept, self._access, self.audit
+            self.transport,
+            self._address,
+            self.registry,
+            self.locks,
+            self.providers,
+            self._settings,
+            self._access,
+            self.audit,
         )
         leaving.callback(self.estop.close)
         self.deadman = self.estop.deadman
@@ -366,6 +374,19 @@ class Components:
         """Announces the revision if it is due, and looks at the links; called every two seconds."""
         self.announcer.beat()
         self.states.links.infos()
+        self._keep_files()
+
+    def _keep_files(self) -> None:
+        """Makes the files again by which others on this host reach this container, if they have vanished."""
+        try:
+            if isinstance(self.transport, ZenohTransport):
+                self.transport.keep_files()
+            if self.stop_line is not None:
+                self.stop_line.keep_place()
+            if self._secret:
+                keep_secret(self._secret)
+        except (OSError, TradeError) as bad:
+            _logger.debug("the files of this container cannot be checked: %s", bad)
 
     def _lost(self, address: Address, *, back: bool = False) -> None:
         """Handles the loss, or the return, of a container; called by the registry listener."""

@@ -144,13 +144,17 @@ def _join_at(
     leaving: contextlib.ExitStack,
 ) -> ZenohTransport:
     connect, certified = list(settings.connect), certificate is not None
+    rendezvous: HostFolder | None = None
     if networks or not connect:
         rendezvous = HostFolder(settings.system)
         leaving.callback(rendezvous.leave)
         connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
-    return ZenohTransport(_configuration(settings, certificate, listen=listen, connect=connect, bridge=networks))
+    transport = ZenohTransport(_configuration(settings, certificate, listen=listen, connect=connect, bridge=networks))
+    if rendezvous is not None:
+        transport.keep_files = rendezvous.keep
+    return transport
 
 
 def _configuration(

@@ -23,9 +23,10 @@ class Reachability(Struct, frozen=True):
     """The containers that one has found so far."""
 
     others: tuple[str, ...]
-    """The other present containers (``identity/container``)."""
+    """The other present containers (``identity/container``). Those that list no services and, by the policy, may have
+    none do not count."""
     silent: tuple[str, ...] = ()
-    """The present containers that have not listed their services yet."""
+    """Those of them that have not listed their services yet."""
     apart: dict[str, str] = {}
     """The endpoints of ``Settings.connect``, or of the hub, where no container was found; with reasons, if known."""
     source: str = "TRADE_CONNECT"
@@ -61,7 +62,7 @@ def look_around(registry: Registry, reach: Dialer | None, own: Address, system: 
 
 
 def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Reachability:
-    states = [state for state in registry.containers() if state.address != own]
+    states = [state for state in registry.containers() if state.address != own and registry.counts(state)]
     unlinked = () if reach is None else reach.unlinked()
     return Reachability(
         others=tuple(state.address.who for state in states),

@@ -5,15 +5,24 @@ others', so of two that start together at least one sees the other; the newcomer
 """
 
 import contextlib
+import errno
 import logging
 import os
+import socket
 import time
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
-from trade._atomic_file import replace
-from trade._paths import runtime_folder
-from trade._transport.endpoints import accepts, free_endpoint
+from trade._atomic_file import fresh_beside
+from trade._paths import runtime_folder, runtime_folders
+from trade._transport.endpoints import Endpoint, free_endpoint
+from trade.errors import ConfigurationError
+
+try:
+    import fcntl
+except ImportError:  # only some operating systems have it
+    fcntl = None
 
 __all__ = ["HostFolder", "free_endpoint"]
 
@@ -21,48 +30,141 @@ _logger = logging.getLogger("trade")
 
 _YOUNG_S: Final = 10.0
 """A file younger than this may belong to a container that does not listen yet, if its process is alive."""
+_LOCKED: Final = "locked"
+"""The last line of a file that its process keeps locked (``flock``): without the lock, the process is gone."""
+_CONNECT_S: Final = 0.5
 
 
 class HostFolder:
     """One system's folder on this host; only this user can read or write it."""
 
     def __init__(self, system: str) -> None:
-        self._folder = runtime_folder() / system
-        self._folder.mkdir(mode=0o700, exist_ok=True)
+        self._system = system
+        self._folder()
+        self._endpoint = ""
         self._own: Path | None = None
+        self._file: FileIO | None = None
+        """The file, open and locked for as long as this process lives."""
+        self._warned = False
+
+    def _folder(self) -> Path:
+        folder = runtime_folder() / self._system
+        folder.mkdir(mode=0o700, exist_ok=True)
+        return folder
 
     def enter(self, endpoint: str) -> list[str]:
         """Publish our endpoint; returns the endpoints of the others.
 
         A container that cannot write, as on a full disk, still dials the others: it may be there to stop them.
         """
-        name = endpoint.replace("/", "_").replace(":", "_")
-        own = self._folder / name
-        try:
-            replace(own, f"{endpoint}\n{os.getpid()}\n{time.monotonic()}\n".encode("ascii"))
-            self._own = own
-        except OSError as bad:
-            _logger.warning("%s cannot be written: %s. Later containers on this host may not find this one", own, bad)
+        self._endpoint = endpoint
+        self._publish()
         return self._others()
+
+    def keep(self) -> None:
+        """Publish our endpoint again if its file has vanished, as when the folder was emptied. Called now and then."""
+        if not self._endpoint:
+            return
+        with contextlib.suppress(OSError):
+            file = None if self._file is None else os.fstat(self._file.fileno())
+            if self._own is not None and file is not None and os.path.samestat(self._own.stat(), file):
+                return
+        if self._own is not None:
+            _logger.warning("%s has vanished, and is written again", self._own)
+        self._publish()
+
+    def _publish(self) -> None:
+        before, self._file = self._file, None
+        try:
+            own = self._folder() / self._endpoint.replace("/", "_").replace(":", "_")
+            self._file, self._own = _written(own, f"{self._endpoint}\n{os.getpid()}\n{time.monotonic()}\n"), own
+        except (OSError, ConfigurationError) as bad:
+            if not self._warned:
+                _logger.warning(
+                    "the endpoint %s cannot be written: %s. Later containers on this host may not find this one",
+                    self._endpoint,
+                    bad,
+                )
+            self._own = None
+        self._warned = self._own is None
+        if before is not None:
+            before.close()
 
     def _others(self) -> list[str]:
         found: list[str] = []
-        for path in sorted(path for path in self._folder.iterdir() if not path.name.startswith(".")):
+        for path in self._files():
             with contextlib.suppress(OSError, ValueError):
                 if path == self._own:
                     continue
-                endpoint, writer, entered, *_ = [*path.read_text(encoding="ascii").strip().split("\n"), "", ""]
-                if accepts(endpoint) or (_is_young(path, entered) and _may_live(writer)):
-                    found.append(endpoint)
-                else:
+                text = path.read_text(encoding="ascii").strip().split("\n")
+                endpoint, writer, entered, locked, *_ = [*text, "", "", ""]
+                if _is_gone(path, endpoint, writer, entered, locked):
                     path.unlink()
+                else:
+                    found.append(endpoint)
+        return found
+
+    def _files(self) -> list[Path]:
+        found: list[Path] = []
+        for folder in runtime_folders():
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                found += sorted(path for path in (folder / self._system).iterdir() if not path.name.startswith("."))
         return found
 
     def leave(self) -> None:
         """Remove our endpoint. Idempotent."""
+        self._endpoint = ""
         if self._own is not None:
             self._own.unlink(missing_ok=True)
             self._own = None
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _written(path: Path, text: str) -> FileIO:
+    """The file, written at once, open and locked. Raises OSError."""
+    fresh = fresh_beside(path)
+    file = FileIO(os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o600), "r+")
+    try:
+        locked = False
+        with contextlib.suppress(OSError):  # a file system without locks
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                locked = True
+        data = f"{text}{_LOCKED if locked else ''}\n".encode("ascii")
+        if file.write(data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        fresh.replace(path)
+    except BaseException:
+        file.close()
+        fresh.unlink(missing_ok=True)
+        raise
+    return file
+
+
+def _is_gone(path: Path, endpoint: str, writer: str, entered: str, locked: str) -> bool:
+    """Whether the process of a file has ended. One that does not answer, as in a flood of connections, has not."""
+    if fcntl is not None and locked == _LOCKED:
+        with path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return False
+            return True
+    return _refuses(endpoint) and not (_is_young(path, entered) and _may_live(writer))
+
+
+def _refuses(endpoint: str) -> bool:
+    """Whether no process listens at an endpoint; True for a text that is not valid."""
+    try:
+        where = Endpoint.read(endpoint)
+        socket.create_connection((where.host.strip("[]"), where.port), timeout=_CONNECT_S).close()
+    except OSError as bad:
+        return isinstance(bad, ConnectionRefusedError | socket.gaierror)
+    except (ValueError, OverflowError):  # ConfigurationError is a ValueError
+        return True
+    return False
 
 
 def _is_young(path: Path, entered: str) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from trade._atomic_file import replace
-from trade._paths import runtime_folder
+from trade._paths import runtime_folders
 from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import host_sockets, is_deaf, listen_on_host
 from trade.errors import ConfigurationError
@@ -33,7 +33,8 @@ class HubFile:
 
     def __init__(self, system: str) -> None:
         self._system = system
-        self.path: Final = runtime_folder() / system / _NAME
+        self._places: Final = [folder / system / _NAME for folder in runtime_folders()]
+        self.path: Final = self._places[0]
         self._own: tuple[socket.socket, Path] | None = None
 
     def claim(self) -> None:
@@ -66,10 +67,11 @@ class HubFile:
 
     def last(self) -> Hub | None:
         """The running hub or the one before; None if there was none."""
-        with contextlib.suppress(OSError, ValueError):
-            endpoint, identity = self.path.read_text(encoding="ascii").splitlines()
-            Endpoint.read(endpoint)
-            return Hub(endpoint, identity)
+        for path in self._places:
+            with contextlib.suppress(OSError, ValueError):
+                endpoint, identity = path.read_text(encoding="ascii").splitlines()
+                Endpoint.read(endpoint)
+                return Hub(endpoint, identity)
         return None
 
     def running(self) -> Hub | None:

@@ -5,7 +5,6 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Final, Protocol
 
 from msgspec import structs
@@ -22,6 +21,7 @@ from trade._registry.registry import Change, ContainerState, Record, Registry
 from trade._resources.lock_table import LockTable
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
+from trade._settings import Settings
 from trade._transport.base import ChannelClosed, Transport
 from trade.errors import ConfigurationError, NoSuchEstop
 
@@ -55,7 +55,7 @@ class EstopController:
         registry: Registry,
         table: LockTable,
         providers: Providers,
-        folder: Path | None,
+        settings: Settings,
         access: Authorizer,
         audit: Audit,
     ) -> None:
@@ -68,7 +68,7 @@ class EstopController:
         self._estops = EstopLatch(
             table,
             self.deadman,
-            EstopStore(folder, own),
+            EstopStore(settings, own),
             self._line.confirm,
             self._publish,
             lambda: bool(providers.stops()),

@@ -246,6 +246,10 @@ class Registry:
                 state.heard.reopen()
             return state is not None
 
+    def counts(self, state: ContainerState) -> bool:
+        """Whether a container has listed its services, or may have some: by the policy, not all may."""
+        return state.heard.complete or self._may_offer_anything(state.address.identity)
+
     def _has_room_for(self, address: Address) -> bool:
         if self._may_offer_anything(address.identity):
             return True

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Generic, TypeVar
 
 from trade._estop.broadcast import EstopReport, all_of
@@ -15,6 +16,7 @@ from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport, together
 from trade._stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
 from trade._stop_line.places import Place, places
+from trade._transport.endpoints import accepts
 
 _logger = logging.getLogger("trade")
 
@@ -23,7 +25,10 @@ _RELAYS: Final = 4
 """How many containers on this host pass an e-stop on with their own orders; the others stop only themselves."""
 _CONNECT_S: Final = 1.0
 _MOST_BYTES: Final = 1 << 20
-_Report = TypeVar("_Report")
+_REACH_S: Final = 0.8
+"""How long a place may take to accept a connection once all others have confirmed: a dead address delays no report."""
+_LOOK_S: Final = 0.02
+_Report = TypeVar("_Report", EstopReport, StopReport)
 
 
 class LineCall(Generic[_Report]):
@@ -36,6 +41,7 @@ class LineCall(Generic[_Report]):
         report_of: Callable[[StopAnswer], _Report | None],
         merge: Callable[[list[_Report]], _Report],
     ) -> None:
+        self._reach_until = time.monotonic() + _REACH_S
         self._until = time.monotonic() + limit_s
         self._report_of = report_of
         self._merge = merge
@@ -43,6 +49,9 @@ class LineCall(Generic[_Report]):
         self._left = len(asked)
         self._waiting = deque(asked)
         self._changed = threading.Condition()
+        self._unreached = {place.name for place, _ in asked if place.path is None}
+        self._pending = {place.name for place, _ in asked if place.path is not None}
+        """The places that have accepted a connection, or are on this host, and that have not answered yet."""
         self.problems: Final[dict[str, str]] = {}
         """Places that did not answer, and why."""
         for _ in range(min(_THREADS, len(asked))):
@@ -63,6 +72,24 @@ class LineCall(Generic[_Report]):
             self._changed.wait_for(self.over, max(0.0, self._until - time.monotonic()))
         return self.report()
 
+    def unreached(self) -> list[str]:
+        """The places on networks that have not accepted a connection so far."""
+        with self._changed:
+            return sorted(self._unreached)
+
+    def is_enough(self) -> bool:
+        """Whether the report is complete, and all places that accept a connection have answered."""
+        with self._changed:
+            tried = self.over() or (not self._pending and time.monotonic() >= self._reach_until)
+            return tried and self.problems.keys() <= self._unreached and self._merge(list(self._reports)).complete
+
+    def wait_enough(self) -> _Report:
+        """Waits as `wait` does, but not for places that accept no connection, once all others have confirmed."""
+        while not (self.over() or self.is_enough()) and (left_s := self._until - time.monotonic()) > 0:
+            with self._changed:
+                self._changed.wait(min(_LOOK_S, left_s))
+        return self.report()
+
     def _work(self) -> None:
         while True:
             try:
@@ -74,7 +101,11 @@ class LineCall(Generic[_Report]):
     def _ask(self, place: Place, request: StopRequest) -> None:
         report, problem = None, "its answer is missing"
         try:
-            with place.connect(min(_CONNECT_S, self._left_s())) as sock:
+            plain = place.dial(min(_CONNECT_S, self._left_s()))
+            with self._changed:
+                self._unreached.discard(place.name)
+                self._pending.add(place.name)
+            with place.secured(plain) as sock:
                 sock.sendall(encoded(request))
                 for answer in _answers(sock, self._left_s):
                     problem = f"{answer.error}: {answer.why}" if answer.error else problem
@@ -82,6 +113,7 @@ class LineCall(Generic[_Report]):
         except (OSError, Malformed, ValueError) as bad:
             problem = str(bad) or type(bad).__name__
         with self._changed:
+            self._pending.discard(place.name)
             if report is None:
                 self.problems[place.name] = problem
                 _logger.debug("no answer on the stop line at %s: %s", place.name, problem)
@@ -135,6 +167,13 @@ class StopLines:
         request = self._request("stop", limit_s, reason, group=group)
         asked = [(place, request) for place in self._places()]
         return LineCall(asked, limit_s, lambda answer: answer.stop, lambda reports: together(group, reports))
+
+    def without_line(self) -> dict[str, bool]:
+        """The endpoints of ``Settings.connect`` that have no stop line, and whether each accepts a connection."""
+        lines = {place.name for place in self._places()}
+        others = [endpoint for endpoint in self._settings.connect if endpoint not in lines]
+        with ThreadPoolExecutor(max(1, len(others)), "trade-stop-look") as pool:
+            return dict(zip(others, pool.map(accepts, others), strict=True))
 
     def _request(self, ask: str, limit_s: float, reason: str, **more: object) -> StopRequest:
         by = f"{self._settings.identity}/{self._settings.container}"

@@ -6,6 +6,8 @@ import ssl
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from trade._default_system import earlier_folders
+from trade._paths import runtime_folders
 from trade._security.certificates import line_context
 from trade._settings import Settings
 from trade._transport.endpoints import Endpoint
@@ -33,29 +35,51 @@ class Place(NamedTuple):
 
     def connect(self, limit_s: float) -> socket.socket:
         """Connects to it. Raises OSError if no container accepts within that time (seconds, for each step)."""
+        return self.secured(self.dial(limit_s))
+
+    def dial(self, limit_s: float) -> socket.socket:
+        """The first step: a plain connection. Raises OSError."""
         if self.path is not None:
             return dial_on_host(self.path, limit_s)
-        assert self.endpoint is not None and self.context is not None  # noqa: S101 - one or the other
-        host = self.endpoint.host
-        plain = socket.create_connection((host, line_port(self.endpoint.port)), timeout=limit_s)
+        assert self.endpoint is not None  # noqa: S101 - one or the other
+        return socket.create_connection((self.endpoint.host, line_port(self.endpoint.port)), timeout=limit_s)
+
+    def secured(self, plain: socket.socket) -> socket.socket:
+        """The second step: that connection with TLS, if it needs it. Closes it on failure. Raises OSError."""
+        if self.endpoint is None or self.context is None:
+            return plain
         try:
-            return self.context.wrap_socket(plain, server_hostname=host)
+            return self.context.wrap_socket(plain, server_hostname=self.endpoint.host)
         except BaseException:
             plain.close()
             raise
+
+
+def host_places(system: str) -> list[Place]:
+    """The stop lines of a system's containers of this user on this host. Raises OSError, ConfigurationError."""
+    return [Place(path.name, path=path) for path in host_sockets(system, _MARK)]
 
 
 def places(settings: Settings) -> list[Place]:
     """The stop lines of this system's containers: those of this user on this host, and those it connects to."""
     found: list[Place] = []
     with contextlib.suppress(OSError, ConfigurationError):
-        found += [Place(path.name, path=path) for path in host_sockets(settings.system, _MARK)]
+        for system in (settings.system, *_earlier(settings)):
+            found += host_places(system)
     certificate = settings.certificate()
     if certificate is not None:
         context = line_context(certificate, server=False)
         ends = map(Endpoint.read, settings.connect)
         found += [Place(str(end), endpoint=end, context=context) for end in ends if end.protocol == "tls"]
     return found
+
+
+def _earlier(settings: Settings) -> list[str]:
+    """The earlier names of the default system: a container that runs since then, or of an earlier release, has one."""
+    if settings.explicit_system:
+        return []
+    names = (one.name for folder in runtime_folders() for one in earlier_folders(folder, settings.system))
+    return sorted(set(names))
 
 
 def host_socket(system: str) -> tuple[socket.socket, Path] | None:

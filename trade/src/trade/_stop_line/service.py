@@ -22,6 +22,7 @@ from trade._stop_line.listener import Listener
 from trade._stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
 from trade._stop_line.places import host_socket, network_socket
 from trade._transport.endpoints import Endpoint
+from trade._transport.host_socket import is_deaf
 from trade.errors import LimitExceeded, TradeError
 
 _logger = logging.getLogger("trade")
@@ -62,6 +63,10 @@ class StopLineService:
         self._busy: Counter[str] = Counter()
         self._listeners: list[Listener] = []
         self._path: Path | None = None
+        self._on_host: Listener | None = None
+        self._wanted = False
+        """Whether it has to listen on this host."""
+        self._warned = False
         self._closed = False
         certificate = settings.certificate()
         if certificate is not None and (servers := _network_sockets(settings, certificate)):
@@ -75,16 +80,36 @@ class StopLineService:
     def listen_on_host(self) -> None:
         """Listens for this user on this host, too. Idempotent; logs a problem."""
         with self._guard:
-            if self._path is not None or self._closed:
-                return
-            try:
-                server = host_socket(self._system)
-            except (OSError, TradeError) as bad:
+            self._wanted = True
+            if self._path is None and not self._closed:
+                self._open_on_host()
+
+    def _open_on_host(self) -> None:
+        try:
+            server = host_socket(self._system)
+        except (OSError, TradeError) as bad:
+            if not self._warned:
                 _logger.warning("the stop line on this host cannot be opened: %s. Stops here need the transport", bad)
+            self._warned = True
+            return
+        self._warned = False
+        if server is not None:
+            sock, self._path = server
+            self._on_host = Listener([(sock, None)], self._serve)
+            self._listeners.append(self._on_host)
+
+    def keep_place(self) -> None:
+        """Listens on this host again if no client can reach it there, as when the folder was emptied. Called often."""
+        with self._guard:
+            if self._closed or not self._wanted or (self._path is not None and not is_deaf(self._path)):
                 return
-            if server is not None:
-                sock, self._path = server
-                self._listeners.append(Listener([(sock, None)], self._serve))
+            if self._path is not None:
+                _logger.warning("%s, the stop line on this host, has vanished, and is made again", self._path)
+            before, self._path, self._on_host = self._on_host, None, None
+            self._listeners = [one for one in self._listeners if one is not before]
+            self._open_on_host()
+        if before is not None:
+            before.close()
 
     # --- called by the listener
 

@@ -13,10 +13,10 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
-from trade._paths import runtime_folder
+from trade._paths import runtime_folder, runtime_folders
 from trade.errors import ConfigurationError
 
-__all__ = ["dictionary_file", "user_secret"]
+__all__ = ["dictionary_file", "keep_secret", "user_secret"]
 
 _FILE: Final = "@secret"
 """No system can have this name: the folders of systems are beside this file."""
@@ -30,12 +30,28 @@ def user_secret() -> tuple[str, str]:
     Raises:
         ConfigurationError: other users can read the file or could have planted it.
     """
-    path = runtime_folder() / _FILE
-    if not path.exists():
-        with _private_file(secrets.token_urlsafe(32)) as fresh, contextlib.suppress(FileExistsError):
-            os.link(fresh, path)  # the second container takes the first one's
+    places = [folder / _FILE for folder in runtime_folders()]
+    path = next((one for one in places if one.exists()), None)
+    if path is None:
+        path = places[0]
+        _create(path, secrets.token_urlsafe(32))
     _check_private(path)
-    return _USER, path.read_text(encoding="ascii").strip()
+    secret = path.read_text(encoding="ascii").strip()
+    keep_secret(secret)
+    return _USER, secret
+
+
+def keep_secret(secret: str) -> None:
+    """Writes the default pair's secret to each folder that has none: one of them may be emptied at any time."""
+    for folder in runtime_folders():
+        if not (folder / _FILE).exists():
+            with contextlib.suppress(OSError):
+                _create(folder / _FILE, secret)
+
+
+def _create(path: Path, secret: str) -> None:
+    with _private_file(secret, path.parent) as fresh, contextlib.suppress(FileExistsError):
+        os.link(fresh, path)  # the second container takes the first one's
 
 
 @contextlib.contextmanager
@@ -46,7 +62,7 @@ def dictionary_file(credentials: tuple[str, str]) -> Generator[Path]:
     """
     text = ":".join(credentials) + "\n"
     if not (hasattr(os, "memfd_create") and _OPEN_FILES.is_dir()):
-        with _private_file(text) as path:
+        with _private_file(text, runtime_folder()) as path:
             yield path
         return
     with os.fdopen(os.memfd_create("trade-credentials"), "w", encoding="utf-8") as file:
@@ -56,8 +72,8 @@ def dictionary_file(credentials: tuple[str, str]) -> Generator[Path]:
 
 
 @contextlib.contextmanager
-def _private_file(text: str) -> Generator[Path]:
-    descriptor, name = tempfile.mkstemp(prefix="@", dir=runtime_folder())  # for this user only
+def _private_file(text: str, folder: Path) -> Generator[Path]:
+    descriptor, name = tempfile.mkstemp(prefix="@", dir=folder)  # for this user only
     path = Path(name)
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:

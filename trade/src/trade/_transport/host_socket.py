@@ -1,6 +1,7 @@
 """Unix sockets in the folder of a system: for containers of one user on one host."""
 
 import contextlib
+import logging
 import os
 import secrets
 import socket
@@ -9,8 +10,9 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
-from trade._paths import runtime_folder
+from trade._paths import runtime_folders
 
+_logger = logging.getLogger("trade")
 _BACKLOG: Final = 1024
 _OPEN_FILES: Final = Path("/proc/self/fd")
 _HAS_UNIX: Final = hasattr(socket, "AF_UNIX")
@@ -30,45 +32,52 @@ def listen_on_host(system: str, mark: str, name: str = "") -> tuple[socket.socke
     """
     if not _HAS_UNIX:
         return None
-    path = runtime_folder() / system / f"{mark}{os.getpid()}-{name or secrets.token_hex(4)}"
+    folders = runtime_folders()
+    for folder in folders:
+        path = folder / system / f"{mark}{os.getpid()}-{name or secrets.token_hex(4)}"
+        try:
+            return _listening(path), path
+        except OSError as bad:  # such as a full file system
+            if folder is folders[-1]:
+                raise
+            _logger.warning("%s cannot be made: %s. It is made in another folder", path, bad)
+    return None
+
+
+def _listening(path: Path) -> socket.socket:
     path.parent.mkdir(mode=0o700, exist_ok=True)
+    early = path.with_name(f".early{path.name}")
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        with _short(path) as short:
+        with _short(early) as short:
             server.bind(short)
-        path.chmod(0o600)
+        early.chmod(0o600)
         server.listen(_BACKLOG)
+        early.replace(path)  # only now: whom a socket of its name refuses has no process any more
     except BaseException:
         server.close()
+        early.unlink(missing_ok=True)
         raise
-    return server, path
+    return server
 
 
 def host_sockets(system: str, mark: str, name: str = "*") -> list[Path]:
     """The sockets of living containers with this mark, and this last part of the name; removes those of ended ones.
+
+    A container lives if its socket does not refuse: a process id says nothing to another process namespace.
 
     Raises:
         OSError: the folder cannot be read.
         ConfigurationError: others may write in it.
     """
     living: list[Path] = []
-    for path in sorted((runtime_folder() / system).glob(f"{mark}*-{name}")) if _HAS_UNIX else ():
-        process = path.name.removeprefix(mark).partition("-")[0]
-        if process.isdigit() and not _lives(int(process)) and is_deaf(path):
+    found = [path for folder in runtime_folders() for path in sorted((folder / system).glob(f"{mark}*-{name}"))]
+    for path in found if _HAS_UNIX else ():
+        if is_deaf(path):
             path.unlink(missing_ok=True)
         else:
             living.append(path)
     return living
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
 
 
 def is_deaf(path: Path) -> bool:

@@ -249,6 +249,8 @@ class ZenohTransport(Transport):
                 problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
         self.links: Final = Links(self._session, settings)
+        self.keep_files: Callable[[], None] = lambda: None
+        """Writes files on this host again, by which others find this transport, if they have vanished."""
         self._publishers: Final[set[zenoh.Publisher]] = set()
         self._passing: list[tuple[ZenohChannel, Callable[[], Any]]] = []
         """Channels with a temporary pattern, and how to subscribe with the final one once the container stays."""

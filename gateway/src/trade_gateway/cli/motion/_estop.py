@@ -11,7 +11,7 @@ from trade._stop_line import StopLines
 from trade.errors import NoSuchEstop
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
 from trade_gateway.cli._system_choice import choice_of, visitor
 
 
@@ -28,14 +28,17 @@ def estop(
     """Stop the whole system at once. Nothing moves until the e-stop is cleared.
 
     The exit code is not 0 if a container did not confirm or could not stop a device, or if none was found.
-    It is also not 0 if an endpoint of TRADE_CONNECT does not answer: containers there did not receive the e-stop.
+    It uses the stop line first, and waits for no link if all confirm there. It warns of dead endpoints.
+    If a link is needed, a dead endpoint makes the exit code not 0: containers there did not receive the e-stop.
     This is software. It is not safety-rated and does not replace a switch that cuts the power.
 
     For example: trade estop --reason "smoke", and later trade estop --clear
     """
     _check_words(ids, reason, clear=clear)
     out = Output(as_json=as_json)
-    given = "" if clear else _given(context, reason, limit)
+    given = new_estop_id()
+    if not clear and _stopped_by_line(context, out, given, reason, limit):
+        return
     with visitor(context) as container:
         system = container.settings.system
         reachability = container.reachability(limit_s=limit) if clear else None
@@ -54,11 +57,19 @@ def estop(
             _say(out, report, system, "cleared" if clear else "stopped", container.address.who)
         if reachability is None:
             reachability = container.reachability(limit_s=0)  # only now, so that it does not delay the e-stop
-    if reachability.apart and not clear:
-        raise reachability.as_error(system, "containers there were not stopped; use the switch that cuts the power")
-    if clear and not reachability.complete:
-        raise reachability.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
-    if not report.complete or not (clear or _known(report, container.address.who)):
+    _end(report, reachability, container, clear=clear)
+
+
+def _end(report: EstopReport, found: Reachability, container: Container, *, clear: bool) -> None:
+    """Ends the command with an error or another exit code than 0, unless all containers are known to have done it."""
+    system, known = container.settings.system, _known(report, container.address.who)
+    if not (clear or known):
+        say_elsewhere(container.settings)
+    if found.apart and not clear:
+        raise found.as_error(system, "containers there were not stopped; use the switch that cuts the power")
+    if clear and not found.complete:
+        raise found.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
+    if not report.complete or not (clear or known):
         raise typer.Exit(1)
 
 
@@ -69,11 +80,25 @@ def _check_words(ids: list[str] | None, reason: str, *, clear: bool) -> None:
         raise UsageError(where="trade estop", problem="--reason is for a new e-stop; leave it out with --clear")
 
 
-def _given(context: typer.Context, reason: str, limit_s: float) -> str:
-    """Sends an e-stop on the stop line, before any link; returns its id, with which it is sent again on the links."""
-    estop_id = new_estop_id()
-    StopLines(choice_of(context).settings()).estop(estop_id, reason, limit_s)
-    return estop_id
+def _stopped_by_line(context: typer.Context, out: Output, estop_id: str, reason: str, limit_s: float) -> bool:
+    """Sends an e-stop on the stop line, before any link; prints the report and returns True if that is enough.
+
+    Otherwise it is sent again on the links, with the same id.
+    """
+    settings = choice_of(context).settings()
+    lines = StopLines(settings)
+    asked = lines.estop(estop_id, reason, limit_s)
+    linked = lines.without_line()
+    report = asked.wait_enough()
+    if any(linked.values()) or not asked.is_enough():
+        return False
+    if out.as_json:
+        out.data(report)
+    else:
+        _say(out, report, settings.system, "stopped", "")
+    say_unreached([*asked.unreached(), *linked])
+    say_elsewhere(settings, earlier=True)  # the e-stop has to be cleared there, too
+    return True
 
 
 def _clear(container: Container, found: Reachability, ids: list[str] | None, limit_s: float) -> EstopReport | None:
@@ -86,6 +111,7 @@ def _clear(container: Container, found: Reachability, ids: list[str] | None, lim
     system, cannot_tell = container.settings.system, "so it is unknown whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
     if not found.others or not (wanted or found.complete):
+        say_elsewhere(container.settings)
         raise found.as_error(system, cannot_tell)
     try:
         return container.estop_clear(wanted, limit_s=limit_s) if wanted else None

@@ -6,10 +6,10 @@ import typer
 from rich.markup import escape
 
 from trade import StopReport
-from trade._stop_line import StopLines
+from trade._stop_line import StopLines, together
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
 from trade_gateway.cli._system_choice import choice_of, visitor
 
 
@@ -34,14 +34,18 @@ def stop(
     out = Output(as_json=as_json)
     settings = choice_of(context).settings()
     asked = StopLines(settings).stop(group, reason, limit)
-    report = asked.wait()
-    if not report.complete:  # a container without a stop line may have a link
+    report = asked.wait_enough()
+    if not asked.is_enough():  # a container without a stop line may have a link
         with visitor(context) as container:
-            report = container.stop(group, reason, limit_s=limit)
+            report = together(group, [report, container.stop(group, reason, limit_s=limit)])
     if as_json:
         out.data(report)
     else:
         _say(out, report, settings.system)
+    if asked.is_enough():
+        say_unreached(asked.unreached())
+    if not (report.stopped or report.failed):
+        say_elsewhere(settings)
     if not report.complete:
         raise typer.Exit(1)
 

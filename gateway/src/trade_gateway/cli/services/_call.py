@@ -13,19 +13,23 @@ import msgspec
 import typer
 
 from trade import Handle
+from trade._protocol.keys import is_chunk
 from trade._protocol.messages import ServiceInfo
 from trade._protocol.schema import read_schema
+from trade._stop_line import StopLines
 from trade.errors import TradeError
 from trade_gateway._usage import UsageError, find
 from trade_gateway.cli._completion import containers, services
 from trade_gateway.cli._options import TIMING, Json, Wait
 from trade_gateway.cli._output import Output, say_error
-from trade_gateway.cli._system_choice import visitor
+from trade_gateway.cli._system_choice import choice_of, visitor
 
 _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
 COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
 """Lets negative numbers pass as arguments."""
+_STOP: Final = "stop"
+_STOP_LIMIT_S: Final = 3.0
 _BRACKETS: Final = ("[", "{")
 _ANGLE = re.compile(r"_rad(_s2?)?$")
 _DEGREES = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)(?:deg|°)(?:/s2?)?(?![\w.])")
@@ -69,15 +73,29 @@ def call(
     """Call a service and print its result. Ctrl-C cancels a motion in progress.
 
     Numbers are rounded to six places; --json prints all digits.
+    A service named stop is called on the stop line first, as `trade stop` does: with all stop services of its group.
 
     For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
     """
     check_brackets(arguments or [])
+    if not (arguments or container or pick) and _stopped_by_line(context, service, deadline):
+        Output(as_json=as_json).data(None)
+        return
     with visitor(context) as visiting:
         handle = find(visiting, service, container, wait, pick).with_(deadline_s=deadline)
         args, kwargs = parse_arguments(arguments or [], handle.record.info)
         result = run_to_end(handle, *args, **kwargs)
     Output(as_json=as_json).data(result)
+
+
+def _stopped_by_line(context: typer.Context, service: str, limit_s: float) -> bool:
+    """Stops the group of a stop service on the stop line; whether that is enough, so that the call is done."""
+    group, _, name = service.rpartition(".")
+    if name != _STOP or not all(map(is_chunk, group.split("."))):
+        return False
+    asked = StopLines(choice_of(context).settings()).stop(group, f"trade call {service}", min(limit_s, _STOP_LIMIT_S))
+    report = asked.wait_enough()
+    return asked.is_enough() and service in report.stopped
 
 
 def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
