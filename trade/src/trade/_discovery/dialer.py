@@ -12,7 +12,9 @@ from typing import Final
 
 from trade._transport.addresses import Attempt, Attempts
 from trade._transport.endpoints import Endpoint, accepts
-from trade._transport.zenoh_links import WITHOUT_HUB, Beacon, Links
+from trade._transport.interfaces import is_near
+from trade._transport.scouting import Beacon
+from trade._transport.zenoh_links import WITHOUT_HUB, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
 
 _logger = logging.getLogger("trade")
@@ -44,7 +46,7 @@ class Dialer:
         self._unsure = list(self.configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
-        self._attempts = Attempts()
+        self._attempts = Attempts(is_near)
         self._thread: threading.Thread | None = None
         self._wake = threading.Event()
         self._closed = False
@@ -108,10 +110,10 @@ class Dialer:
     def _join(self, endpoints: Sequence[str], session: str) -> str:
         """Link to the session, or to any, at the first of these addresses that has it; returns its id, or nothing."""
         for address in self._attempts.accepting(endpoints):
-            there = self._links.join([address], session, _JOIN_S, self._ended)
-            if there or self._closed:
-                return there
-            self._attempts.note(address, "accepts connections, and did not link")
+            joined = self._links.join(address, session, _JOIN_S, self._ended)
+            if joined.session or self._closed:
+                return joined.session
+            self._attempts.note(address, joined.problem)
         return ""
 
     def attempts(self) -> list[Attempt]:
