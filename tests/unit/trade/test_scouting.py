@@ -109,11 +109,9 @@ def told(transport: ZenohTransport, other: ZenohTransport) -> tuple[str, list[st
 
 def test_an_open_session_dials_on_request(leaving: ExitStack) -> None:
     one, other = opened(leaving), opened(leaving)
-    began = time.monotonic()
     assert one._prompt is not None
     assert one._prompt.dial(*told(one, other))
     wait_until(lambda: one.links.linked(other.links._own), "they are linked")
-    assert time.monotonic() - began < 60
     assert one.links.linked_at(str(other.links.listen[0]))  # it dialled
 
 
@@ -142,6 +140,7 @@ def test_a_session_with_another_id_is_not_linked(leaving: ExitStack) -> None:
     assert not one.links.linked(other.links._own)
 
 
+@pytest.mark.realtime
 def test_a_session_without_peers_opens_at_once(leaving: ExitStack) -> None:
     took_s: list[float] = []
     for _ in range(5):

@@ -7,6 +7,11 @@ import sys
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
+if sys.platform == "linux":
+    import fcntl
+else:
+    fcntl = None
+
 __all__ = ["Own", "is_near", "own_addresses"]
 
 _DUMP_ADDRESSES: Final = 22
@@ -18,6 +23,8 @@ _LOCAL: Final = 2
 _HEADER: Final = struct.Struct("=IHHII")
 _ABOUT: Final = struct.Struct("=BBBBI")
 _ATTRIBUTE: Final = struct.Struct("=HH")
+_FLAGS_OF: Final = 0x8913
+_MULTICAST: Final = 0x1000
 _FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 
 
@@ -38,6 +45,19 @@ class Own(NamedTuple):
     def dialled(self) -> bool:
         """Whether other hosts can dial it; an IPv6 address of one link cannot be without that host's interface."""
         return not (self.loopback or ipaddress.ip_address(self.ip).is_link_local)
+
+    @property
+    def multicasts(self) -> bool:
+        """Whether the interface carries multicast by its flags; the loopback interface does so without the flag."""
+        if self.loopback or fcntl is None:
+            return True
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            try:
+                name = socket.if_indextoname(self.interface).encode()
+                flags = fcntl.ioctl(asking, _FLAGS_OF, struct.pack("16sH14x", name, 0))
+            except OSError:  # it just went away
+                return False
+        return bool(struct.unpack("16xH14x", flags)[0] & _MULTICAST)
 
     def reaches(self, ip: str) -> bool:
         """Whether another address is in the same network."""

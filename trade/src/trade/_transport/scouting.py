@@ -6,6 +6,7 @@ later. The bytes are those of zenoh's scouting protocol, version 9: containers o
 
 import contextlib
 import logging
+import select
 import selectors
 import socket
 import struct
@@ -104,7 +105,7 @@ def scout(for_s: float, ended: Callable[[], bool], *, here_only: bool) -> Iterat
 
 
 def _asked(here_only: bool, known: Sequence[Own]) -> list[Own]:
-    return [own for own in known if ":" not in own.ip and own.loopback == here_only]
+    return [own for own in known if ":" not in own.ip and own.loopback == here_only and own.multicasts]
 
 
 class Beacon:
@@ -134,9 +135,10 @@ class Beacon:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._socket.bind(GROUP)
-        self._socket.settimeout(_BEAT_S)
+        self._socket.setblocking(False)
         self._join()
         self._ending = threading.Event()
+        self._woken, self._waker = socket.socketpair()
         self._thread = threading.Thread(target=self._run, name="trade-beacon", daemon=True)
         self._thread.start()
 
@@ -144,15 +146,14 @@ class Beacon:
         look_at = time.monotonic() + _BEAT_S
         while not self._ending.is_set():
             try:
+                select.select([self._socket, self._woken], [], [], max(0.0, look_at - time.monotonic()))
                 if time.monotonic() >= look_at:
                     look_at = time.monotonic() + _BEAT_S
                     self._look()
                 self._answer()
-            except TimeoutError:
+            except BlockingIOError:
                 continue
             except OSError as bad:  # a network that just went away
-                if self._ending.wait(0.1):
-                    return
                 _logger.debug("a scout was not answered: %s", bad)
 
     def _answer(self) -> None:
@@ -178,7 +179,7 @@ class Beacon:
     def close(self) -> None:
         """Idempotent."""
         self._ending.set()
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RD)
-        self._thread.join(2 * _BEAT_S)
+        self._waker.close()
+        self._thread.join(_BEAT_S)
+        self._woken.close()
         self._socket.close()
