@@ -3,11 +3,14 @@
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import pytest
 
+from trade._discovery.dialer import Dialer
 from trade._transport.addresses import Attempts
 from trade._transport.endpoints import Endpoint
+from trade._transport.zenoh_links import Joined, Links
 
 pytestmark = pytest.mark.virtual_time
 
@@ -95,6 +98,14 @@ def test_a_name_is_resolved_at_each_try_to_all_its_addresses() -> None:
     assert name not in [attempt.address for attempt in tried.listed()]
 
 
+def test_with_tls_a_name_is_dialled_as_the_name_that_its_certificate_is_for() -> None:
+    wire = Wire(**{"10_9_0_5": (0.01, "")})
+    found = [address.replace("tcp", "tls") for address in (VPN[0], GOOD)]
+    tried = Attempts(resolve=lambda _: found, knocks=wire.knock)
+
+    assert list(tried.accepting(["tls/rosie.local:7450"])) == ["tls/rosie.local:7450"]
+
+
 def test_what_only_the_transport_can_try_is_left_to_it() -> None:
     wire = Wire()
     asked = ["udp/10.9.0.5:7450", "tcp/10.9.0.5:7450#iface=eth0"]
@@ -109,3 +120,53 @@ def test_an_attempt_is_of_the_last_try_only() -> None:
     tried.note(GOOD, "")
 
     assert [attempt[:2] for attempt in tried.listed()] == [(GOOD, "")]
+
+
+class Cable:
+    """In place of the links: what is dialled is linked, until the cable is pulled."""
+
+    hub, certified, bridges = "", False, False
+    connect: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self.to: set[str] = set()
+
+    def join(self, endpoint: str, *_: object) -> Joined:
+        self.to.add(endpoint)
+        return Joined(f"session-of-{endpoint}")
+
+    def linked(self, session: str) -> bool:
+        return any(f"session-of-{endpoint}" == session for endpoint in self.to)
+
+    def linked_at(self, endpoint: str) -> bool:
+        return endpoint in self.to
+
+
+def test_a_configured_name_is_dialled_at_the_addresses_that_it_has_now() -> None:
+    known: list[str] = []
+    wire = Wire(**{"10_9_0_5": (0.01, ""), "10_9_0_6": (0.01, "")})
+    cable, tried = Cable(), Attempts(resolve=lambda _: list(known), knocks=wire.knock)
+    dialer = Dialer(cast("Links", cable), lambda _: None, ["tcp/rosie.local:7450"], tried)
+    try:
+        threading.Event().wait(5.0)
+        assert cable.to == set()
+        known[:] = [VPN[0], GOOD]
+        threading.Event().wait(5.0)
+        assert cable.to == {GOOD}
+
+        cable.to.clear()  # her address changes, and her name follows
+        known[:] = ["tcp/10.9.0.6:7450"]
+        threading.Event().wait(5.0)
+        assert cable.to == {"tcp/10.9.0.6:7450"}
+    finally:
+        dialer.close()
+
+
+def test_a_configured_address_is_left_to_the_transport() -> None:
+    wire, cable = Wire(), Cable()
+    dialer = Dialer(cast("Links", cable), lambda _: None, [VPN[0]], Attempts(resolve=as_written, knocks=wire.knock))
+    try:
+        threading.Event().wait(2.0)
+        assert wire.tried == []
+    finally:
+        dialer.close()

@@ -18,6 +18,7 @@ from trade._transport.endpoints import free_endpoint, loopback_interface
 from trade._transport.interfaces import Own, is_near, own_addresses
 from trade._transport.scouting import Beacon, hello, read_hello, scout
 from trade._transport.zenoh import ZenohTransport, configuration
+from trade._transport.zenoh_links import _tell_change
 
 ID = "de88bef20f15d9afd64d6f625e211ef4"
 CAPTURED = bytes.fromhex(
@@ -94,6 +95,15 @@ def test_the_addresses_are_those_of_the_kernel() -> None:
     assert not HERE.dialled
     assert not Own("fe80::1", 64, 2).dialled
     assert Own("10.9.0.5", 24, 2).dialled
+
+
+def test_a_change_of_addresses_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    before, now = [HERE, Own("10.9.0.5", 24, 2)], [HERE, Own("10.9.0.9", 24, 2)]
+    _tell_change(before, now)
+    assert "the addresses of this host changed: new 10.9.0.9; gone 10.9.0.5" in caplog.text
+    caplog.clear()
+    _tell_change(now, [HERE])
+    assert "changed: gone 10.9.0.9." in caplog.text
 
 
 def opened(leaving: ExitStack) -> ZenohTransport:

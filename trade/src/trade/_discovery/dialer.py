@@ -31,22 +31,28 @@ _REFUSED_S: Final = 3.0
 class Dialer:
     """The discovery switches of one container; thread-safe."""
 
-    def __init__(self, links: Links, may_dial: Callable[[str], None], configured: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        links: Links,
+        may_dial: Callable[[str], None],
+        configured: Sequence[str] = (),
+        attempts: Attempts | None = None,
+    ) -> None:
         self._links = links
         self._may_dial = may_dial
         self._lock = threading.RLock()
         self._beacon: Beacon | None = None
         self._discovering = False
-        self._kept: dict[str, str] = {}
-        """From each endpoint to the id of the session found there."""
         self.configured: Final = (links.hub,) if links.hub else tuple(configured)
         """The endpoints to dial that its settings name, or that of the hub of this host."""
         self.source: Final = "the hub of this host" if links.hub else "TRADE_CONNECT"
         """Where these are from."""
+        self._kept: dict[str, str] = {endpoint: "" for endpoint in self.configured if Endpoint.read(endpoint).named}
+        """From each endpoint to the id of the session found there; a name may have other addresses at each try."""
         self._unsure = list(self.configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
-        self._attempts = Attempts(is_near)
+        self._attempts = attempts or Attempts(is_near)
         self._thread: threading.Thread | None = None
         self._wake = threading.Event()
         self._closed = False
@@ -183,7 +189,7 @@ class Dialer:
 
     def _redial(self) -> None:
         for endpoint, session in list(self._kept.items()):
-            if self._links.linked(session):
+            if self._links.linked(session) if session else self._links.linked_at(endpoint):
                 continue
             there = self._dial(endpoint)
             with self._lock:

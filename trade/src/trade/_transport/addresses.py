@@ -70,9 +70,10 @@ class Attempts:
         """Try all addresses of these endpoints at once; yields those that accept, as they answer.
 
         Own networks come first, and what failed at the last try comes last. Endpoints that only the transport can try
-        (UDP, or with settings after ``?`` or ``#``) are yielded as they are, after the others.
+        (UDP, or with settings after ``?`` or ``#``) are yielded as they are, after the others. So is a name with TLS,
+        in place of its addresses: the certificate may be for the name.
         """
-        plain: dict[str, None] = {}
+        plain: dict[str, str] = {}
         others: list[str] = []
         for text in endpoints:
             asked = Endpoint.read(text)
@@ -84,12 +85,12 @@ class Attempts:
                 self.note(text, _UNRESOLVED)
             elif text not in found:
                 self._forget(text)
-            plain |= dict.fromkeys(found)
+            plain |= dict.fromkeys(found, text if asked.protocol == "tls" else "")
         wanted = [Endpoint.read(text) for text in sorted(plain, key=self._rank)]
         for endpoint, problem in self._knock(wanted, _LIMIT_S) if wanted else ():
             self.note(str(endpoint), problem)
             if not problem:
-                yield str(endpoint)
+                yield plain[str(endpoint)] or str(endpoint)
         yield from others
 
     def _rank(self, endpoint: str) -> tuple[bool, bool]:
