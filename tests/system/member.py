@@ -346,6 +346,10 @@ class Member:
     def addresses(self) -> list[str]:
         return [str(address) for address in self.up.addresses()]
 
+    def attempts(self) -> list[str]:
+        """What came of the addresses that were tried."""
+        return [str(attempt) for attempt in self.up.reach.attempts()]
+
     def tap(self) -> None:
         """From now on note all that the transport hands to this container."""
         fifo = zenoh.handlers.FifoChannel(8192)
@@ -364,10 +368,9 @@ class Member:
         return {
             "own": links._own[:6],
             "peers": [str(peer)[:6] for peer in links._session.info.peers_zid()],
-            "containers": {
-                str(s.address): [s.alive, len(s.providers)] for s in self.up._parts.registry._containers.values()
-            },
+            "containers": {str(s.address): s.heard.complete for s in self.up._parts.registry.containers()},
             "refused": self.up.reach._refused,
+            "attempts": self.attempts(),
         }
 
     def register_ticker(self, group: str) -> None:

@@ -10,8 +10,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade._transport.addresses import Attempt, Attempts
 from trade._transport.endpoints import Endpoint, accepts
-from trade._transport.zenoh_links import WITHOUT_HUB, Beacon, Links
+from trade._transport.interfaces import is_near
+from trade._transport.scouting import Beacon
+from trade._transport.zenoh_links import WITHOUT_HUB, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
 
 _logger = logging.getLogger("trade")
@@ -28,21 +31,28 @@ _REFUSED_S: Final = 3.0
 class Dialer:
     """The discovery switches of one container; thread-safe."""
 
-    def __init__(self, links: Links, may_dial: Callable[[str], None], configured: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        links: Links,
+        may_dial: Callable[[str], None],
+        configured: Sequence[str] = (),
+        attempts: Attempts | None = None,
+    ) -> None:
         self._links = links
         self._may_dial = may_dial
         self._lock = threading.RLock()
         self._beacon: Beacon | None = None
         self._discovering = False
-        self._kept: dict[str, str] = {}
-        """From each endpoint to the id of the session found there."""
         self.configured: Final = (links.hub,) if links.hub else tuple(configured)
         """The endpoints to dial that its settings name, or that of the hub of this host."""
         self.source: Final = "the hub of this host" if links.hub else "TRADE_CONNECT"
         """Where these are from."""
+        self._kept: dict[str, str] = {endpoint: "" for endpoint in self.configured if Endpoint.read(endpoint).named}
+        """From each endpoint to the id of the session found there; a name may have other addresses at each try."""
         self._unsure = list(self.configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
+        self._attempts = attempts or Attempts(is_near)
         self._thread: threading.Thread | None = None
         self._wake = threading.Event()
         self._closed = False
@@ -101,9 +111,20 @@ class Dialer:
             raise LinkStays(to=endpoint)
 
     def _dial(self, endpoint: str) -> str:
-        asked = Endpoint.read(endpoint)
-        found = asked.resolved() if asked.protocol in ("tcp", "udp") and not asked.rest else [endpoint]
-        return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
+        return self._join([endpoint], "")
+
+    def _join(self, endpoints: Sequence[str], session: str) -> str:
+        """Link to the session, or to any, at the first of these addresses that has it; returns its id, or nothing."""
+        for address in self._attempts.accepting(endpoints):
+            joined = self._links.join(address, session, _JOIN_S, self._ended)
+            if joined.session or self._closed:
+                return joined.session
+            self._attempts.note(address, joined.problem)
+        return ""
+
+    def attempts(self) -> list[Attempt]:
+        """What came of the last try at each address that this container dialled, oldest first; for reports."""
+        return self._attempts.listed()
 
     def dialled(self) -> dict[str, bool]:
         """The endpoints that it dials, and whether a link leads to each."""
@@ -162,13 +183,13 @@ class Dialer:
         for found in self._links.scouted(_SCOUT_S, lambda: self._closed or not self._discovering):
             patient = time.monotonic() >= self._refused.get(found.session, 0.0)
             if patient and not self._links.linked(found.session):
-                joined = self._links.join(found.endpoints, found.session, _JOIN_S, self._ended)
+                joined = self._join(found.endpoints, found.session)
                 if not joined:
                     self._refused[found.session] = time.monotonic() + _AGAIN_S
 
     def _redial(self) -> None:
         for endpoint, session in list(self._kept.items()):
-            if self._links.linked(session):
+            if self._links.linked(session) if session else self._links.linked_at(endpoint):
                 continue
             there = self._dial(endpoint)
             with self._lock:

@@ -50,6 +50,15 @@ class Endpoint(NamedTuple):
             return self.host == "localhost"
 
     @property
+    def named(self) -> bool:
+        """Whether the host is a name, which may have other addresses at each look."""
+        try:
+            ipaddress.ip_address(self.host.strip("[]").partition("%")[0])
+        except ValueError:
+            return self.host != "localhost"
+        return False
+
+    @property
     def everywhere(self) -> bool:
         """Whether the endpoint listens on all networks of this host."""
         return self.host in _EVERYWHERE

@@ -7,6 +7,7 @@ for a stalled receiver instead of dropping (zenoh's default). All sessions have 
 """
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from types import MappingProxyType
@@ -29,7 +30,10 @@ from trade._transport.base import (
 )
 from trade._transport.endpoints import Endpoint
 from trade._transport.zenoh_links import Links, new_session_id, open_session
+from trade._transport.zenoh_prompt import Prompt
 from trade.errors import ConfigurationError
+
+_logger = logging.getLogger("trade")
 
 LEASE_MS: Final = 2000
 _COMING_IN_MS: Final = 4000
@@ -240,15 +244,21 @@ class ZenohPresence(Presence):
 
 class ZenohTransport(Transport):
     def __init__(self, settings: dict[str, Any]) -> None:
+        self._prompt = Prompt() if Prompt.possible(settings) else None
+        more = {} if self._prompt is None else self._prompt.settings(bool(settings["connect/endpoints"]))
         try:
-            self._session = open_session(settings)
+            self._session = open_session({**settings, **more})
         except zenoh.ZError as bad:
+            if self._prompt is not None:
+                self._prompt.close()
             reason = str(bad).partition(" at /")[0]  # the rest is a line in zenoh's sources
             raise ConfigurationError(
                 where=f"listen {', '.join(settings['listen/endpoints'])}",
                 problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
-        self.links: Final = Links(self._session, settings)
+        if self._prompt is not None and not self._prompt.secure():
+            _logger.warning("the transport cannot be made to dial: containers whose addresses change may stay unlinked")
+        self.links: Final = Links(self._session, settings, self._prompt)
         self.keep_files: Callable[[], None] = lambda: None
         """Writes files on this host again, by which others find this transport, if they have vanished."""
         self._publishers: Final[set[zenoh.Publisher]] = set()
@@ -354,6 +364,8 @@ class ZenohTransport(Transport):
         for publisher in list(self._publishers):  # zenoh 1.10 never frees a session that ends before its publishers
             _quietly(publisher.undeclare)
         _quietly(self._session.close)
+        if self._prompt is not None:
+            self._prompt.close()
 
 
 def _fifo() -> Any:

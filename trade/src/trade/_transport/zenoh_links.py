@@ -5,14 +5,16 @@ An open zenoh session can neither dial nor answer scouts, and the main one is ne
 linked to two others introduces them to each other by gossip; the two link, and stay linked when it closes.
 """
 
+import contextlib
 import hashlib
 import hmac
 import json
 import logging
 import math
 import secrets
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -20,6 +22,9 @@ import zenoh
 from trade._security.certificates import authority
 from trade._transport.credentials import dictionary_file
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface
+from trade._transport.interfaces import Own, own_addresses
+from trade._transport.scouting import PEER, ROUTER, Beacon, scout
+from trade._transport.zenoh_prompt import Prompt
 from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
@@ -69,22 +74,29 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-class Beacon:
-    """Answers scouts until it is closed."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
-
-    def close(self) -> None:
-        self._session.close()
-
-
 class Found(NamedTuple):
     """A discoverable container of this system."""
 
     session: str
     """The first digits of its main session's id."""
     endpoints: tuple[str, ...]
+
+
+class Joined(NamedTuple):
+    """What came of an attempt to link."""
+
+    session: str
+    """The id of the session that the main one is linked to now; empty: none."""
+    problem: str = ""
+    """Why not, as far as it is known."""
+
+
+class _There(NamedTuple):
+    """Who listens at an address."""
+
+    endpoint: str
+    session: str = ""
+    kind: int = PEER
 
 
 class Link(NamedTuple):
@@ -105,9 +117,10 @@ class Link(NamedTuple):
 class Links:
     """The links of the main session, and the way to add more."""
 
-    def __init__(self, session: zenoh.Session, settings: dict[str, Any]) -> None:
+    def __init__(self, session: zenoh.Session, settings: dict[str, Any], prompt: Prompt | None = None) -> None:
         self._session = session
         self._settings = settings
+        self._prompt = prompt
         self._own = str(session.zid())
         self.bridges: Final[bool] = settings["mode"] == "router"
         self.hub: Final[str] = settings["connect/endpoints"][0] if settings["mode"] == "client" else ""
@@ -116,6 +129,8 @@ class Links:
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self.connect: Final[tuple[str, ...]] = tuple(settings["connect/endpoints"])
         """The endpoints that the main session dials."""
+        self._known_at_start = _dialled()
+        """The addresses at the start: all that the main session ever announces by gossip."""
         self._tag = _tag(settings)
         self._reached_at = self.listen or [Endpoint.read(self.hub)]
         self._shown = next((own for own in self._reached_at if not own.loopback), self._reached_at[0])
@@ -171,11 +186,14 @@ class Links:
 
     def interfaces(self, endpoint: str) -> list[str]:
         """The interfaces that reach the main session at one of its endpoints; empty if it is unreachable there."""
-        asking = self._beside([], [endpoint], {})
+        asking = self._beside(endpoint)
         try:
-            return [name for link in asking.info.links() for name in link.interfaces]
+            until = time.monotonic() + _MOMENT_S / 2
+            while not (links := list(asking.info.links())) and time.monotonic() < until:
+                time.sleep(_LOOK_S)
+            return [name for link in links for name in link.interfaces]
         finally:
-            asking.close()
+            _close(asking)
 
     def linked_at(self, endpoint: str) -> bool:
         """Whether one of the main session's links leads to an endpoint."""
@@ -186,60 +204,111 @@ class Links:
             return False
 
     def beacon(self) -> Beacon:
-        """Opens a session, linked to the main one, that answers scouts and does not dial, until it is closed."""
-        listen = str(self._shown._replace(port=0))
-        return Beacon(self._beside([listen], [self._main_endpoint()], {**self._scouting(), "id": self._beacon_id}))
+        """Answers scouts until it is closed, with the addresses at which this host can be dialled at that moment."""
+        self._check_here()
+        return Beacon(self._beacon_id, self._locators, here_only=self._here_only, changed=_tell_change)
+
+    def _locators(self, known: list[Own], asker: str) -> list[str]:
+        """Where others can dial the main session now, best first for who asks."""
+        ips = [own.ip for own in known if own.dialled] or [own.ip for own in known if own.loopback]
+        shared = {own.ip for own in known if own.reaches(asker)}
+        ips.sort(key=lambda ip: ip not in shared)
+        found: list[str] = []
+        for own in self.listen:
+            hosts = [own.host]
+            if own.everywhere:
+                hosts = [f"[{ip}]" if ":" in ip else ip for ip in ips if ":" not in ip or ":" in own.host]
+            found += [f"{own.protocol}/{host}:{own.port}" for host in hosts]
+        return found
 
     def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
         """Scouts for containers; yields each discoverable container of this system once."""
+        self._check_here()
         seen = {self._beacon_id}
-        asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=_config(self._scouting()))
-        try:
-            until = time.monotonic() + for_s
-            while time.monotonic() < until and not ended():
-                hello = asking.try_recv()
-                if hello is None:
-                    time.sleep(_LOOK_S)
-                    continue
-                found = str(hello.zid)
-                if found not in seen and found.startswith(self._tag):
-                    seen.add(found)
-                    yield _found(found, map(str, hello.locators))
-        finally:
-            asking.stop()
+        for beacon, locators in scout(for_s, ended, here_only=self._here_only):
+            if beacon not in seen and beacon.startswith(self._tag):
+                seen.add(beacon)
+                with contextlib.suppress(ConfigurationError, ValueError):  # any program may answer
+                    yield _found(beacon, locators)
 
-    def join(self, endpoints: Sequence[str], session: str, wait_s: float, ended: Callable[[], bool]) -> str:
-        """Link the main session with the one whose id begins with ``session``, or else with any listener there.
+    def join(self, endpoint: str, session: str, wait_s: float, ended: Callable[[], bool]) -> Joined:
+        """Link the main session with the one that listens there.
 
-        Returns:
-            The id of the session it is linked to now; empty if none accepts it within ``wait_s``.
+        Args:
+            endpoint: an address, not a name.
+            session: the first digits of the id that it must have; empty: any will do.
+            wait_s: the time for each of three steps: to ask who listens, to be dialled, and to dial.
+            ended: whether to end early.
         """
-        helper = self._beside([], [self._main_endpoint(), *endpoints], {})
+        there = self._ask_who(endpoint, wait_s, ended)
+        if not there.session:
+            return Joined("", "accepts connections, but not this container")
+        if there.session == self._own:
+            return Joined("", "this container itself")
+        if not there.session.startswith(session):
+            return Joined("", f"another container answers now ({there.session[:_NAME]})")
+        ways = [self._introduced, self._prompted]
+        if self._prompt is not None and not self.bridges and (self._moved() or _dials_first(self._own, there)):
+            ways.reverse()
+        for way in ways:
+            if self.linked(there.session) or way(there, wait_s, ended):
+                return Joined(there.session)
+        return Joined("", "accepts this container, but no link was made in time")
+
+    def _moved(self) -> bool:
+        """Whether others would dial addresses that this host had when it started, and that are not all of today's."""
+        return any(own.everywhere for own in self.listen) and _dialled() != self._known_at_start
+
+    def _ask_who(self, endpoint: str, wait_s: float, ended: Callable[[], bool]) -> _There:
+        asking = self._beside(endpoint)
         try:
             until = time.monotonic() + wait_s
             while time.monotonic() < until and not ended():
-                there = session or next((p for p in _others(helper) if p != self._own), "")
-                if there and self.linked(there):
-                    return there
+                if routers := sorted(_routers(asking)):
+                    return _There(endpoint, routers[0], ROUTER)
+                if others := _others(asking):
+                    return _There(endpoint, others[0])
                 time.sleep(_LOOK_S)
-            return ""
+            return _There(endpoint)
         finally:
-            helper.close()
+            _close(asking)
+
+    def _introduced(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+        """By a session that is linked to both: of the two, the one that dials first dials what the other listened on
+        when it started.
+        """
+        helper = self._beside(self._main_endpoint(), there.endpoint)
+        try:
+            return self._wait_linked(there, min(wait_s, _MOMENT_S) if self._prompt else wait_s, ended)
+        finally:
+            _close(helper)
+
+    def _prompted(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+        """By the main session itself, which dials exactly there."""
+        if self._prompt is None or not self._prompt.dial(there.session, [there.endpoint], there.kind):
+            return False
+        return self._wait_linked(there, wait_s, ended)
+
+    def _wait_linked(self, there: _There, wait_s: float, ended: Callable[[], bool]) -> bool:
+        until = time.monotonic() + wait_s
+        while not (linked := self.linked(there.session)) and time.monotonic() < until and not ended():
+            time.sleep(_LOOK_S)
+        return linked
 
     def _main_endpoint(self) -> str:
         """The endpoint at which a session of this process reaches the main one, or the hub that it is attached to."""
         return dialled_from_here(self._reached_at[0])
 
-    def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
+    def _beside(self, *connect: str) -> zenoh.Session:
         settings = {
             **self._settings,
             "id": new_session_id(),
             "mode": "peer",
             "gateway": {},
-            "listen/endpoints": list(listen),
+            "listen/endpoints": [],
             "connect/endpoints": list(connect),
             "scouting/gossip/autoconnect": _NO_PEERS,
-            **more,
+            "open/return_conditions/connect_scouted": False,
         }
         try:
             return open_session(settings)
@@ -248,23 +317,15 @@ class Links:
                 where="the extra session for discovery and joining", problem=f"cannot be opened: {bad}"
             ) from None
 
-    def _scouting(self) -> dict[str, Any]:
-        return {
-            "scouting/multicast/enabled": True,
-            "scouting/multicast/listen": True,
-            "scouting/multicast/autoconnect": _NO_PEERS,
-            "scouting/multicast/interface": self._interface(),
-        }
+    @property
+    def _here_only(self) -> bool:
+        return all(own.loopback for own in self.listen)
 
-    def _interface(self) -> str:
+    def _check_here(self) -> None:
         """S21: a container that listens on this host only scouts and answers on this host only."""
-        if not all(own.loopback for own in self.listen):
-            return "auto"
-        loopback = loopback_interface()
-        if not loopback:
+        if self._here_only and not loopback_interface():
             problem = "no loopback interface was found, and this container may not be found from other hosts"
             raise ConfigurationError(where="discovery", problem=problem)
-        return loopback
 
 
 def _routers(session: zenoh.Session) -> set[str]:
@@ -274,6 +335,43 @@ def _routers(session: zenoh.Session) -> set[str]:
 def _others(session: zenoh.Session) -> list[str]:
     """The ids of the sessions that a session is linked to."""
     return [str(other) for other in (*session.info.peers_zid(), *session.info.routers_zid())]
+
+
+def _dialled() -> set[str]:
+    """The addresses of this host that others can dial."""
+    return {own.ip for own in own_addresses() if own.dialled}
+
+
+def _dials_first(own: str, there: _There) -> bool:
+    """Whether, of two sessions that hear of each other, this one dials: its id is the greater, last byte first."""
+    if there.kind == ROUTER:
+        return True
+
+    def rank(session: str) -> bytes:
+        return bytes.fromhex(session.zfill(_DIGITS))[::-1]
+
+    return rank(own) > rank(there.session)
+
+
+def _close(extra: zenoh.Session) -> None:
+    """Close a session beside the main one. Over a network that just went away it takes 10 s; waits 1 s at most."""
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            extra.close()
+
+    closing = threading.Thread(target=close, name="trade-link-end", daemon=True)
+    closing.start()
+    closing.join(_MOMENT_S)
+
+
+def _tell_change(before: list[Own], now: list[Own]) -> None:
+    came = sorted({own.ip for own in now} - {own.ip for own in before})
+    went = sorted({own.ip for own in before} - {own.ip for own in now})
+    _logger.warning(
+        "the addresses of this host changed: %s. Other containers find this one at its addresses of now",
+        "; ".join(f"{what} {', '.join(ips)}" for what, ips in (("new", came), ("gone", went)) if ips),
+    )
 
 
 def _found(beacon: str, locators: Iterable[str]) -> Found:
