@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import socket
 import threading
 import time
@@ -57,10 +58,10 @@ class LineCall(Generic[_Report]):
         """Whether all have answered or failed."""
         return self._left == 0
 
-    def wait(self) -> _Report:
-        """Waits until all have answered, or the time is over; returns the answers, merged."""
+    def wait(self, most_s: float = math.inf) -> _Report:
+        """Waits until all have answered, or the time is over, and at most that many seconds; returns all answers."""
         with self._changed:
-            self._changed.wait_for(self.over, max(0.0, self._until - time.monotonic()))
+            self._changed.wait_for(self.over, max(0.0, min(most_s, self._until - time.monotonic())))
         return self.report()
 
     def _work(self) -> None:
