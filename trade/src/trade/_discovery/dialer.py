@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade._transport.addresses import Attempt, Attempts
 from trade._transport.endpoints import Endpoint, accepts
 from trade._transport.zenoh_links import WITHOUT_HUB, Beacon, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
@@ -43,6 +44,7 @@ class Dialer:
         self._unsure = list(self.configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
+        self._attempts = Attempts()
         self._thread: threading.Thread | None = None
         self._wake = threading.Event()
         self._closed = False
@@ -101,9 +103,20 @@ class Dialer:
             raise LinkStays(to=endpoint)
 
     def _dial(self, endpoint: str) -> str:
-        asked = Endpoint.read(endpoint)
-        found = asked.resolved() if asked.protocol in ("tcp", "udp") and not asked.rest else [endpoint]
-        return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
+        return self._join([endpoint], "")
+
+    def _join(self, endpoints: Sequence[str], session: str) -> str:
+        """Link to the session, or to any, at the first of these addresses that has it; returns its id, or nothing."""
+        for address in self._attempts.accepting(endpoints):
+            there = self._links.join([address], session, _JOIN_S, self._ended)
+            if there or self._closed:
+                return there
+            self._attempts.note(address, "accepts connections, and did not link")
+        return ""
+
+    def attempts(self) -> list[Attempt]:
+        """What came of the last try at each address that this container dialled, oldest first; for reports."""
+        return self._attempts.listed()
 
     def dialled(self) -> dict[str, bool]:
         """The endpoints that it dials, and whether a link leads to each."""
@@ -162,7 +175,7 @@ class Dialer:
         for found in self._links.scouted(_SCOUT_S, lambda: self._closed or not self._discovering):
             patient = time.monotonic() >= self._refused.get(found.session, 0.0)
             if patient and not self._links.linked(found.session):
-                joined = self._links.join(found.endpoints, found.session, _JOIN_S, self._ended)
+                joined = self._join(found.endpoints, found.session)
                 if not joined:
                     self._refused[found.session] = time.monotonic() + _AGAIN_S
 
