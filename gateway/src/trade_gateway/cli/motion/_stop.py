@@ -9,7 +9,7 @@ from trade import StopReport
 from trade._stop_line import StopLines, together
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor
 
 _LINE_S: Final = 0.3
@@ -42,6 +42,8 @@ def stop(
     if not (report.complete and asked.over()):  # a container without a stop line may have a link, or see one that has
         with visitor(context) as container:
             report = together(group, [container.stop(group, reason, limit_s=limit), asked.report()])
+            for sentence in () if report.complete else container.beyond():
+                complain(sentence)
     if as_json:
         out.data(report)
     else:
