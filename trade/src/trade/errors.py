@@ -172,6 +172,8 @@ class NoSuchService(CallerError, LookupError):
     """Endpoints where no container was found, each with the reason, if this container found no other one."""
     hidden: str = ""
     """Why the policy would hide a matching service from this container; empty if it would not."""
+    beyond: Sequence[str] = ()
+    """What other containers see and this one does not, as sentences."""
 
     def describe(self) -> str:
         return f"no service matches {self.constraint} after {self.waited_s:.3g} s. {self._hint()}"
@@ -179,6 +181,8 @@ class NoSuchService(CallerError, LookupError):
     def _hint(self) -> str:
         if self.hidden:
             return f"{self.hidden}, so such services are hidden here. Ask the policy's maintainer for access"
+        if self.beyond:
+            return "; ".join(self.beyond)
         if self.near:
             return f"Did you mean {' or '.join(self.near)}?"
         if self.groups:

@@ -6,9 +6,12 @@ from typing import Final
 import typer
 
 from trade import Container, Settings
+from trade_gateway.cli._output import complain
 
 _PATIENCE_S: Final = 3.0
 """How long to wait for a container at the endpoints of the settings, in seconds."""
+_LINK_S: Final = 2.0
+"""How long to wait for links to the containers that this one sees, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,8 @@ def visitor(context: typer.Context, name: str | None = None) -> Container:
 def visitor_among_others(context: typer.Context) -> Container:
     """Opens the same for queries: if the settings name endpoints, one of them has to answer.
 
+    It warns of containers that others see and this command does not.
+
     Raises:
         NoContainerFound: none of these endpoints answers; with the reason, if known.
     """
@@ -52,6 +57,9 @@ def visitor_among_others(context: typer.Context) -> Container:
             reachability = container.reachability(limit_s=_PATIENCE_S)
             if not reachability.others:
                 raise reachability.as_error(container.settings.system)
+        if container.settings.connect:
+            for sentence in container.beyond(wait_s=_LINK_S):
+                complain(sentence)
     except BaseException:
         container.close()
         raise

@@ -199,7 +199,7 @@ class _Rule(NamedTuple):
 
 
 _LOCKS: Final = frozenset(("break_lock", "request_release"))
-_STOPS: Final = frozenset(("estop", "estop_clear", "resume"))
+_STOPS: Final = frozenset(("estop", "estop_clear", "resume", "stop_group"))
 _REPORTED_BY_TABLE: Final = frozenset(("acquire",))
 """The lock table reports these itself, in more detail; only their refusals are reported here."""
 _SILENT: Final = frozenset(

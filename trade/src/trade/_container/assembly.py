@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, Protocol
 
 from trade._audit.events import open_audit
@@ -49,7 +49,7 @@ from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
 from trade._settings import Settings
-from trade._stop_line import StopLines, StopLineService, StopReport, stop_group, stops_of, together
+from trade._stop_line import GroupStop, StopLines, StopLineService, StopReport, session_for, together
 from trade._streams import source as _streams
 from trade._streams.source import Streams
 from trade._streams.subscriptions import Subscriptions
@@ -67,8 +67,6 @@ from trade._transport.zenoh import ZenohTransport
 from trade.errors import AccessDenied, TradeError
 
 _logger = logging.getLogger("trade")
-
-_LOOK_S: Final = 0.1
 
 
 class Host(
@@ -276,7 +274,7 @@ class Components:
         """Its service of the stop line; None on a transport without a host."""
         if self.dialer is not None:
             self.stop_line = StopLineService(
-                self._address, self._settings, self._access, self.audit, self.estop, self.stop_known
+                self._address, self._settings, self._access, self.audit, self.estop, self.stop_for
             )
             leaving.callback(self.stop_line.close)
             self.registry.changes.subscribe(self._mind_stops)
@@ -336,32 +334,50 @@ class Components:
                 begin_watching(self._home.access, self.scheduler, self.audit, self.recheck_access)
             undone.pop_all()
 
-    def stop_known(self, group: str, limit_s: float) -> StopReport:
-        """Calls the stop services of a group that are known here, within a time limit in seconds."""
-        return stop_group(self._home, stops_of(self.registry, group), group, limit_s)
+    def stop_for(self, who: str, group: str, limit_s: float, known: Sequence[str] = ()) -> StopReport:
+        """Calls the stop services of a group that are known here, in a session of the client that asks.
+
+        Args:
+            who: the client.
+            group: what to stop, with all groups beneath it.
+            limit_s: how long to wait, in seconds.
+            known: the keys of services that the client stops itself.
+        """
+        until = time.monotonic() + limit_s
+        with session_for(self._address, who).use():
+            return GroupStop(self._home, self.registry, group, None, known).wait(until, lambda: True)
 
     def stop(self, group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
         """Calls all stop services of a group at once, and waits until what they stop is at rest (S07).
 
-        It needs no lock and no existing link: it also asks containers on the stop line, and a service that one of them
-        stopped is stopped. Read the report: `StopReport.complete`. This is software, not safety-rated.
+        It needs no lock and no existing link: it also asks containers on the stop line, and each container that it sees
+        stops what only that one sees. A service that any of them stopped is stopped. Read the report:
+        `StopReport.complete`. This is software, not safety-rated.
 
         Args:
             group: such as ``rosie.left``, with all groups beneath it.
             reason: why, for the record.
-            limit_s: how long to try, in seconds; also if nothing is found.
+            limit_s: how long to try, in seconds; also if nothing is found, and a container may be missing.
 
         Raises:
             ConfigurationError: the group or the limit is not valid.
         """
         check_limit(limit_s, "stop")
-        until = time.monotonic() + limit_s
-        wanted = where(group=group)
+        until, wanted = time.monotonic() + limit_s, where(group=group)
         beside = self.stop_lines.stop(group, reason, limit_s)
-        while not (self.registry.select(wanted) or beside.over()) and (left_s := until - time.monotonic()) > 0:
-            self.registry.wait_for(lambda: bool(self.registry.select(wanted)), min(_LOOK_S, left_s))
-        report = self.stop_known(group, max(_LOOK_S, until - time.monotonic()))
+        begun = GroupStop(self._home, self.registry, group, reason)
+
+        def ready() -> bool:
+            found = bool(self.registry.select(wanted)) or bool(begun.report().stopped)
+            return found or (beside.over() and (bool(beside.report().stopped) or self._sees_all()))
+
+        report = begun.wait(until, ready)
         return together(group, [report, beside.report() if report.complete else beside.wait()])
+
+    def _sees_all(self) -> bool:
+        """Whether no container is known to be missing: each has listed its services, and each dialled one is linked."""
+        listed = all(state.heard.complete for state in self.registry.containers() if state.address != self._address)
+        return listed and not (self.dialer is not None and self.dialer.unlinked())
 
     # --- handling events
 

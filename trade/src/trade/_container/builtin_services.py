@@ -15,6 +15,7 @@ from trade._notifications.services import NotificationServicesHost as Member
 from trade._notifications.states import StateServices
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
+from trade._stop_line import GroupStopServices
 from trade._streams.services import StreamServices
 from trade._telemetry.log_buffer import LogLine, logbook
 from trade._telemetry.spans import Span, Spans
@@ -63,6 +64,7 @@ class OwnServices(
     MigrationServices,
     StreamServices,
     StateServices,
+    GroupStopServices,
 ):
     """One provider, so that one registry entry lists all the container's own services."""
 
@@ -86,3 +88,4 @@ class OwnServices(
         MigrationServices.__init__(self, parts.migration_source, parts.migration_target)
         StreamServices.__init__(self, parts.streams)
         StateServices.__init__(self, parts.states)
+        GroupStopServices.__init__(self, parts.stop_for)

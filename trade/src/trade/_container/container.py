@@ -185,6 +185,7 @@ class Container:
     robot: FindRobot = cast("FindRobot", delegated("_lookup", cast("Any", Lookup.robot)))
     await_services = delegated("_lookup", Lookup.await_services)
     reachability = delegated("_lookup", Lookup.reachability)
+    beyond = delegated("_lookup", Lookup.beyond)
     call = delegated("_lookup", Lookup.call)
     call_all = delegated("_lookup", Lookup.call_all)
     call_sequence = delegated("_lookup", Lookup.call_sequence)

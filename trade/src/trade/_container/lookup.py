@@ -10,7 +10,7 @@ from trade._calls.everywhere import Everywhere, answers, everywhere
 from trade._calls.handle import Bound, CallHost, Handle, service_of
 from trade._calls.picking import Pick, Picker, narrowed, required
 from trade._container.group_view import GroupView, Members
-from trade._container.reachability import Reachability, look_around
+from trade._container.reachability import Reachability, beyond, look_around
 from trade._context.call_context import patience_s
 from trade._discovery.dialer import Dialer
 from trade._protocol.keys import ServiceKey
@@ -270,14 +270,18 @@ class Lookup:
             return
         apart = self._unanswered(wait_s) if len(self._registry.containers()) == 1 else ()
         hidden = self._access.hidden(self.home.address.identity, asked_for(constraint, "group"))
-        raise no_such_service(constraint, self._registry.select(where()), wait_s, apart, hidden)
+        others = self.beyond() if wait_s > 0 else ()
+        raise no_such_service(constraint, self._registry.select(where()), wait_s, apart, hidden, others)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Endpoints without a container; the reasons, at half a second each, only if the caller does not wait."""
-        reach = self._dialer
-        if wait_s > 0 or reach is None:
+        if wait_s > 0 or self._dialer is None:
             return self.reachability(limit_s=0).unanswered
-        return tuple(f"{endpoint} ({reach.source})" for endpoint in reach.configured)
+        return tuple(f"{endpoint} ({self._dialer.source})" for endpoint in self._dialer.configured)
+
+    def beyond(self, *, wait_s: float = 0.0) -> list[str]:
+        """What others see and this container does not, as sentences; waits that long for links, in seconds."""
+        return beyond(self._registry, self._dialer, self.handle, wait_s)
 
     def reachability(self, *, limit_s: float = 3.0) -> Reachability:
         """The containers that it has found: without them, an empty answer of the system means nothing.

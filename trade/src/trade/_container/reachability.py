@@ -1,18 +1,26 @@
 """Reachability: the containers that one has found, and the dialled endpoints at which it found none."""
 
 import time
+from collections.abc import Callable
 from typing import Final
 
 from msgspec import Struct, structs
 
+from trade._calls import batch
+from trade._calls.handle import Handle
 from trade._discovery.dialer import Dialer
-from trade._protocol.keys import Address
+from trade._protocol.container_info import ContainerInfo
+from trade._protocol.keys import DOMAIN, Address, ServiceKey
+from trade._registry.constraints import where
 from trade._registry.registry import Registry
 from trade.errors import NoContainerFound
 
-__all__ = ["Reachability", "look_around"]
+__all__ = ["Reachability", "beyond", "look_around"]
 
 _LOOK_S: Final = 0.02
+_ASK_S: Final = 0.5
+_OWN_PROVIDERS: Final = 2
+"""What every container has: one with no more is a client, which comes and goes."""
 _HIDDEN: Final = (
     "the link is up, but no container is visible to {identity}. Is its certificate revoked, is it unknown to the "
     "policy there, or is the system there another one than {system}?"
@@ -80,3 +88,35 @@ def _apart(reach: Dialer, own: Address, system: str, found: Reachability) -> dic
         hidden = _HIDDEN.format(identity=own.identity, system=system)
         apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
     return apart
+
+
+def beyond(
+    registry: Registry, reach: Dialer | None, handle: Callable[[ServiceKey], Handle], wait_s: float = 0.0
+) -> list[str]:
+    """What other containers see and this one does not, as sentences with the addresses that were tried in vain.
+
+    For example: "base sees rosie (12 services); no link from here yet: tried 10.9.0.5:7450 (refused)".
+
+    Args:
+        registry: of this container.
+        reach: its links.
+        handle: a handle of a service.
+        wait_s: how long to wait until it sees them, too, in seconds.
+    """
+    lists = registry.select(where(name="containers", group=DOMAIN))
+    asked = [handle(record.key).with_(deadline_s=_ASK_S) for record in lists if not record.local]
+    seen: dict[str, tuple[ContainerInfo, list[str]]] = {}
+    for outcome in batch.all_outcomes([one.bind() for one in asked]):
+        for info in outcome.result if outcome.ok else ():
+            if info.providers > _OWN_PROVIDERS:
+                seen.setdefault(info.epoch, (info, []))[1].append(outcome.handle.container)
+
+    def missing() -> list[str]:
+        present = {state.address.epoch for state in registry.containers()}
+        return [epoch for epoch in seen if epoch not in present]
+
+    registry.wait_for(lambda: not missing(), wait_s)
+    vain = [] if reach is None else [str(attempt) for attempt in reach.attempts() if attempt.problem]
+    tried = f": tried {', '.join(vain)}" if vain else ""
+    found = [(", ".join(sorted(seen[epoch][1])), seen[epoch][0]) for epoch in missing()]
+    return [f"{by} sees {one.name} ({one.services} services); no link from here yet{tried}" for by, one in found]

@@ -54,6 +54,9 @@ class ServiceKey(Struct, frozen=True, array_like=True, gc=False, cache_hash=True
     provider: str
     name: str
 
+    def __str__(self) -> str:
+        return f"{self.address}/{self.domain}/{self.provider}/{self.name}"
+
 
 def call_key(caller: str, callee: Address, domain: str, provider: str, *, stop: bool) -> str:
     return f"{'stop' if stop else 'call'}/{caller}/{callee}/{domain}/{provider}"

@@ -23,6 +23,7 @@ def no_such_service(
     waited_s: float,
     apart: Sequence[str] = (),
     hidden: str = "",
+    beyond: Sequence[str] = (),
 ) -> NoSuchService:
     """The error of a lookup without a match.
 
@@ -32,6 +33,7 @@ def no_such_service(
         waited_s: how long the lookup waited, in seconds.
         apart: missing links, and the reasons (`Reachability`).
         hidden: why the policy hides the service.
+        beyond: what other containers see.
     """
     known = list(records)
     groups = sorted({group for record in known for group in record.groups} - {DOMAIN})
@@ -43,6 +45,7 @@ def no_such_service(
         groups=groups[:_MOST_GROUPS],
         apart=apart,
         hidden=hidden,
+        beyond=beyond,
     )
 
 

@@ -26,6 +26,7 @@ FUNCTIONS: Final = {
     "request_release": _ALL,
     "release_requested": _ALL,
     "estop": _ALL,
+    "stop_group": _ALL,
     "estops": _ALL,
     "notify": "instrument",  # and the right to make the call, checked at each call
     "notifications": _ALL,

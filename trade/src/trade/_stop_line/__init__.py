@@ -6,7 +6,17 @@ docs/wire-protocol.md, "The stop line", describes its messages.
 
 from trade._stop_line.client import LineCall, StopLines
 from trade._stop_line.elsewhere import elsewhere
-from trade._stop_line.group_stop import StopReport, stop_group, stops_of, together
+from trade._stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
 from trade._stop_line.service import StopLineService
 
-__all__ = ["LineCall", "StopLineService", "StopLines", "StopReport", "elsewhere", "stop_group", "stops_of", "together"]
+__all__ = [
+    "GroupStop",
+    "GroupStopServices",
+    "LineCall",
+    "StopLineService",
+    "StopLines",
+    "StopReport",
+    "elsewhere",
+    "session_for",
+    "together",
+]

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import socket
 import threading
 import time
@@ -83,9 +84,16 @@ class LineCall(Generic[_Report]):
             tried = self.over() or (not self._pending and time.monotonic() >= self._reach_until)
             return tried and self.problems.keys() <= self._unreached and self._merge(list(self._reports)).complete
 
-    def wait_enough(self) -> _Report:
-        """Waits as `wait` does, but not for places that accept no connection, once all others have confirmed."""
+    def wait_enough(self, incomplete_s: float = math.inf) -> _Report:
+        """Waits as `wait` does, but not for places that accept no connection, once all others have confirmed.
+
+        Args:
+            incomplete_s: after this time in seconds, it does not wait for a report that is still incomplete.
+        """
+        patient_until = time.monotonic() + incomplete_s
         while not (self.over() or self.is_enough()) and (left_s := self._until - time.monotonic()) > 0:
+            if time.monotonic() >= patient_until and not self.report().complete:
+                break
             with self._changed:
                 self._changed.wait(min(_LOOK_S, left_s))
         return self.report()

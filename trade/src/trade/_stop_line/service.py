@@ -38,7 +38,7 @@ class StopLineService:
     """Listens on the networks from the start, and on this host when there is something to stop.
 
     Args:
-        stop: calls all known stop services of a group, within a time limit in seconds.
+        stop: calls all known stop services of a group for a client, within a time limit in seconds.
 
     Raises:
         ConfigurationError: one of its ports cannot be opened.
@@ -51,7 +51,7 @@ class StopLineService:
         access: Authorizer,
         audit: Audit,
         estopping: EstopController,
-        stop: Callable[[str, float], StopReport],
+        stop: Callable[[str, str, float], StopReport],
     ) -> None:
         self._own = own
         self._system = settings.system
@@ -157,7 +157,7 @@ class StopLineService:
         if request.ask == "stop":
             self._audit.note("stop", "stop line", about=request.group, who=identity, why=request.reason)
             _logger.warning("stopping %s, asked by %s on the stop line: %s", request.group, asked, request.reason)
-            return StopAnswer(who=own, stop=self._stop(request.group, request.limit_s))
+            return StopAnswer(who=own, stop=self._stop(identity, request.group, request.limit_s))
         if not self._estopping.knows(request.id):  # else it was received, and is on record
             self._audit.note("stop", "stop line", about=request.id, who=identity, why=request.reason)
         reason = f"{request.reason} (asked by {asked} on the stop line)".lstrip()

@@ -211,6 +211,9 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
     yield from _hub(HubFile(system))
     others = sorted(one.name for one in member.containers() if one.epoch != member.address.epoch)
     about = f"system {system}"
+    for sentence in member.beyond(wait_s=_PATIENCE_S if member.settings.connect else 0):
+        fix = "make an address of it reachable from here; until then, only stops of its groups get there"
+        yield Finding(level="warning", about=about, text=sentence, fix=fix)
     if others:
         yield Finding(level="ok", about=about, text=f"visible: {', '.join(others)}")
         return

@@ -1,6 +1,6 @@
 """``trade stop``: stops all motion in a group."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
@@ -9,8 +9,11 @@ from trade import StopReport
 from trade._stop_line import StopLines, together
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
+from trade_gateway.cli._output import Output, complain, say_elsewhere, say_unreached
 from trade_gateway.cli._system_choice import choice_of, visitor
+
+_LINE_S: Final = 0.3
+"""The time before it also stops over links, in seconds."""
 
 
 def stop(
@@ -26,6 +29,7 @@ def stop(
 
     The command calls all stop services of the group.
     It uses the stop line first, which works while the middleware's links are busy.
+    Then it uses the links, and asks each container that it sees to stop what only that one sees.
     The exit code is not 0 if a device could not be stopped, or if there was nothing to stop.
     This is software. It is not safety-rated and does not replace a switch that cuts the power.
 
@@ -34,10 +38,12 @@ def stop(
     out = Output(as_json=as_json)
     settings = choice_of(context).settings()
     asked = StopLines(settings).stop(group, reason, limit)
-    report = asked.wait_enough()
-    if not asked.is_enough():  # a container without a stop line may have a link
+    report = asked.wait_enough(_LINE_S)
+    if not asked.is_enough():  # a container without a stop line may have a link, or see one that has
         with visitor(context) as container:
-            report = together(group, [report, container.stop(group, reason, limit_s=limit)])
+            report = together(group, [container.stop(group, reason, limit_s=limit), asked.report()])
+            for sentence in () if report.complete else container.beyond():
+                complain(sentence)
     if as_json:
         out.data(report)
     else:

@@ -99,6 +99,8 @@ def _nothing(container: Container, constraint: Constraint) -> str:
     groups = sorted({group for handle in others for group in handle.groups})
     if groups:
         return f"no services match {escape(str(constraint))}; there is {', '.join(groups)}"
+    if len(container.addresses()) > 1:
+        return f"no services are visible from here in system {escape(container.settings.system)}"
     return f"nothing is up in system {escape(container.settings.system)}{_starts(container)}"
 
 
