@@ -141,10 +141,12 @@ LEGS = CanBus(name="legs", driver="cia402", interface="socketcan", channel="can0
         (Link(True, ErrorState.PASSIVE, 500_000), "error", "120 ohm"),
         (Link(True, ErrorState.ACTIVE, 500_000), "ok", ""),
         (Link(True, None), "ok", ""),
+        (Link(True, ErrorState.ACTIVE, 500_000, 17), "warning", "ip link set can0 txqueuelen 128"),
+        (Link(True, ErrorState.ACTIVE, 500_000, 18), "ok", ""),
     ],
 )
 def test_a_can_interface_is_up_at_the_rate_of_the_file_and_healthy(link: Link, level: str, fix: str) -> None:
-    found = robots.judged(LEGS, link)
+    found = robots.judged(LEGS, link, 6)
     assert (found.level, fix in found.fix) == (level, True)
 
 

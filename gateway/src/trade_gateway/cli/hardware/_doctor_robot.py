@@ -33,6 +33,10 @@ __all__ = ["controllers", "devices", "interfaces", "judged", "refused", "shared"
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
 _PATIENCE_S: Final = 3.0
+_FRAMES: Final = 3
+"""The frames that a drive gets at once, at the start of a group's motion."""
+_QUEUE: Final = 128
+"""A length of the send queue that suffices for all of this project's drivers."""
 _BAD_LINE: Final = (
     "check the cable, its length and its ends: a long line needs a termination (120 ohm) at both ends only, "
     "a common ground, and one baud rate"
@@ -71,14 +75,14 @@ def interfaces(robot: Robot) -> Iterator[Finding]:
         from trade_drivers.bus.can import look_at  # noqa: PLC0415 - python-can is optional
 
         try:
-            yield judged(bus, look_at(bus.channel))
+            yield judged(bus, look_at(bus.channel), len(robot.joints_on(bus.name)))
         except OSError as bad:
             fix = "plug its adapter in and load its kernel module; `ip link show type can` lists the interfaces"
             yield Finding(level="error", about=bus.channel, text=str(bad), fix=fix)
 
 
-def judged(bus: CanBus, link: "Link") -> Finding:
-    """Returns the finding about a CAN interface."""
+def judged(bus: CanBus, link: "Link", drives: int) -> Finding:
+    """Returns the finding about a CAN interface with so many drives."""
     about = bus.channel
     up = f"sudo ip link set {about} up type can bitrate {bus.bitrate} restart-ms 100"
     if not link.up:
@@ -94,6 +98,10 @@ def judged(bus: CanBus, link: "Link") -> Finding:
             f"down; {up}"
         )
         return Finding(level="error", about=about, text=text, fix=fix)
+    if link.queue is not None and link.queue < _FRAMES * drives:
+        text = f"its send queue holds {link.queue} frames (txqueuelen); {drives} drives may need {_FRAMES * drives}"
+        fix = f"sudo ip link set {about} txqueuelen {max(_QUEUE, _FRAMES * drives)}, after each boot (docs/drivers.md)"
+        return Finding(level="warning", about=about, text=text, fix=fix)
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
 
 
