@@ -15,6 +15,7 @@ from trade import Container
 from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
+from trade_drivers.plugins._ports import SeenPorts
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.cli.hardware import _doctor_robot as robots
@@ -170,6 +171,17 @@ def of_devices(robot_file: Path) -> list[Finding]:
 def test_a_missing_port_is_reported(robot_file: Path) -> None:
     found = only(of_devices(robot_file))
     assert (found.level, found.about) == ("error", "bus neck")
+
+
+def test_an_adapter_that_two_robot_files_name_is_an_error_with_both_files(robot_file: Path) -> None:
+    other = robot_file.with_name("other.toml")
+    other.write_text(robot_file.read_text().replace('"rosie"', '"ada"'))
+    seen = SeenPorts()
+    assert not [one for one in _of_robot(robot_file, seen) if one.about == "ports"]
+    found = only([one for one in _of_robot(other, seen) if one.about == "ports"])
+    assert found.level == "error"
+    assert f"{other}: bus.neck.port" in found.text
+    assert f"{robot_file}: bus.neck.port already" in found.text
 
 
 @pytest.mark.realtime

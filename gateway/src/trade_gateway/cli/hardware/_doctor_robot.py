@@ -20,7 +20,7 @@ from trade_drivers import (
     load_driver,
 )
 from trade_drivers.bus._jobs import SHARED, TAKEN
-from trade_drivers.plugins._ports import check_ports
+from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
@@ -105,10 +105,10 @@ def judged(bus: CanBus, link: "Link", drives: int) -> Finding:
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
 
 
-def shared(robot: Robot) -> Iterator[Finding]:
-    """Reports two names of one port."""
+def shared(robot: Robot, seen: SeenPorts | None = None) -> Iterator[Finding]:
+    """Reports two names of one port; ``seen`` has the ports of robots before this one."""
     try:
-        check_ports(robot)
+        check_ports(robot, seen=seen)
     except ConfigurationError as bad:
         yield Finding(level="error", about="ports", text=str(bad), fix="correct one of the two keys")
 
