@@ -173,6 +173,17 @@ def test_a_missing_port_is_reported(robot_file: Path) -> None:
     assert (found.level, found.about) == ("error", "bus neck")
 
 
+def test_a_port_whose_number_may_change_is_named_with_a_lasting_name(tmp_path: Path) -> None:
+    """Two equal adapters swap ttyUSB0 and ttyUSB1, and each robot's commands go to the other arm."""
+    (tmp_path / "by-path").mkdir()
+    lasting = tmp_path / "by-path" / "pci-0:usb-0:1.2"
+    lasting.symlink_to("/dev/ttyUSB7")
+    found = only(robots.numbered(parse(HEAD.replace("/dev/ttyNOWHERE", "/dev/ttyUSB7"), "head.toml"), tmp_path))
+    assert (found.level, found.about) == ("warning", "bus neck")
+    assert str(lasting) in found.fix
+    assert not list(robots.numbered(parse(HEAD.replace("/dev/ttyNOWHERE", str(lasting)), "head.toml"), tmp_path))
+
+
 def test_an_adapter_that_two_robot_files_name_is_an_error_with_both_files(robot_file: Path) -> None:
     other = robot_file.with_name("other.toml")
     other.write_text(robot_file.read_text().replace('"rosie"', '"ada"'))

@@ -114,6 +114,7 @@ def _of_robot(path: Path, seen: SeenPorts | None = None) -> Iterator[Finding]:
     yield from robots.shared(robot, seen)
     yield from robots.refused(robot, wrong)
     sound = replace(robot, buses=[bus for bus in robot.buses if bus.name not in wrong])
+    yield from robots.numbered(robot)
     yield from robots.unwatched(sound)
     yield from robots.unmeasured(robot, path)
     yield from robots.interfaces(sound)

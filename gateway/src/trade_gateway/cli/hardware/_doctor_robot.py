@@ -1,5 +1,6 @@
 """Checks of ``trade doctor`` on a robot: its lines, its devices, and their watchdogs."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -28,11 +29,12 @@ from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "shared", "unmeasured", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "numbered", "refused", "shared", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
 _PATIENCE_S: Final = 3.0
+_NUMBERED: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 _FRAMES: Final = 3
 """The frames that a drive gets at once, at the start of a group's motion."""
 _QUEUE: Final = 128
@@ -111,6 +113,18 @@ def shared(robot: Robot, seen: SeenPorts | None = None) -> Iterator[Finding]:
         check_ports(robot, seen=seen)
     except ConfigurationError as bad:
         yield Finding(level="error", about="ports", text=str(bad), fix="correct one of the two keys")
+
+
+def numbered(robot: Robot, links: Path = Path("/dev/serial")) -> Iterator[Finding]:
+    """Reports ports whose number depends on the order of plugging in: two adapters may swap theirs, and so two arms."""
+    for bus in robot.buses:
+        if not isinstance(bus, SerialBus) or not _NUMBERED.fullmatch(bus.port):
+            continue
+        device = Path(bus.port).resolve()
+        lasting = [link for kind in ("by-id", "by-path") for link in sorted(links.glob(f"{kind}/*"))]
+        name = next((str(link) for link in lasting if link.resolve() == device), "its name in /dev/serial/by-id")
+        text = f"its port is {bus.port}, which may be another adapter after the next start or replugging"
+        yield Finding(level="warning", about=f"bus {bus.name}", text=text, fix=f"write port = {name!r}")
 
 
 def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
