@@ -133,7 +133,7 @@ class MotorExchange(Exchange[_Axis]):
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
                 silences.warning("%s does not answer on %s", axis.name, axis.bus)
-                axis.why_silent = self.why_silent()
+                axis.why_silent = self.why_silent() or axis.why_silent
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns
 
