@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.contract.rigs.base import SafetyRig
+from tests.contract.rigs.differences import DIFFERENCES, Difference
 from tests.contract.rigs.vendors import RIGS
 from tests.unit.drivers.gate import Gate
 from trade import Container
@@ -25,7 +26,15 @@ _OWN_TIME = {"ur"}
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Runs a rule on the rigs of all vendors that it applies to, on virtual time where that is possible."""
-    if "rig" in metafunc.fixturenames:
+    if "difference" in metafunc.fixturenames:
+        named = [(vendor, question, one) for vendor, of in DIFFERENCES.items() for question, one in of.items()]
+        rows = [
+            pytest.param(vendor, one, id=f"{vendor}-{question}", marks=pytest.mark.virtual_time)
+            for vendor, question, one in named
+            if isinstance(one, Difference)
+        ]
+        metafunc.parametrize(("rig", "difference"), rows, indirect=["rig"])
+    elif "rig" in metafunc.fixturenames:
         rule = metafunc.definition.originalname
         vendors = [vendor for vendor, made in RIGS.items() if rule not in made.lacks]
         marks = [pytest.mark.realtime if vendor in _OWN_TIME else pytest.mark.virtual_time for vendor in vendors]

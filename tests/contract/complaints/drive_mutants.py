@@ -31,3 +31,7 @@ def a_drive_is_mapped_in_any_state(patch: pytest.MonkeyPatch) -> None:
         yield from inspect._map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
 
     patch.setattr(inspect, "_map_first", at_once)
+
+
+def a_full_queue_is_a_lost_port(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_drivers.bus.can._port.is_full", lambda _: False)

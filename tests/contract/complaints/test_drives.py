@@ -7,6 +7,7 @@ import pytest
 from tests.contract.complaints import drive_mutants as mutants
 from tests.contract.complaints.bodies import Body, outcome
 from tests.contract.complaints.table import complaint
+from tests.support.can_queue import QueuedBus
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from trade_hil_sim.cia402 import Object, factor_objects, unit_objects
@@ -61,3 +62,21 @@ def test_a_drive_cannot_be_set_up_a_second_time(body: Body) -> None:
     assert not refusal, f"the second start ended with {refusal}"
     assert not body.events("motion_started", began)
     assert not body.events("torque_off", began)
+
+
+@complaint(
+    ("cia402", mutants.a_full_queue_is_a_lost_port, "a frame that had to wait ended the motion"),
+    ("damiao", mutants.a_full_queue_is_a_lost_port, "a frame that had to wait ended the motion"),
+)
+def test_a_short_send_queue_ends_a_motion(body: Body) -> None:
+    body.rig.plug()
+    with QueuedBus.offered():
+        port, bus = body.rig.sim.port.replace("socketcand", "queued"), body.rig.robot.buses[0].name
+        group = body.attach(ports={bus: port}).group(body.rig.robot.groups[0].name)
+        group.enable()
+        QueuedBus.reset(length=1, frame_s=0.0002)
+        refusal = outcome(lambda: group.move_to([0.3, 0.3]))
+        assert QueuedBus.refused
+        assert not refusal, f"a frame that had to wait ended the motion: {refusal}"
+        QueuedBus.length = 0
+        wait_until(lambda: "its send queue has been full" in outcome(group.relax), "it is named")

@@ -12,6 +12,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, HALT, PATIENT, Leg
 from tests.unit.drivers.motor_rig import KINDS, MotorRig
 from trade.errors import DeviceFault
+from trade_drivers import parse
 from trade_hil_sim import Entry, Late, Mute, WrongModel
 
 _NO_PORT = "unit/drivers/test_never_twice.py has two drivers of a bus"
@@ -24,6 +25,13 @@ class CanJointRig(JointRig):
 
     max_rad, too_slow_rad_s = 1.0, 0.0
     says_on_return: ClassVar[str | None] = None
+
+    def attach_to_ask(self) -> None:
+        """With the port in the file, as the angles of another one are not saved."""
+        name = self.bench.sim.port.partition(":")[2]
+        self.bench.text = self.bench.text.replace('"socketcan"\nchannel = "can0"', f'"socketcand"\nchannel = "{name}"')
+        self.bench.robot = parse(self.bench.text, "robot.toml")
+        self.attach(ports={}, state_dir=self.folder)
 
     def judge_return(self) -> None:
         wait_until(lambda: answers(self.robot.motor(self.second).state), "the other joint is back")

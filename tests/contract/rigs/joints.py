@@ -11,6 +11,7 @@ from tests.support.simulated_robots import at_rest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome
 from trade import Container
+from trade.errors import DeviceFault, TradeError
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Absent, Entry, Mute, Place
@@ -79,6 +80,19 @@ class JointRig(SafetyRig):
         self.plug()
         self.robot = self.bench.attach(**options)
         self.device = self.robot.motor(self.joint)
+
+    def attach_to_ask(self) -> None:
+        """Attach as a robot that keeps its joints' last known angles."""
+        self.attach(state_dir=self.folder)
+
+    def noticed(self) -> bool:
+        """Whether the driver has noticed that the device lost its power."""
+        try:
+            return bool(self.device.state().fault)
+        except DeviceFault:
+            return True
+        except TradeError:
+            return False
 
     def ready(self) -> None:
         self.device.enable()

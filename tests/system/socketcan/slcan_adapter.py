@@ -33,6 +33,8 @@ class SlcanAdapter:
         self._bell, self._rope = os.pipe()
         self.off = False
         """Bus-off: it neither sends nor hears."""
+        self.deaf = False
+        """It takes nothing from the system, as without anything that acknowledges: the send queue stays full."""
         self._held = b""
         self._thread = threading.Thread(target=self._run, name="slcan adapter", daemon=True)
         self._thread.start()
@@ -54,7 +56,8 @@ class SlcanAdapter:
     def _run(self) -> None:
         wire = self._wire.fileno()
         while True:
-            ready, _, _ = select.select([self._master, wire, self._bell], [], [], 60)
+            watched = [wire, self._bell] if self.deaf else [self._master, wire, self._bell]
+            ready, _, _ = select.select(watched, [], [], 0.1)
             if self._bell in ready:
                 return
             if self._master in ready:

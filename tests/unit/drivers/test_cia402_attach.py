@@ -49,6 +49,8 @@ def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -
         ({"device_type": 0x000F_0191}, "node 1 is no CiA 402 drive: its device type (1000h) names profile 401"),
         ({"supported_modes": 0x3AC}, "it has no profile position mode (6502h)"),
         ({"position_limit_min": -1000}, "is more than the drive's own range (607Dh)"),
+        ({"position_limit_min": 5000, "position_limit_max": -5000}, "own range is impossible: 607Dh = 5000 to -5000"),
+        ({"position_limit_min": 5000, "position_limit_max": 5000}, "own range is impossible: 607Dh = 5000 to 5000"),
         ({"max_profile_velocity": 1000}, "max_speed_rad_s: 2 is above the drive's own limit 0.03068 (607Fh)"),
     ],
     ids=str,

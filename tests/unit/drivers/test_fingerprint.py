@@ -69,13 +69,6 @@ def test_a_dynamixel_servo_whose_zero_was_moved_is_refused_and_both_are_named(ri
     assert f"{said}, or this is the calibration of another arm" in str(wrong)
 
 
-def test_a_feetech_servo_whose_zero_was_moved_is_refused_and_both_are_named(tail: TailRig) -> None:
-    tail.plug()
-    tail.poke(31, 0x64, 0x08)  # sign and magnitude, in bit 11
-    wrong = refused(tail)
-    assert (wrong.key, wrong.expected, wrong.found) == ("homing_counts", "0", "-100")
-
-
 def test_a_servo_with_the_homing_offset_of_the_file_is_attached_and_enabled(tail: TailRig) -> None:
     tail.configure(("id = 1\n", "id = 1\nhoming_counts = -100\n"))
     tail.plug()

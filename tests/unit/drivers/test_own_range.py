@@ -137,20 +137,6 @@ def test_a_servo_that_rests_at_the_end_of_its_own_range_is_enabled_with_the_end_
     assert bench.truth().torque
 
 
-def test_S23_a_range_that_was_lost_with_the_power_is_a_fault_before_the_next_enabling(bench: Bench) -> None:
-    bench.plug(2048)
-    motor = bench.motor()
-    motor.enable()
-    bench.rig.sim.do(BrownOut(ids=(1,)))
-    bench.own_range(1800, 2200)
-    wait_until(lambda: motor.state().fault, "the loss of power is noticed")
-    mark = written_now()
-    with pytest.raises(DeviceFault, match=r"min_rad -1.4 to max_rad 1.4 is more than the device's own range"):
-        motor.enable()
-    assert not bench.rig.goals(1, mark)
-    assert not bench.truth().torque
-
-
 def test_S23_a_mode_that_was_lost_with_the_power_is_a_fault_before_the_next_enabling(bench: Bench) -> None:
     bench.plug(2048)
     motor = bench.motor()

@@ -124,6 +124,23 @@ def test_a_range_past_the_end_of_the_encoder_is_refused_with_its_width(beyond: l
         measured(joint(), None, ends)
 
 
+@pytest.mark.parametrize(
+    "counts", [[3900, 4095, 0, 200], [3000, 4095, 0, 1200, 2500], [4095, 0, 100], [3800, 4095, 0, 200]]
+)
+@pytest.mark.parametrize("homing", [0, 300, -2000])
+def test_the_homing_offset_that_a_refusal_names_lets_the_range_be_measured(counts: list[int], homing: int) -> None:
+    """A Feetech servo reports its raw counts less the offset, within one turn."""
+    before = joint(homing_counts=homing)
+    with pytest.raises(ConfigurationError, match="register 31") as refusal:
+        measured(before, None, Sweep(Hand(angles(*counts)), 1, PLACE).until(done_after(len(counts) - 1), 60.0))  # type: ignore[arg-type]
+    offset = int(str(refusal.value).partition("homing_counts = ")[2].split()[0])
+    assert -2047 <= offset <= 2047
+    moved = angles(*((count + homing - offset) % 4096 for count in counts))
+    ends = Sweep(Hand(moved), 1, PLACE).until(done_after(len(moved) - 1), 60.0)  # type: ignore[arg-type]
+    found = measured(before, None, ends)
+    assert found["max_rad"] + found["min_rad"] == pytest.approx(0.0, abs=0.01)
+
+
 def test_a_zero_and_a_range_beside_the_end_of_the_encoder_are_measured() -> None:
     sweep: Any = Sweep(Hand(angles(200, 0, 4095, 3950, 3950, 3900, 4095)), 1, PLACE)  # type: ignore[arg-type]
     zero = sweep.until(done_after(3), 60.0).last

@@ -15,6 +15,7 @@ from trade import Container
 from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
+from trade_drivers.plugins._ports import SeenPorts
 from trade_gateway.cli import app
 from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.cli.hardware import _doctor_robot as robots
@@ -141,10 +142,12 @@ LEGS = CanBus(name="legs", driver="cia402", interface="socketcan", channel="can0
         (Link(True, ErrorState.PASSIVE, 500_000), "error", "120 ohm"),
         (Link(True, ErrorState.ACTIVE, 500_000), "ok", ""),
         (Link(True, None), "ok", ""),
+        (Link(True, ErrorState.ACTIVE, 500_000, 17), "warning", "ip link set can0 txqueuelen 128"),
+        (Link(True, ErrorState.ACTIVE, 500_000, 18), "ok", ""),
     ],
 )
 def test_a_can_interface_is_up_at_the_rate_of_the_file_and_healthy(link: Link, level: str, fix: str) -> None:
-    found = robots.judged(LEGS, link)
+    found = robots.judged(LEGS, link, 6)
     assert (found.level, fix in found.fix) == (level, True)
 
 
@@ -168,6 +171,28 @@ def of_devices(robot_file: Path) -> list[Finding]:
 def test_a_missing_port_is_reported(robot_file: Path) -> None:
     found = only(of_devices(robot_file))
     assert (found.level, found.about) == ("error", "bus neck")
+
+
+def test_a_port_whose_number_may_change_is_named_with_a_lasting_name(tmp_path: Path) -> None:
+    """Two equal adapters swap ttyUSB0 and ttyUSB1, and each robot's commands go to the other arm."""
+    (tmp_path / "by-path").mkdir()
+    lasting = tmp_path / "by-path" / "pci-0:usb-0:1.2"
+    lasting.symlink_to("/dev/ttyUSB7")
+    found = only(robots.numbered(parse(HEAD.replace("/dev/ttyNOWHERE", "/dev/ttyUSB7"), "head.toml"), tmp_path))
+    assert (found.level, found.about) == ("warning", "bus neck")
+    assert str(lasting) in found.fix
+    assert not list(robots.numbered(parse(HEAD.replace("/dev/ttyNOWHERE", str(lasting)), "head.toml"), tmp_path))
+
+
+def test_an_adapter_that_two_robot_files_name_is_an_error_with_both_files(robot_file: Path) -> None:
+    other = robot_file.with_name("other.toml")
+    other.write_text(robot_file.read_text().replace('"rosie"', '"ada"'))
+    seen = SeenPorts()
+    assert not [one for one in _of_robot(robot_file, seen) if one.about == "ports"]
+    found = only([one for one in _of_robot(other, seen) if one.about == "ports"])
+    assert found.level == "error"
+    assert f"{other}: bus.neck.port" in found.text
+    assert f"{robot_file}: bus.neck.port already" in found.text
 
 
 @pytest.mark.realtime

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.certificates import Papers
+from tests.support.simulated_robots import HEAD as SERVO_HEAD
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
 from trade_gateway.config._system import read_system_file
@@ -213,3 +214,21 @@ def test_an_http_gateway_starts_with_the_options_of_its_table(folder: Path) -> N
     [part] = read_system_file(write(folder, f"{HEAD}{PAGE}{said}")).parts
     words = " ".join(part.words)
     assert words.endswith(f"--ask-first a --ask-first b --tokens {folder}/t.toml --twin {folder}/rosie.toml --mcp")
+
+
+def two_robots(folder: Path, second: str, more: str = "") -> Path:
+    """A system with two robots, whose files name ports of this host."""
+    for name, robot, port in (("one", "rosie", "/dev/null"), ("other", "ada", second)):
+        text = SERVO_HEAD.replace('"rosie"', f'"{robot}"').replace("/dev/ttyNOWHERE", port)
+        (folder / f"{name}.toml").write_text(text)
+    tables = f'[container.one]\nrobot = "one.toml"\n[container.other]\nrobot = "other.toml"\n{more}'
+    return write(folder, f"{HEAD}{tables}")
+
+
+def test_an_adapter_that_two_robots_of_a_host_name_is_refused_with_both_files(folder: Path) -> None:
+    link = folder / "by-id"
+    link.symlink_to("/dev/null")
+    with pytest.raises(ConfigurationError, match=r"other.toml: bus.neck.port: .*one.toml: bus.neck.port already"):
+        read_system_file(two_robots(folder, str(link)))
+    assert len(read_system_file(two_robots(folder, "/dev/zero")).parts) == 2
+    assert len(read_system_file(two_robots(folder, str(link), "sim = true\n")).parts) == 2

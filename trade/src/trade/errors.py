@@ -18,7 +18,9 @@
     |-- DeviceError            a device failed
     |   |-- DeviceFault, ToleranceExceeded
     |   `-- DeviceSilent
-    |       `-- BusGone, NotStopped
+    |       |-- BusGone
+    |       |   `-- SendQueueFull
+    |       `-- NotStopped
     `-- SetupError             the installation or the configuration must change
         |-- ConfigurationError
         |   `-- WrongDevice, DeviceAbsent
@@ -79,6 +81,7 @@ __all__ = [
     "NotStopped",
     "OutcomeUnknown",
     "RemoteError",
+    "SendQueueFull",
     "ServiceGone",
     "SessionEnded",
     "SetupError",
@@ -722,6 +725,20 @@ class BusGone(DeviceSilent, ConnectionError):
         return (
             f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s): {why}. "
             "The driver reconnects by itself and moves nothing"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class SendQueueFull(BusGone):
+    """Frames stay in the send queue of a CAN interface: nothing acknowledges them, or the queue is too short.
+
+    ``reason`` names the queue and what to do. The driver stops the joints of the bus, and opens the bus again.
+    """
+
+    def describe(self) -> str:
+        return (
+            f"{self.device} cannot be reached: no frame can be sent on {self.bus} (since {self.waited_s:.1f} s ago): "
+            f"{self.reason}. The driver tries again by itself and moves nothing"
         )
 
 

@@ -3,10 +3,10 @@
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Final, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from trade import current_call
-from trade.errors import DeviceFault, TradeError
+from trade.errors import BusGone, DeviceFault, SendQueueFull, TradeError
 
 __all__ = [
     "SHARED",
@@ -15,6 +15,7 @@ __all__ = [
     "Device",
     "Gate",
     "NoAnswer",
+    "PortFull",
     "PortLost",
     "PortOpening",
     "Refused",
@@ -40,6 +41,15 @@ _TELL_S: Final = 0.1
 
 class PortLost(Exception):
     """The port is gone: unplugged, down, or never opened."""
+
+    error: ClassVar[type[BusGone]] = BusGone
+    """The error for callers."""
+
+
+class PortFull(PortLost):
+    """The port takes no more frames: those before are still in its send queue."""
+
+    error = SendQueueFull
 
 
 class PortOpening(PortLost):

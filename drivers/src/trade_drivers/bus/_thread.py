@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
@@ -12,7 +12,7 @@ from trade import Measure
 from trade.errors import BusGone, ConfigurationError, DeviceAbsent, TradeError
 from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._fault_detector import FaultDetector
-from trade_drivers.bus._jobs import Device, PortLost, PortOpening, WireError
+from trade_drivers.bus._jobs import Device, PortFull, PortLost, PortOpening, WireError
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
 
@@ -54,7 +54,7 @@ class BusThread(Generic[_Exchange_co]):
         self._healthy = healthy
         self._sick = False
         self._lost_at = 0.0
-        self._lost_why = ""
+        self._lost_why: Exception = PortLost()
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
@@ -174,17 +174,28 @@ class BusThread(Generic[_Exchange_co]):
             act()
         except PortLost as lost:
             _log.warning("bus %s: port %s is gone: %s", self._bus.name, self._wire.path, lost)
-            self._lost_at, self._lost_why = time.monotonic(), str(lost)
+            self._lost_at, self._lost_why = time.monotonic(), lost
             self._reopen_s = _REOPEN_FIRST_S
             self._reopen_at = self._lost_at + self._reopen_s
             self.exchange.refusing = self._gone
+            if isinstance(lost, PortFull):
+                self._hold_all()
             self.exchange.forget_measurements()
             self.exchange.fail_all(self._gone)
             self._wire.close()
 
+    def _hold_all(self) -> None:
+        """Tries once more to stop everything on a bus with a full queue; what it misses is stopped by watchdogs."""
+        with suppress(PortLost):
+            self.exchange.serve_stops()
+        self.exchange.fail_all(self._gone)
+        with suppress(PortLost):
+            self.exchange.halt_all("the send queue of its bus is full")
+
     def _gone(self, device: Device) -> TradeError:
-        waited_s = time.monotonic() - self._lost_at
-        return BusGone(device=device.name, bus=self._wire.path, waited_s=waited_s, reason=self._lost_why)
+        lost, waited_s = self._lost_why, time.monotonic() - self._lost_at
+        error = lost.error if isinstance(lost, PortLost) else BusGone
+        return error(device=device.name, bus=self._wire.path, waited_s=waited_s, reason=str(lost))
 
     def _reopen(self) -> None:
         self.exchange.fail_all(self._gone)
@@ -196,7 +207,7 @@ class BusThread(Generic[_Exchange_co]):
             self._reopen_at = time.monotonic() + _REOPEN_FIRST_S
             return
         except (PortLost, TradeError) as still:
-            self._lost_why = str(still)
+            self._lost_why = still
             self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)
             self._reopen_at = time.monotonic() + self._reopen_s
             return

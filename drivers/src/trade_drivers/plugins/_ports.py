@@ -10,13 +10,16 @@ from typing import Final, NamedTuple
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Bus, CanBus, Robot, UrBus
 
-__all__ = ["check_ports"]
+__all__ = ["SeenPorts", "check_ports"]
 
 _SOCKETCAND_PORT: Final = "29536"
 
 
 class _Port(NamedTuple):
     """A port that a robot file names."""
+
+    where: str
+    """The file."""
 
     key: str
     """The key in the file."""
@@ -26,21 +29,27 @@ class _Port(NamedTuple):
     """What it is on this host; equal for two names of one port."""
 
 
-def check_ports(robot: Robot, ports: Mapping[str, str] | None = None) -> None:
+SeenPorts = dict[Hashable, _Port]
+"""The ports of robots that were checked before."""
+
+
+def check_ports(robot: Robot, ports: Mapping[str, str] | None = None, seen: SeenPorts | None = None) -> None:
     """Checks that no two buses or sensors have the same port. Opens nothing.
 
     Args:
         robot: the robot.
         ports: replacements for the ports in the file, by bus or device.
+        seen: the ports of other robots on this host, to which those of this one are added.
 
     Raises:
         ConfigurationError: two keys name one port; names both.
     """
-    seen = dict[Hashable, _Port]()
+    seen = {} if seen is None else seen
     for port in _ports(robot, ports or {}):
         if (other := seen.setdefault(port.device, port)) is not port:
+            place = other.key if other.where == port.where else f"{other.where}: {other.key}"
             problem = (
-                f"{port.shown} is the port of {other.key} already, there as {other.shown}; "
+                f"{port.shown} is the port of {place} already, there as {other.shown}; "
                 "two drivers cannot share a port: put the devices on one bus, or name another port"
             )
             raise ConfigurationError(where=f"{robot.where}: {port.key}", problem=problem)
@@ -50,11 +59,11 @@ def _ports(robot: Robot, ports: Mapping[str, str]) -> Iterator[_Port]:
     for bus in robot.buses:
         kind = "channel" if isinstance(bus, CanBus) else "host" if isinstance(bus, UrBus) else "port"
         shown = ports.get(bus.name, bus.port)
-        yield _Port(f"bus.{bus.name}.{kind}", shown, _of_bus(bus, shown))
+        yield _Port(robot.where, f"bus.{bus.name}.{kind}", shown, _of_bus(bus, shown))
     for sense in (*robot.cameras, *robot.sensors):
         shown = ports.get(sense.name, sense.options.get("port"))
         if isinstance(shown, str) and shown.startswith("/"):
-            yield _Port(f"{sense.key}.port", shown, _of_path(shown))
+            yield _Port(robot.where, f"{sense.key}.port", shown, _of_path(shown))
 
 
 def _of_bus(bus: Bus, port: str) -> Hashable:

@@ -20,6 +20,7 @@ from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
 from trade_drivers import check, load, without
+from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_gateway.config._entry import (
     INSIDE,
     KINDS,
@@ -60,6 +61,7 @@ class Tables:
         self.around = around
         self._text = text
         self._entries = entries
+        self._ports: SeenPorts = {}
 
     def parts(self) -> "list[ContainerSpec]":
         """Returns all containers, each after those that it waits for. Raises ConfigurationError."""
@@ -149,7 +151,10 @@ class Tables:
             if entry.ros:
                 importlib.import_module("trade_gateway.ros").read_ros_file(self.beside(entry.ros))
             if entry.robot:
-                check(without(load(self.beside(entry.robot)), entry.without)[0])
+                robot = without(load(self.beside(entry.robot)), entry.without)[0]
+                check(robot)
+                if not entry.sim:
+                    check_ports(robot, seen=self._ports)
             if entry.rules:
                 read_rules(self.beside(entry.rules))
             if policy := environment.get("TRADE_POLICY"):

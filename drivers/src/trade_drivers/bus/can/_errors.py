@@ -8,9 +8,10 @@ from typing import Final
 
 from trade_drivers.bus._can_monitor import ErrorWord
 
-__all__ = ["ErrorState", "error_state"]
+__all__ = ["ErrorState", "error_state", "unheard"]
 
 _CONTROLLER: Final = 0x004
+_NO_ACKNOWLEDGEMENT: Final = 0x020
 _BUS_OFF: Final = 0x040
 _RESTARTED: Final = 0x100
 _WARNING: Final = 0x0C
@@ -55,3 +56,8 @@ def error_state(frame_id: int, data: bytes) -> ErrorState | None:
         if data[1] & bits:
             return state
     return None
+
+
+def unheard(frame_id: int) -> bool:
+    """Returns whether an error frame reports that nothing acknowledged a frame of this end."""
+    return bool(frame_id & _NO_ACKNOWLEDGEMENT)

@@ -19,6 +19,7 @@ _NEW_LINK: Final = 16
 _GET_LINK: Final = 18
 _REQUEST: Final = 1
 _UP: Final = 1
+_QUEUE_LENGTH: Final = 13
 _LINK_INFO: Final = 18
 _INFO_DATA: Final = 2
 _CAN_BIT_TIMING: Final = 1
@@ -39,6 +40,8 @@ class Link(NamedTuple):
     """None if the interface has no controller (``vcan``) or is stopped."""
     bitrate: int | None = None
     """Bits per second; None if the interface has no controller, or no rate is set."""
+    queue: int | None = None
+    """Frames that its send queue holds: ``txqueuelen``."""
 
 
 def look_at(channel: str) -> Link:
@@ -46,7 +49,7 @@ def look_at(channel: str) -> Link:
     try:
         index = socket.if_nametoindex(channel)
     except OSError:
-        raise OSError(f"there is no interface {channel}") from None
+        raise OSError(f"there is no interface {channel}; `ip link` lists the interfaces") from None
     body = _LINK.pack(socket.AF_UNSPEC, 0, index, 0, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as system:
         system.settimeout(_PATIENCE_S)
@@ -60,10 +63,13 @@ def parse_link(answer: bytes) -> Link:
     if len(answer) < _HEADER.size + _LINK.size or _HEADER.unpack_from(answer)[1] != _NEW_LINK:
         raise OSError("the system reports nothing about the interface")
     *_, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
-    data = _within(_within(answer[_HEADER.size + _LINK.size :], _LINK_INFO), _INFO_DATA)
+    attributes = answer[_HEADER.size + _LINK.size :]
+    data = _within(_within(attributes, _LINK_INFO), _INFO_DATA)
     number = int.from_bytes(_within(data, _CAN_STATE) or b"\xff", "little")
     bitrate = int.from_bytes(_within(data, _CAN_BIT_TIMING)[:_BITRATE_SIZE], "little")
-    return Link(bool(flags & _UP), ErrorState(number) if number in set(ErrorState) else None, bitrate or None)
+    length = _within(attributes, _QUEUE_LENGTH)
+    queue = int.from_bytes(length, "little") if length else None
+    return Link(bool(flags & _UP), ErrorState(number) if number in set(ErrorState) else None, bitrate or None, queue)
 
 
 def _within(data: bytes, kind: int) -> bytes:

@@ -15,8 +15,9 @@ from trade_drivers.bus._can_monitor import CanBusState
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost, losing
 from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
-from trade_drivers.bus.can._errors import ErrorState, error_state
+from trade_drivers.bus.can._errors import ErrorState, error_state, unheard
 from trade_drivers.bus.can._netlink import look_at
+from trade_drivers.bus.can._send_queue import LONGEST_S, SendQueue, is_full
 from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.bus.can._socketcand import ServerBus
 
@@ -72,6 +73,7 @@ class CanPort:
         where: the bus's table in the robot file, for messages; empty if it has none.
         listen_s: how long to listen after each opening before anything may be sent.
         orders: returns the identifiers of that traffic that only another driver sends.
+        patience_s: how long to wait for room in a full send queue, at most 40 ms.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class CanPort:
         where: str = "bus",
         listen_s: float = 0.0,
         orders: Callable[[Talk], Collection[int]] = _no_orders,
+        patience_s: float = LONGEST_S,
     ) -> None:
         self.path = path
         self.state = ErrorState.ACTIVE
@@ -94,6 +97,9 @@ class CanPort:
         self._listen_s, self._orders = listen_s, orders
         self._interface, self._channel = split_port(path, where or path)
         device = self._channel.partition("@")[0] if self._channel.startswith("/") else ""
+        self.queue = SendQueue(self._interface, self._channel, patience_s)
+        self.unheard = False
+        """Nothing has acknowledged a frame since the last one was received."""
         self._lock = HostLock(self._known_as(), where or "a scan", device)
         self._bitrate = bitrate
         self._bus: can.BusABC | None = None
@@ -106,7 +112,7 @@ class CanPort:
 
         A device that has torque after that is fed by another driver, or has no watchdog.
         """
-        return cls(path, bus.bitrate, where, max(_SLOWEST_S, bus.watchdog_s + 0.1), orders)
+        return cls(path, bus.bitrate, where, max(_SLOWEST_S, bus.watchdog_s + 0.1), orders, 1 / bus.rate_hz)
 
     def _known_as(self) -> str:
         """Returns the name of this bus for all processes on this host."""
@@ -191,6 +197,13 @@ class CanPort:
             bus_offs=self.bus_offs,
         )
 
+    @property
+    def doubt(self) -> str:
+        """What the controller says about frames without an answer; empty if nothing."""
+        if self.unheard or self.state >= ErrorState.PASSIVE:
+            return f"the bus is {self.state.word}: nothing acknowledges frames, or something disturbs them"
+        return ""
+
     def _options(self) -> dict[str, Any]:
         match self._interface:
             case "socketcand":
@@ -226,18 +239,20 @@ class CanPort:
         self._lock.release()
 
     def send(self, frame_id: int, data: bytes) -> None:
-        """Sends one frame; never waits.
+        """Sends one frame.
 
         Raises:
-            PortLost: the frame could not be sent.
+            PortFull, PortLost: the frame could not be sent.
         """
         self.send_all([Frame(frame_id, data)])
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Sends frames in this order, in one write if the interface supports that; never waits.
+        """Sends frames in this order, in one write if the interface supports that.
+
+        Waits only for room in a full send queue, for a cycle at most.
 
         Raises:
-            PortLost: not all frames could be sent.
+            PortFull, PortLost: not all frames could be sent.
         """
         messages = [can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False) for frame in frames]
         bus = self._open_bus()
@@ -246,10 +261,25 @@ class CanPort:
                 bus.send_all(messages)
             else:
                 for message in messages:
-                    bus.send(message, timeout=0)
+                    self._put(bus, message)
         except _TROUBLE as gone:
             raise PortLost(str(gone)) from None
         self._count(sum(frame_bits(len(frame.data)) for frame in frames))
+
+    def _put(self, bus: can.BusABC, message: can.Message) -> None:
+        waited = False
+        while True:
+            try:
+                bus.send(message, timeout=0)
+            except can.CanOperationError as refused:
+                if not is_full(refused):
+                    raise
+                waited = True
+                self.queue.await_room(unheard=self.unheard)
+            else:
+                if not waited:
+                    self.queue.renew()
+                return
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Returns a data frame, or None if none arrives in time or an error frame does.
@@ -270,6 +300,7 @@ class CanPort:
             return None
         if self.state is ErrorState.BUS_OFF:
             self._enter(ErrorState.ACTIVE)  # nothing is received in bus-off
+        self.unheard = False
         self._count(frame_bits(len(message.data)))
         if message.is_extended_id or message.is_remote_frame:
             return None
@@ -291,6 +322,7 @@ class CanPort:
 
     def _take_error(self, frame_id: int, data: bytes) -> None:
         self.errors += 1
+        self.unheard = self.unheard or unheard(frame_id)
         state = error_state(frame_id, data)
         if state is not None:
             self._enter(state)

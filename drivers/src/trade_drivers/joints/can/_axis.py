@@ -11,6 +11,8 @@ __all__ = ["STILL_RAD_S", "Another", "MotorAxis", "check_zero_known", "grain_of"
 
 STILL_RAD_S: Final = 0.01
 """The maximum speed at rest."""
+_LARGEST: Final = 2**31
+"""Counts beyond any position, as drives count in 32 bits, and as a float of 32 bits no longer resolves one."""
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 
@@ -86,7 +88,16 @@ class MotorAxis(Axis):
         """
         asked_ns, self.asked_ns = self.asked_ns, 0
         at_ns = now_ns if self.hushed else asked_ns
-        if self.silent or not at_ns or not all(map(isfinite, (position, velocity, effort))):
+        values = (position, velocity, effort)
+        if not all(isfinite(value) and abs(value) <= _LARGEST for value in values):
+            said = ", ".join(f"{value:.6g}" for value in values)
+            self.why_silent = (
+                f"it reports an impossible position, speed or effort ({said}, in its driver's counts), as while its "
+                "encoder is not ready; check its encoder and calibration"
+            )
+            return
+        self.why_silent = ""
+        if self.silent or not at_ns:
             return
         self.note(Sample(round(position), round(velocity), round(effort), at_ns))
 

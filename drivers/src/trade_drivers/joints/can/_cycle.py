@@ -91,6 +91,14 @@ class MotorExchange(Exchange[_Axis]):
     def idle(self, seconds: float) -> None:
         self.net.take_in(seconds)
 
+    def why_silent(self) -> str:
+        return self.port.doubt
+
+    def serve_stops(self) -> None:
+        if self._stops:
+            self.port.queue.renew()
+        super().serve_stops()
+
     def cycle(self) -> None:
         """Runs one cycle: stops, measurements, work, motions."""
         began_ns = self.clock()
@@ -125,6 +133,7 @@ class MotorExchange(Exchange[_Axis]):
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
                 silences.warning("%s does not answer on %s", axis.name, axis.bus)
+                axis.why_silent = self.why_silent() or axis.why_silent
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns
 

@@ -64,6 +64,12 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
         """Returns the class of its motors."""
         return BusMotor
 
+    @staticmethod
+    def absent(exchange: _Exchange, where: str, problem: str) -> DeviceAbsent:
+        """Returns the error for a motor that does not answer, with the state of a bus that is disturbed."""
+        doubt = exchange.port.doubt
+        return DeviceAbsent(where=where, problem=f"{problem}; {doubt}" if doubt else problem)
+
     def _can(self, robot: Robot, bus: Bus) -> CanBus:
         if not isinstance(bus, CanBus):
             problem = f"driver {self.name} needs a CAN bus: interface and channel instead of port"
@@ -105,8 +111,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
                 exchange.opened()
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
-                problem = f"{port}: {lost}; is the interface up? `ip link` lists the interfaces"
-                raise DeviceAbsent(where=f"{where}.channel", problem=problem) from None
+                raise DeviceAbsent(where=f"{where}.channel", problem=f"{port}: {lost}") from None
             undo.pop_all()
         return exchange
 
@@ -140,7 +145,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
                     f"no motor answers as {axis.id} on {axis.bus}; check its power and cable, its id and bit rate, "
                     "and the two terminations of the bus"
                 )
-                raise DeviceAbsent(where=key, problem=problem)
+                raise self.absent(exchange, key, problem)
             case NoAnswer():
                 axis.probe_at_ns = exchange.clock()
             case _:

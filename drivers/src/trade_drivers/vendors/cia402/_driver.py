@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, Final
 
-from trade.errors import ConfigurationError, DeviceAbsent
+from trade.errors import ConfigurationError
 from trade_drivers.joints import BusMotor
 from trade_drivers.joints.can import CanMotorDriver, axes_of
 from trade_drivers.robotfile import CanBus, Robot
@@ -61,7 +61,7 @@ class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
                     f"no drive answers as node {axis.id} on {axis.bus} ({silent}); check its power and cable, its node "
                     "id and bit rate, and the two terminations of the bus"
                 )
-                raise DeviceAbsent(where=key, problem=problem)
+                raise self.absent(exchange, key, problem)
             case _:
                 super().check_away(exchange, axis, where, last=last)
         exchange.recall(axis)

@@ -139,6 +139,8 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
         raise Unfit("it has no profile position mode (6502h)")
     low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
     high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
+    if low > high or low == high != 0:
+        raise Unfit(f"its own range is impossible: 607Dh = {low} to {high}; set it to what is true, or both to 0")
     axis.own_range = (low, high) if low < high else None
     if low < high and (axis.low < low or axis.high > high):
         ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))

@@ -71,6 +71,9 @@ FEED: Final = (Entry(0x6092, "u4", 1), Entry(0x6092, "u4", 2))
 """Counts of a position, for so many turns of the shaft."""
 POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = (Entry(index, "u4") for index in (0x60A8, 0x60A9, 0x60AA))
 POSITION_LIMITS: Final = (Entry(0x607D, "i4", 1), Entry(0x607D, "i4", 2))
+POLARITY: Final = Entry(0x607E, "u1")
+"""Bits that reverse positions and speeds."""
+REVERSED: Final = 0xC0
 MAX_PROFILE_VELOCITY: Final = Entry(0x607F, "u4")
 PROFILE_VELOCITY: Final = Entry(0x6081, "u4")
 ACCELERATION: Final = Entry(0x6083, "u4")

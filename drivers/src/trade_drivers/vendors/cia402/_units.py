@@ -77,6 +77,13 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
             f"({scale.said}); correct the one that is wrong",
             ".counts_per_rev",
         )
+    polarity = yield from read_optional(net, axis.id, table.POLARITY)
+    if polarity and polarity & table.REVERSED:
+        raise Unfit(
+            f"its polarity (607Eh) is {polarity:02X}h: it counts in the other direction by itself, and the file has "
+            f"reversed = {str(joint.reversed).lower()}; set 607Eh to 0, and measure its direction and zero again",
+            ".reversed",
+        )
     speed = yield from read_optional(net, axis.id, table.VELOCITY_UNIT)
     accel = yield from read_optional(net, axis.id, table.ACCELERATION_UNIT)
     rad = axis.grain.rad

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 
-__all__ = ["check_bus", "look_over", "register", "set_register"]
+__all__ = ["check_bus", "check_ranges", "look_over", "register", "set_register"]
 
 _WITHIN: Final = 0.98
 """The share of a motor's position range that a joint may use, as positions at its two ends look alike."""
@@ -65,16 +65,7 @@ def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
         Unfit: the motor cannot be used.
         NoAnswer: the motor does not answer.
     """
-    for number, meant in zip(
-        (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX), axis.ranges, strict=True
-    ):
-        yield from register(bus, axis, number)
-        if axis.answer is None or not isclose(axis.answer, meant, rel_tol=1e-3):
-            name = number.name.replace("_MAX", "").lower()
-            problem = (
-                f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to {axis.answer:g}"
-            )
-            raise Unfit(f"{problem} (register {number:d})", ".model")
+    yield from check_ranges(bus, axis)
     yield from register(bus, axis, Register.SOFTWARE)
     if axis.software not in {None, axis.answer}:
         raise Unfit(f"another motor answers as {axis.id}: its software is {axis.answer}, not {axis.software}")
@@ -86,6 +77,24 @@ def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
         raise Unfit(f"it does not keep its time-out (register 9): {axis.answer}, not {bus.timeout}")
     axis.heard_ns = 0
     yield from asked(bus, axis, [bus.refresh(axis)], lambda: axis.heard_ns > 0)
+
+
+def check_ranges(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
+    """Compares the registers that scale positions, speeds and torques with those of the model.
+
+    Raises:
+        Unfit, NoAnswer: as for ``look_over``.
+    """
+    for number, meant in zip(
+        (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX), axis.ranges, strict=True
+    ):
+        yield from register(bus, axis, number)
+        if axis.answer is None or not isclose(axis.answer, meant, rel_tol=1e-3):
+            name = number.name.replace("_MAX", "").lower()
+            problem = (
+                f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to {axis.answer:g}"
+            )
+            raise Unfit(f"{problem} (register {number:d})", ".model")
 
 
 def register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register) -> Steps:

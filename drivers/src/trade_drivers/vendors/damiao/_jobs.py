@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._cycle import HALT_NS
 from trade_drivers.bus._jobs import NoAnswer
-from trade_drivers.joints import Steps, Work, next_measurement, until
+from trade_drivers.joints import Steps, Unfit, Work, next_measurement, until
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Register
-from trade_drivers.vendors.damiao._inspect import register, set_register
+from trade_drivers.vendors.damiao._inspect import check_ranges, register, set_register
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
@@ -42,7 +42,8 @@ def enabling(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> 
 
 
 def _set_up(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
-    """Sets timeout and mode each time: a restart, which the motor does not report, loses both."""
+    """Compares its scale, and sets timeout and mode, each time: a restart, which is not reported, may change all."""
+    yield from _heard(bus, axis, check_ranges(bus, axis))
     job.gate()
     yield from _written(bus, axis, Register.TIMEOUT, bus.timeout)
     yield from _heard(bus, axis, register(bus, axis, Register.CONTROL_MODE))
@@ -83,10 +84,12 @@ def _written(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: i
 
 
 def _heard(bus: "DamiaoExchange", axis: DamiaoAxis, asking: Steps) -> Steps:
-    """Runs a register exchange; raises ``DeviceSilent`` if the motor does not answer."""
+    """Runs register exchanges; raises ``DeviceSilent`` for a missing answer, and ``DeviceFault`` for ``Unfit``."""
     try:
         for _ in asking:
             bus.idle(_WAIT_S)
             yield
     except NoAnswer:
         raise axis.deaf(bus.clock()) from None
+    except Unfit as unfit:
+        raise axis.faulty(str(unfit)) from None

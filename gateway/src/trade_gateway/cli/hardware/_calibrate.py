@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from math import pi, tau
+from math import pi, remainder, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar, cast
 
@@ -40,6 +40,9 @@ _LONGEST_S: Final = 600.0
 _DIGITS: Final = 4
 _PATIENCE_S: Final = 2.0
 """How long to retry a device that does not answer, so that a loose plug does not lose the measurement."""
+_COUNTS: Final = 4096
+_MOST_HOMING: Final = 2047
+"""The largest homing offset of a Feetech servo, in counts (memory table, register 31)."""
 _AGAIN_S: Final = 0.02
 
 _Number = TypeVar("_Number", int, float)
@@ -208,15 +211,26 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
             problem = f"was moved by {ends.high - ends.low:.3f} rad only; move it from one end to the other"
             raise ConfigurationError(where=joint.name, problem=problem)
         if ends.low < -pi or ends.high > pi:
-            problem = (
-                f"its range is {ends.high - ends.low:.3f} rad wide, but passes the end of its encoder, which a servo "
-                "cannot do by itself. Bring its middle to the centre of the encoder: mount its horn half a turn "
-                "further, or set its homing offset with the vendor's tool. Then try again"
-            )
-            raise ConfigurationError(where=joint.name, problem=problem)
+            raise ConfigurationError(where=joint.name, problem=_across(joint, ends))
         low, high = sorted((offset + sign * ends.low, offset + sign * ends.high))
         values |= {"min_rad": low + _MARGIN_RAD, "max_rad": high - _MARGIN_RAD}
     return {key: round(value, _DIGITS) + 0.0 for key, value in values.items()}
+
+
+def _across(joint: Joint, ends: Ends) -> str:
+    """Says how to bring the middle of a range to the centre of the encoder.
+
+    The offset of a Feetech servo moves the end of its encoder; that of a Dynamixel does not.
+    """
+    middle = remainder((ends.low + ends.high) / 2, tau)
+    offset = (joint.homing_counts + round(middle / tau * _COUNTS) + _MOST_HOMING) % _COUNTS - _MOST_HOMING
+    offset = min(offset, _MOST_HOMING)
+    return (
+        f"its range is {ends.high - ends.low:.3f} rad wide, but passes the end of its encoder, which a servo "
+        f"cannot do. On a Feetech servo, write {offset} to its homing offset (register 31) with the vendor's tool, and "
+        f"homing_counts = {offset} into the file: then its middle is the centre. On another servo, mount its horn "
+        f"{abs(middle):.2f} rad further. Then measure its zero and range again"
+    )
 
 
 def homed(joint: Joint, found: int, *, zero_measured: bool) -> dict[str, float]:

@@ -1,6 +1,7 @@
-"""``trade doctor [ROBOT.toml]``: finds problems of this host and this robot, each with its fix."""
+"""``trade doctor [ROBOT.toml ...]``: finds problems of this host and these robots, each with its fix."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import SerialBus, drivers, load, refusals
+from trade_drivers.plugins._ports import SeenPorts
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
@@ -26,13 +28,13 @@ _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 
 def doctor(
     context: typer.Context,
-    robot_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="ROBOT.toml", help="Robot file whose lines and devices to check."),
+    robot_files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="ROBOT.toml", help="Robot file whose lines and devices to check. Repeatable."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check this host and a robot for problems, and suggest fixes.
+    """Check this host and its robots for problems, and suggest fixes.
 
     Host: rights and latency of serial ports, libraries, clock, real time, certificates, visible containers.
     Robot file: errors that its drivers find, ports, CAN interfaces, devices and their setup, missing watchdogs.
@@ -40,9 +42,9 @@ def doctor(
 
     For example: trade doctor rosie.toml
     """
-    out = Output(as_json=as_json)
+    out, seen, paths = Output(as_json=as_json), SeenPorts(), robot_files or []
     found: list[Finding] = []
-    for one in (*_of_host(context, robot_file), *(() if robot_file is None else _of_robot(robot_file))):
+    for one in chain(_of_host(context, paths), *(_of_robot(path, seen) for path in paths)):
         found.append(one)
         if not as_json:
             _print(out, one)
@@ -55,11 +57,11 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Finding]:
-    yield from host.ports(serial_ports(), _lines_of(robot_file))
+def _of_host(context: typer.Context, paths: Sequence[Path]) -> Iterator[Finding]:
+    yield from host.ports(serial_ports(), [line for path in paths for line in _lines_of(path)])
     yield from host.latencies()
     yield from brltty()
-    if robot_file is None:
+    if not paths:
         yield from host.libraries(sorted(drivers()), needed=False)
     yield from host.clock()
     yield from host.waits()
@@ -87,15 +89,15 @@ def _fix_of(bad: TradeError) -> str:
     return "the message says what helps" if of_certificate else "correct that variable, or leave it out"
 
 
-def _lines_of(path: Path | None) -> list[str]:
+def _lines_of(path: Path) -> list[str]:
     """Returns the serial ports that a robot file names; none if it cannot be read, which is reported later."""
     try:
-        return [bus.port for bus in load(path).buses if isinstance(bus, SerialBus)] if path is not None else []
+        return [bus.port for bus in load(path).buses if isinstance(bus, SerialBus)]
     except TradeError:
         return []
 
 
-def _of_robot(path: Path) -> Iterator[Finding]:
+def _of_robot(path: Path, seen: SeenPorts | None = None) -> Iterator[Finding]:
     try:
         robot = load(path)
     except TradeError as bad:
@@ -109,9 +111,10 @@ def _of_robot(path: Path) -> Iterator[Finding]:
     known = {bus.driver for bus in robot.buses} & drivers().keys()
     yield from host.libraries(sorted(known), needed=True)
     wrong = dict(refusals(robot))
-    yield from robots.shared(robot)
+    yield from robots.shared(robot, seen)
     yield from robots.refused(robot, wrong)
     sound = replace(robot, buses=[bus for bus in robot.buses if bus.name not in wrong])
+    yield from robots.numbered(robot)
     yield from robots.unwatched(sound)
     yield from robots.unmeasured(robot, path)
     yield from robots.interfaces(sound)

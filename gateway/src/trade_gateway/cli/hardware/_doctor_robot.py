@@ -1,5 +1,6 @@
 """Checks of ``trade doctor`` on a robot: its lines, its devices, and their watchdogs."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,7 +21,7 @@ from trade_drivers import (
     load_driver,
 )
 from trade_drivers.bus._jobs import SHARED, TAKEN
-from trade_drivers.plugins._ports import check_ports
+from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
@@ -28,11 +29,16 @@ from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "shared", "unmeasured", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "numbered", "refused", "shared", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
 _PATIENCE_S: Final = 3.0
+_NUMBERED: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
+_FRAMES: Final = 3
+"""The frames that a drive gets at once, at the start of a group's motion."""
+_QUEUE: Final = 128
+"""A length of the send queue that suffices for all of this project's drivers."""
 _BAD_LINE: Final = (
     "check the cable, its length and its ends: a long line needs a termination (120 ohm) at both ends only, "
     "a common ground, and one baud rate"
@@ -71,14 +77,14 @@ def interfaces(robot: Robot) -> Iterator[Finding]:
         from trade_drivers.bus.can import look_at  # noqa: PLC0415 - python-can is optional
 
         try:
-            yield judged(bus, look_at(bus.channel))
+            yield judged(bus, look_at(bus.channel), len(robot.joints_on(bus.name)))
         except OSError as bad:
             fix = "plug its adapter in and load its kernel module; `ip link show type can` lists the interfaces"
             yield Finding(level="error", about=bus.channel, text=str(bad), fix=fix)
 
 
-def judged(bus: CanBus, link: "Link") -> Finding:
-    """Returns the finding about a CAN interface."""
+def judged(bus: CanBus, link: "Link", drives: int) -> Finding:
+    """Returns the finding about a CAN interface with so many drives."""
     about = bus.channel
     up = f"sudo ip link set {about} up type can bitrate {bus.bitrate} restart-ms 100"
     if not link.up:
@@ -94,15 +100,31 @@ def judged(bus: CanBus, link: "Link") -> Finding:
             f"down; {up}"
         )
         return Finding(level="error", about=about, text=text, fix=fix)
+    if link.queue is not None and link.queue < _FRAMES * drives:
+        text = f"its send queue holds {link.queue} frames (txqueuelen); {drives} drives may need {_FRAMES * drives}"
+        fix = f"sudo ip link set {about} txqueuelen {max(_QUEUE, _FRAMES * drives)}, after each boot (docs/drivers.md)"
+        return Finding(level="warning", about=about, text=text, fix=fix)
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
 
 
-def shared(robot: Robot) -> Iterator[Finding]:
-    """Reports two names of one port."""
+def shared(robot: Robot, seen: SeenPorts | None = None) -> Iterator[Finding]:
+    """Reports two names of one port; ``seen`` has the ports of robots before this one."""
     try:
-        check_ports(robot)
+        check_ports(robot, seen=seen)
     except ConfigurationError as bad:
         yield Finding(level="error", about="ports", text=str(bad), fix="correct one of the two keys")
+
+
+def numbered(robot: Robot, links: Path = Path("/dev/serial")) -> Iterator[Finding]:
+    """Reports ports whose number depends on the order of plugging in: two adapters may swap theirs, and so two arms."""
+    for bus in robot.buses:
+        if not isinstance(bus, SerialBus) or not _NUMBERED.fullmatch(bus.port):
+            continue
+        device = Path(bus.port).resolve()
+        lasting = [link for kind in ("by-id", "by-path") for link in sorted(links.glob(f"{kind}/*"))]
+        name = next((str(link) for link in lasting if link.resolve() == device), "its name in /dev/serial/by-id")
+        text = f"its port is {bus.port}, which may be another adapter after the next start or replugging"
+        yield Finding(level="warning", about=f"bus {bus.name}", text=text, fix=f"write port = {name!r}")
 
 
 def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
