@@ -13,6 +13,7 @@ from trade._transport.base import Transport
 from trade._transport.memory import MemoryTransport, Network
 from trade.testing.virtual._loop import Policy
 from trade.testing.virtual._modules import replaced
+from trade.testing.virtual._outside import Watch
 from trade.testing.virtual._scheduler import Deadlock, Scheduler, VirtualTimeError
 
 __all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
@@ -108,7 +109,15 @@ def virtual_time(
         undo.callback(_forget_containers, set(fork_guard.live))
         undo.callback(setattr, VirtualTime, "_current", None)
         VirtualTime._current = VirtualTime(scheduler)
-        yield VirtualTime._current
+        undo.callback(Watch(scheduler).close)
+        try:
+            yield VirtualTime._current
+        except VirtualTimeError:
+            if scheduler.interrupt is not None:  # what was closed after it could not wait any more
+                raise scheduler.interrupt from None
+            raise
+        if scheduler.foreign is not None:
+            raise scheduler.foreign
         if left := scheduler.forgotten():
             raise VirtualTimeError(f"threads are left behind: {', '.join(left)}")
 

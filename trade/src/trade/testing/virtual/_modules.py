@@ -259,6 +259,7 @@ _REFUSED: Final = {
     "subprocess": ("Popen", "run", "check_call", "check_output", "call"),
     "multiprocessing": ("Process", "Pool"),
     "socketserver": ("TCPServer", "UDPServer"),
+    "zenoh": ("open",),
 }
 """What waits for something outside, by module."""
 
