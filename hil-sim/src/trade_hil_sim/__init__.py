@@ -1,11 +1,13 @@
 """Simulated devices that speak the real bytes, on pseudo-terminals, with a byte log and scripted faults.
 
-`SimProcess` simulates a whole robot file in a process of its own; `trade_hil_sim.dynamixel` has the devices for use in
-one's own process. `read_log`, `motion_writes` and similar functions query what a bus has seen.
+`SimProcess` simulates a whole robot file in a process of its own, `SimThreads` in threads of this one;
+`trade_hil_sim.dynamixel` has single devices. `read_log`, `motion_writes` and similar functions query what a bus has
+seen.
 """
 
 from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.control._process import SimProcess, remove_leftovers
+from trade_hil_sim.control._threads import SimThreads
 from trade_hil_sim.faults._commands import (
     Absent,
     AnswerFault,
@@ -101,6 +103,7 @@ __all__ = [
     "Servo",
     "SimControl",
     "SimProcess",
+    "SimThreads",
     "SimulationError",
     "Span",
     "Supply",

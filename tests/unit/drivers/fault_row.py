@@ -100,12 +100,8 @@ class Row(NamedTuple):
     cure: tuple[Order, ...] = (Heal(),)
     bus_health: str = "healthy"
     """What its bus says in the registry while it lasts, of itself and of all its devices."""
-    reopens: bool = False
-    """The port is closed and opened again."""
     refuses: bool = True
     """Further moves end in an error as long as it lasts; False: it is over at once."""
-    alone: bool = False
-    """It is tried on a robot of its own: which of two signs is seen first depends on what was tried before."""
 
     @property
     def registry(self) -> str:

@@ -23,7 +23,7 @@ from trade_drivers import Arm, Motor
 from trade_drivers.vendors.ur._dashboard import ask
 from trade_hil_sim import Entry, events, instructions, motion_writes, writes
 
-__all__ = ["ALONE", "SUBJECTS", "Subject"]
+__all__ = ["OWN_CLOCK", "SUBJECTS", "Subject"]
 
 _BEATS = 15
 """Exchanges with a device in which something would have begun to move."""
@@ -41,8 +41,6 @@ class Subject(ABC):
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        self.sound = True
-        """Fit for another fault: nothing is left over from the last one."""
         self.well = True
         self.reported: dict[object, str] = {}
         self.robot = rig.attach(healthy=lambda: self.well, set_health=self.reported.__setitem__)
@@ -390,5 +388,5 @@ SUBJECTS = {
     "ur": lambda _, undo: ArmSubject(ArmRig(undo)),
 }
 """What makes one of each kind."""
-ALONE = frozenset({"ur"})
-"""Those that start processes: each test has its own, and leaves none behind."""
+OWN_CLOCK = frozenset({"ur"})
+"""Those whose library is in C++ and waits by itself, in processes of its own."""

@@ -57,7 +57,7 @@ def _silent(device: Device, fault: str, *strike: Order, stop: Stop = Stop.HOLD, 
 
 def _gone(device: Device, says: str, stop: Stop, after: Recovery, bus_health: str = "healthy") -> Row:
     row = Row(device, "unplug and replug", (Unplug(),), BusGone, says, BusGone, stop, BusGone, after)
-    return row._replace(cure=(Replug(),), bus_health=bus_health, reopens=True)
+    return row._replace(cure=(Replug(),), bus_health=bus_health)
 
 
 def _faulty(device: Device, fault: str, strike: Order, says: str, stop: Stop, after: Recovery | None = None) -> Row:
@@ -91,8 +91,8 @@ _DYNAMIXEL: Final = (
     _faulty("dynamixel", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
     _faulty(
         "dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped, or it makes no progress", Stop.HOLD
-    )._replace(alone=True),
-    _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED)._replace(alone=True),
+    ),
+    _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED),
     _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
     _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),
     _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF),
@@ -131,7 +131,6 @@ _CIA402: Final = (
         DeviceSilent,
         cure=(BusOff(on=False),),
         bus_health="degraded: CAN bus-off",
-        reopens=True,
     ),
     _faulty("cia402", "EMCY", Emergency(ids=ONE, code=0x2310), "error 2310h, continuous over-current", Stop.ITSELF),
     _faulty(
@@ -244,7 +243,7 @@ def _arm_relaxed(fault: str, *strike: Order, stop: Stop = Stop.PROGRAM, cure: tu
 
 def _arm_gone(fault: str, strike: Order, cure: Order, stop: Stop) -> Row:
     row = Row("ur", fault, (strike,), DeviceError, "", DeviceSilent, stop, DeviceSilent, Recovery.NOTHING)
-    return row._replace(cure=(cure,), reopens=True)
+    return row._replace(cure=(cure,))
 
 
 _UR: Final = (
@@ -272,9 +271,7 @@ _UR: Final = (
     _arm_stopped("emergency stop of its system", HardwareFault(bits=6), "emergency stop", Recovery.START, _MADE_NORMAL),
     _arm_stopped("safety fault", HardwareFault(bits=9), "fault", Recovery.START, _MADE_NORMAL),
     _arm_stopped("power switched off", Dashboard("power off"), "its power is off", Recovery.START),
-    _arm_stopped("restart", BrownOut(), "", Recovery.START)._replace(
-        error=DeviceError, state="its power is off", reopens=True
-    ),
+    _arm_stopped("restart", BrownOut(), "", Recovery.START)._replace(error=DeviceError, state="its power is off"),
     _sick("ur", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
 )
 TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH, *_ODRIVE, *_DAMIAO, *_UR)

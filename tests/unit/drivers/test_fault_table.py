@@ -10,11 +10,9 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.fault_row import Recovery, Row, Stop
-from tests.unit.drivers.fault_subjects import ALONE, SUBJECTS, Subject
+from tests.unit.drivers.fault_subjects import OWN_CLOCK, SUBJECTS, Subject
 from tests.unit.drivers.fault_table import TABLE, page
 from trade.errors import DeviceError, DeviceFault
-
-pytestmark = pytest.mark.realtime
 
 _ARRIVED = 0.97
 _TURNS_S = 0.05
@@ -23,32 +21,22 @@ _NOTHING = 0.005
 
 
 def _rows(rows: list[Row]) -> pytest.MarkDecorator:
-    """Rows that leave the port open share one device of their kind; one kind at a time is in use."""
-    shared = [None if row.device in ALONE or row.reopens or row.alone else row.device for row in rows]
-    names = [row.name for row in rows]
-    return pytest.mark.parametrize(
-        ("shared", "row"), [*zip(shared, rows, strict=True)], indirect=["shared"], ids=names, scope="module"
-    )
+    """On virtual time, where a device's driver can be."""
+    return pytest.mark.parametrize("row", [pytest.param(row, id=row.name, marks=_time_of(row)) for row in rows])
 
 
-@pytest.fixture(scope="module")
-def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject | None]:
-    with ExitStack() as undo:
-        yield request.param and SUBJECTS[request.param](tmp_path_factory.mktemp(request.param), undo)
+def _time_of(row: Row) -> pytest.MarkDecorator:
+    return pytest.mark.realtime if row.device in OWN_CLOCK else pytest.mark.virtual_time
 
 
 @pytest.fixture
-def subject(row: Row, shared: Subject | None, tmp_path: Path) -> Iterator[Subject]:
-    if shared is not None and shared.sound:
-        yield shared
-        return
+def subject(row: Row, tmp_path: Path) -> Iterator[Subject]:
     with ExitStack() as undo:
         yield SUBJECTS[row.device](tmp_path, undo)
 
 
 @_rows([row for row in TABLE if row.error])
 def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: Row, subject: Subject) -> None:
-    subject.sound = False
     moving = subject.set_off()
     struck = written_now()
     subject.strike(*row.strike)
@@ -82,18 +70,15 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
     subject.use()
     assert subject.provider.state().fault == ""
     wait_until(lambda: subject.reported.get(subject.provider, "healthy") == "healthy", "it is healthy")
-    subject.sound = True
 
 
 @_rows([row for row in TABLE if not row.error])
 def test_a_small_fault_goes_unnoticed(row: Row, subject: Subject) -> None:
-    subject.sound = False
     subject.make_ready()
     subject.strike(*row.strike)
     subject.use()
     assert subject.fault() == ""
     subject.strike(*row.cure)
-    subject.sound = True
 
 
 def test_the_page_of_the_docs_is_what_the_table_says() -> None:

@@ -84,7 +84,9 @@ def test_over_slow_links_started_calls_can_be_driven_to_their_end() -> None:
 
 @pytest.mark.real_clock
 def test_the_page_on_testing_does_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    page = Path(__file__).parents[3] / "docs" / "testing.md"
+    root = Path(__file__).parents[3]
+    page = root / "docs" / "testing.md"
+    monkeypatch.chdir(root / "examples")
     module = ModuleType("page_on_testing")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     known = vars(module)
@@ -92,7 +94,7 @@ def test_the_page_on_testing_does_what_it_says(monkeypatch: pytest.MonkeyPatch) 
     for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         exec(program, known)
     tests = [value for name, value in known.items() if name.startswith("test_")]
-    assert len(tests) == 10
+    assert len(tests) == 11
     for test in tests:
         test()
 

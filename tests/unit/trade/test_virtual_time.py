@@ -1,9 +1,11 @@
 """Virtual time: waits cost nothing, the same seed gives the same run, and what it cannot do is refused by name."""
 
 import asyncio
+import importlib
 import queue
 import re
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -191,6 +193,34 @@ def test_everything_is_as_before_at_the_end() -> None:
     with pytest.raises(KeyError), virtual_time(packages=HERE):
         raise KeyError
     assert (time.monotonic, threading.Lock, queue.SimpleQueue) == before
+
+
+def test_a_test_knows_whether_its_time_is_virtual_and_has_one_time(clock: VirtualTime) -> None:
+    assert VirtualTime.current() is clock
+    with pytest.raises(VirtualTimeError, match="virtual time runs already"), virtual_time(packages=HERE):
+        pass
+    assert VirtualTime.current() is clock
+
+
+def test_outside_of_virtual_time_there_is_none() -> None:
+    with pytest.raises(KeyError), virtual_time(packages=HERE):
+        raise KeyError
+    assert VirtualTime.current() is None
+
+
+def test_a_module_that_is_imported_again_has_the_time_of_its_test(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pytest loads all modules of tests by one loader, which no earlier test may have changed."""
+    (tmp_path / "test_imported_again.py").write_text("import time\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    for _ in range(3):
+        with virtual_time(packages=["test_imported_again"]) as clock:
+            importlib.import_module("test_imported_again").time.sleep(7)
+            assert clock.elapsed_s >= 7
+        sys.modules.pop("test_imported_again")
+    assert importlib.import_module("test_imported_again").time is time
+    sys.modules.pop("test_imported_again")
 
 
 def test_ids_come_from_the_seed() -> None:

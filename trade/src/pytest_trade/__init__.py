@@ -5,7 +5,7 @@ as a module inside of it would import trade in every pytest run.
 """
 
 from collections.abc import Generator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -25,7 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the markers."""
     for line in (
-        "virtual_time(seed=0, switch=0.02): run the test and its fixtures of function scope on virtual time",
+        "virtual_time(seed=0, switch=0.02, packages=()): run the test and its function-scoped fixtures on virtual time",
         "real_clock: keep the test on the real clock, whatever its module says",
     ):
         config.addinivalue_line("markers", line)
@@ -40,11 +40,12 @@ def _virtual_time(request: pytest.FixtureRequest) -> Generator[None, None, None]
         return
     from trade.testing import virtual_time  # noqa: PLC0415 - see above
 
-    wanted = {"seed": 0, **marker.kwargs}
+    modules: list[str] = [request.node.module.__name__, request.function.__module__, "conftest"]
+    packages = [*(name.partition(".")[0] for name in modules), *marker.kwargs.get("packages", ())]
+    wanted: dict[str, Any] = {"seed": 0, **marker.kwargs, "packages": packages}
     if (seed := request.config.getoption("--seed")) is not None:
         wanted["seed"] = seed
-    own: str = request.node.module.__name__
-    with virtual_time(**wanted, packages=[own.partition(".")[0]]):
+    with virtual_time(**wanted):
         yield
 
 

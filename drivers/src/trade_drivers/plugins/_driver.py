@@ -119,6 +119,8 @@ class AnyDriver:
     """Scans for devices and sets them up; None if the driver does not support that."""
     modules: ClassVar[tuple[str, ...]] = ()
     """Libraries that the driver imports; the extra of its name installs them."""
+    own_clock: ClassVar[str] = ""
+    """Why its devices cannot be on virtual time, such as a library in C that waits by itself; empty if they can."""
 
     @classmethod
     def missing(cls) -> list[str]:

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Mapping
 
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
-from trade_drivers.plugins._driver import Driver, SenseDriver, load_driver
+from trade_drivers.plugins._driver import AnyDriver, Driver, SenseDriver, load_driver
 from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["check", "refusals"]
+__all__ = ["check", "own_clocks", "refusals"]
 
 
 def check(robot: Robot, ports: Mapping[str, str] | None = None) -> None:
@@ -34,6 +34,19 @@ def refusals(robot: Robot) -> Iterator[tuple[str, ConfigurationError]]:
             _check_bus(robot, part) if isinstance(part, Bus) else _check_sense(part)
         except ConfigurationError as refusal:
             yield part.name, refusal
+
+
+def own_clocks(robot: Robot) -> Iterator[tuple[str, str]]:
+    """Yields the drivers of a robot that cannot be on virtual time, as keys of its file, each with the reason.
+
+    Raises:
+        ConfigurationError: a driver is missing.
+    """
+    parts = {f"bus.{bus.name}": bus.driver for bus in robot.buses}
+    parts |= {sense.key: sense.driver for sense in (*robot.cameras, *robot.sensors)}
+    for key, driver in parts.items():
+        if why := load_driver(driver, f"{robot.where}: {key}.driver", AnyDriver).own_clock:
+            yield f"{key}.driver", f"driver {driver}: {why}"
 
 
 def _check_bus(robot: Robot, bus: robotfile.SerialBus | robotfile.CanBus | robotfile.UrBus) -> None:

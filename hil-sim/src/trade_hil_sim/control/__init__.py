@@ -1,1 +1,1 @@
-"""The simulator as a process: its server, its client, and its command line."""
+"""The simulator as a process or as threads: its server, its client, and its command line."""

@@ -67,6 +67,7 @@ class UrDriver(Driver):
     """Arms of Universal Robots, through ur-rtde."""
 
     modules = ("rtde_control", "rtde_receive", "rtde_io")
+    own_clock = "its library ur-rtde is in C++, waits by itself, and runs in processes of its own"
 
     devices = (robotfile.Arm,)
 

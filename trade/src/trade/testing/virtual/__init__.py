@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import gc
 from collections.abc import Generator, Sequence, Set
+from typing import ClassVar
 
 from trade._container.container import Container
 from trade._settings import Settings
@@ -12,6 +13,7 @@ from trade._transport.base import Transport
 from trade._transport.memory import MemoryTransport, Network
 from trade.testing.virtual._loop import Policy
 from trade.testing.virtual._modules import replaced
+from trade.testing.virtual._outside import Watch
 from trade.testing.virtual._scheduler import Deadlock, Scheduler, VirtualTimeError
 
 __all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
@@ -20,8 +22,15 @@ __all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
 class VirtualTime:
     """The time of one test; made by `virtual_time`."""
 
+    _current: ClassVar["VirtualTime | None"] = None
+
     def __init__(self, scheduler: Scheduler) -> None:
         self._scheduler = scheduler
+
+    @classmethod
+    def current(cls) -> "VirtualTime | None":
+        """The one that runs in this process; None on the real clock."""
+        return cls._current
 
     @property
     def elapsed_s(self) -> float:
@@ -73,6 +82,8 @@ def virtual_time(
         Deadlock: all threads wait without a deadline; with the stack of each.
         VirtualTimeError: a process or a real socket was used, a thread is left behind, or `limit_s` has passed.
     """
+    if VirtualTime._current is not None:
+        raise VirtualTimeError("virtual time runs already: a test has one `virtual_time`, or the marker")
     scheduler = Scheduler(seed, switch, limit_s)
     networks: dict[str, Network] = {}
 
@@ -96,7 +107,17 @@ def virtual_time(
         asyncio.set_event_loop_policy(Policy(scheduler))  # pyright: ignore[reportDeprecated]
         undo.callback(scheduler.end)
         undo.callback(_forget_containers, set(fork_guard.live))
-        yield VirtualTime(scheduler)
+        undo.callback(setattr, VirtualTime, "_current", None)
+        VirtualTime._current = VirtualTime(scheduler)
+        undo.callback(Watch(scheduler).close)
+        try:
+            yield VirtualTime._current
+        except VirtualTimeError:
+            if scheduler.interrupt is not None:  # what was closed after it could not wait any more
+                raise scheduler.interrupt from None
+            raise
+        if scheduler.foreign is not None:
+            raise scheduler.foreign
         if left := scheduler.forgotten():
             raise VirtualTimeError(f"threads are left behind: {', '.join(left)}")
 

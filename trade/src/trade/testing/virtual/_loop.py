@@ -5,7 +5,7 @@ import selectors
 from collections import deque
 from typing import Any
 
-from trade.testing.virtual._scheduler import Scheduler, WaitList
+from trade.testing.virtual._scheduler import Scheduler, VirtualTimeError, WaitList
 
 
 class _Selector(selectors.SelectSelector):
@@ -41,6 +41,17 @@ class _Loop(asyncio.SelectorEventLoop):
 
     def _write_to_self(self) -> None:
         self._virtual.wake()
+
+
+def _refused(name: str) -> Any:
+    async def refuse(*_: Any, **_named: Any) -> None:
+        raise VirtualTimeError(f"asyncio's {name} was called: virtual time has sockets of threads only")
+
+    return refuse
+
+
+for _name in ("create_connection", "create_server", "create_unix_connection", "create_unix_server"):
+    setattr(_Loop, _name, _refused(_name))
 
 
 class Policy(asyncio.DefaultEventLoopPolicy):

@@ -29,6 +29,7 @@ PACKAGES: Final = (
     "trade_drivers",
     "trade_gateway",
     "trade_hil_sim",
+    "pytest_trade_hil_sim",
     "can",
     "canopen",
     "dynamixel_sdk",
@@ -132,23 +133,32 @@ class _Finder:
         if not _is_of(name, self._roots):
             return None
         for finder in sys.meta_path:
-            if finder is not self and (spec := finder.find_spec(name, path, target)) is not None:
-                self._watch(spec.loader)
+            spec: Any = None if finder is self else finder.find_spec(name, path, target)
+            if spec is not None:
+                spec.loader = _Loader(spec.loader, self._run)
                 return spec
         return None
 
-    def _watch(self, loader: Any) -> None:
-        run = loader.exec_module
+    def _run(self, run: Callable[[ModuleType], None], module: ModuleType) -> None:
+        self._scheduler.importing += 1
+        try:
+            run(module)
+            self._loaded(module)
+        finally:
+            self._scheduler.importing -= 1
 
-        def run_and_replace(module: ModuleType) -> None:
-            self._scheduler.importing += 1
-            try:
-                run(module)
-                self._loaded(module)
-            finally:
-                self._scheduler.importing -= 1
 
-        loader.exec_module = run_and_replace
+class _Loader:
+    """A loader with something to do around its modules. The real one may be shared: pytest has one for all tests."""
+
+    def __init__(self, real: Any, around: Callable[[Callable[[ModuleType], None], ModuleType], None]) -> None:
+        self._real, self._around = real, around
+
+    def exec_module(self, module: ModuleType) -> None:
+        self._around(self._real.exec_module, module)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
 
 
 class _Site(NamedTuple):
@@ -249,6 +259,7 @@ _REFUSED: Final = {
     "subprocess": ("Popen", "run", "check_call", "check_output", "call"),
     "multiprocessing": ("Process", "Pool"),
     "socketserver": ("TCPServer", "UDPServer"),
+    "zenoh": ("open",),
 }
 """What waits for something outside, by module."""
 

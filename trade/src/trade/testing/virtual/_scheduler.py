@@ -10,6 +10,7 @@ import heapq
 import itertools
 import random
 import sys
+import threading
 import traceback
 from collections import deque
 from collections.abc import Iterable
@@ -46,6 +47,8 @@ class Task:
     def __init__(self, name: str, ident: int | None = None) -> None:
         self.name = name
         self.ident = ident
+        self.native_id = 0
+        """Its number in the kernel, while it runs."""
         self.gate: Final = _thread.allocate_lock()
         self.gate.acquire()
         self.turn = 0
@@ -89,6 +92,11 @@ class Scheduler:
         self._current = self._main
         self._tasks[_thread.get_ident()] = self._main
         self._ended = False
+        self._main.native_id = threading.get_native_id()
+        self.interrupt: BaseException | None = None
+        """Ctrl-C, or a time limit of the test's runner, that reached the main thread while it waited."""
+        self.foreign: VirtualTimeError | None = None
+        """What a thread that is not part of virtual time did."""
 
     # --- the clock
 
@@ -134,6 +142,8 @@ class Scheduler:
 
     def wake(self, task: Task, woken: bool = True) -> None:
         """Make a waiting thread ready."""
+        if _thread.get_ident() != self._current.ident:
+            self._me()
         task.turn += 1
         task.woken = woken
         for waiting in task.waits_in:
@@ -186,23 +196,47 @@ class Scheduler:
         """The names of threads that have not ended."""
         return [task.name for task in self._tasks.values() if task is not self._main]
 
+    @property
+    def running_native_id(self) -> int:
+        """The kernel's number of the thread that runs."""
+        return self._current.native_id
+
+    def knows_this_thread(self) -> bool:
+        """Whether the caller is a thread of the simulation."""
+        return not self._ended and _thread.get_ident() in self._tasks
+
+    def give_up(self, waited_s: float) -> None:
+        """Called beside the simulation: the thread that runs waits for something that virtual time does not have."""
+        stuck = self._current
+        stack = self._stack(stuck, sys._current_frames().get(stuck.ident or 0))
+        what = f"for {waited_s:g} s, in a library in C, or in a module that is not named in packages="
+        self._main.error = VirtualTimeError(f"{stuck.name} has waited outside of virtual time {what}:\n{stack}")
+        if stuck is not self._main:
+            self._current = self._main
+            self._main.gate.release()
+
     def end(self) -> None:
         """End all threads that still run: each gets `Ended` where it waits."""
+        if self._ended:
+            return
         self._ended = True
         for task in list(self._tasks.values()):
             if task is not self._main:
                 task.error = Ended()
-                task.gate.release()
+                with contextlib.suppress(RuntimeError):  # it is open: the thread that ran just now has opened it
+                    task.gate.release()
 
     # --- the order
 
     def _me(self) -> Task:
         task = self._tasks.get(_thread.get_ident())
         if self._ended:
-            raise VirtualTimeError("virtual time is over") if task is self._main else Ended
+            raise self.interrupt or VirtualTimeError("virtual time is over") if task is self._main else Ended
         if task is not self._current:
-            name = "a thread that virtual time does not know" if task is None else task.name
-            raise VirtualTimeError(f"{name} ran beside {self._current.name}: it was there before, or waits outside")
+            name = threading.current_thread().name
+            why = "it was there before virtual time began" if task is None else "it waits outside of virtual time"
+            self.foreign = VirtualTimeError(f"thread {name} ran beside {self._current.name}: {why}")
+            raise self.foreign
         return self._current
 
     def _hand_over(self, me: Task) -> None:
@@ -212,7 +246,8 @@ class Scheduler:
             self._go_to(following)
             try:
                 me.gate.acquire()
-            except BaseException:  # Ctrl-C or a time limit of the test's runner reached the main thread
+            except BaseException as interrupt:  # Ctrl-C or a time limit of the test's runner reached the main thread
+                self.interrupt = interrupt
                 self.end()
                 raise
         if me.error is not None:

@@ -106,7 +106,8 @@ class Socket:
         holders = self._network.bound.get(_place(address), [])
         found = next(((one, one._backlog) for one in holders if one._backlog is not None), None)
         if found is None:
-            raise _error(errno.ECONNREFUSED)
+            where = f"no thread of this test listens on {address}, and virtual time reaches no other process"
+            raise ConnectionRefusedError(errno.ECONNREFUSED, f"{os.strerror(errno.ECONNREFUSED)}: {where}")
         listener, backlog = found
         other = type(self)(self.family)
         other.peer, self.peer = self, other

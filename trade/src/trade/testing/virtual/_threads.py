@@ -228,6 +228,7 @@ class Thread(threading.Thread):
 
 
 def _run_in_turn(scheduler: Scheduler, task: Task, run: Callable[[], None]) -> None:
+    task.native_id = threading.get_native_id()
     task.gate.acquire()
     if task.error is not None:
         return
