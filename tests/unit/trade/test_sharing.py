@@ -8,10 +8,10 @@ import pytest
 from msgspec import Struct
 
 from tests.support.two_joint_robot import Joint
+from tests.support.two_systems import member
 from tests.support.waiting import wait_until
-from trade import Container, Handle, Settings, progress, service, where
+from trade import Container, Handle, progress, service, where
 from trade._context.sessions import foreign
-from trade._transport.memory import MemoryTransport
 from trade.errors import (
     Cancelled,
     ConfigurationError,
@@ -116,16 +116,6 @@ class Two:
 
     def find(self, name: str, who: Container | None = None) -> Handle:
         return (who or self.anna).find(where(name=name) & ~where(group="trade"), wait_s=20)
-
-
-def member(system: MemorySystem, name: str, of: str, identity: str) -> Container:
-    """A container of a system of that name: memory systems all have one name."""
-    made = Container(
-        Settings(system=of, identity=identity, container=name), transport=MemoryTransport(system.network, name)
-    )
-    system._containers[name] = made
-    system._every.append(made)
-    return made
 
 
 @pytest.fixture
