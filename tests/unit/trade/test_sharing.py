@@ -406,6 +406,22 @@ def test_S09_an_e_stop_holds_on_both_sides_and_is_cleared_on_each(two: Two) -> N
     assert two.planner.estops() == two.bob.estops() == []  # nothing of it comes back
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_S09_an_e_stop_is_confirmed_once_it_holds_on_both_sides(two: Two, lost: bool) -> None:
+    """Its order to the robot's container is lost, which a stop of each joint does not make up for."""
+    if lost:
+        two.lab.lose(lambda passage: passage.source == "door" and "/estop" in f"/{passage.key}")
+    report = two.bob.estop("smoke")
+    assert report.complete != lost
+    assert (report.id in [one.id for one in two.robot.estops()]) != lost
+    if lost:
+        assert "guest/door" in {*report.missing, *report.failed}
+    else:
+        with pytest.raises(Stopped, match="smoke"):
+            two.planner.find(where(name="go_on", group="rosie.head"))(1.0)
+        assert not two.joint.resource.moving
+
+
 def test_S09_one_that_is_open_when_the_border_opens_crosses_too(two: Two) -> None:
     two.border.close()
     report = two.planner.estop("fire")
