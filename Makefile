@@ -74,7 +74,7 @@ siege: $(UV) ## robots, gateways, clients under every trouble (SEED=.. MINUTES=.
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
-explore: $(UV) ## stories of robots on virtual time under drawn troubles (SEEDS=..; ARGS="--first 17 --only 0,2")
+explore: $(UV) ## stories of robots and a gateway under drawn troubles, on virtual time (SEEDS=..; ARGS="--first 17 --only 0,2")
 	@$(RUN) python -m tests.endurance.explore --seeds $(SEEDS) $(ARGS)
 
 mutants: $(UV) ## break the product in each known way; a test has to detect each (root, iproute2 for the siege's)

@@ -9,13 +9,17 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 _TEST = Path(__file__).with_name("test_siege.py")
 _MOST_MINUTES = 1.5
 _STARTS_AND_ENDS_S = 400.0
 
 
-def fewest(kinds: Sequence[str], fails: Callable[[Sequence[str]], bool]) -> list[str]:
+_T = TypeVar("_T")
+
+
+def fewest(kinds: Sequence[_T], fails: Callable[[Sequence[_T]], bool]) -> list[_T]:
     """Leave out halves, quarters and so on, down to each alone, whatever it fails without."""
     left, size = [*kinds], len(kinds) // 2
     while size:

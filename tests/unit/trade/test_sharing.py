@@ -8,10 +8,10 @@ import pytest
 from msgspec import Struct
 
 from tests.support.two_joint_robot import Joint
+from tests.support.two_systems import member
 from tests.support.waiting import wait_until
-from trade import Container, Handle, Settings, progress, service, where
+from trade import Container, Handle, progress, service, where
 from trade._context.sessions import foreign
-from trade._transport.memory import MemoryTransport
 from trade.errors import (
     Cancelled,
     ConfigurationError,
@@ -116,16 +116,6 @@ class Two:
 
     def find(self, name: str, who: Container | None = None) -> Handle:
         return (who or self.anna).find(where(name=name) & ~where(group="trade"), wait_s=20)
-
-
-def member(system: MemorySystem, name: str, of: str, identity: str) -> Container:
-    """A container of a system of that name: memory systems all have one name."""
-    made = Container(
-        Settings(system=of, identity=identity, container=name), transport=MemoryTransport(system.network, name)
-    )
-    system._containers[name] = made
-    system._every.append(made)
-    return made
 
 
 @pytest.fixture
@@ -414,6 +404,22 @@ def test_S09_an_e_stop_holds_on_both_sides_and_is_cleared_on_each(two: Two) -> N
     assert two.find("move")(0.1) == 0.1
     two.settle()
     assert two.planner.estops() == two.bob.estops() == []  # nothing of it comes back
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_S09_an_e_stop_is_confirmed_once_it_holds_on_both_sides(two: Two, lost: bool) -> None:
+    """Its order to the robot's container is lost, which a stop of each joint does not make up for."""
+    if lost:
+        two.lab.lose(lambda passage: passage.source == "door" and "/estop" in f"/{passage.key}")
+    report = two.bob.estop("smoke")
+    assert report.complete != lost
+    assert (report.id in [one.id for one in two.robot.estops()]) != lost
+    if lost:
+        assert "guest/door" in {*report.missing, *report.failed}
+    else:
+        with pytest.raises(Stopped, match="smoke"):
+            two.planner.find(where(name="go_on", group="rosie.head"))(1.0)
+        assert not two.joint.resource.moving
 
 
 def test_S09_one_that_is_open_when_the_border_opens_crosses_too(two: Two) -> None:

@@ -153,24 +153,32 @@ class EstopController:
         report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
         return self._with_versions(report)
 
-    def subscribe(self, callback: Callable[[Estop], None]) -> None:
-        """Calls this, on another thread, with every open and every future e-stop."""
+    def subscribe(self, callback: Callable[[Estop], str]) -> None:
+        """Calls this, on another thread, with every open and every future e-stop; it returns the problem, or empty.
+
+        A future one is confirmed here once each callback has returned.
+        """
         self._estops.subscribe(callback)
 
-    def unsubscribe(self, callback: Callable[[Estop], None]) -> None:
+    def unsubscribe(self, callback: Callable[[Estop], str]) -> None:
         """Calls it no more."""
         self._estops.unsubscribe(callback)
 
-    def carry(self, estop: Estop, system: str) -> None:
-        """Opens an e-stop of another system here, under its id, once; it is cleared here separately."""
+    def carry(self, estop: Estop, system: str) -> str:
+        """Opens an e-stop of another system here, under its id, once; it is cleared here separately.
+
+        Returns the containers that have not confirmed it, as a text; empty if all have.
+        """
         if self._estops.knows(estop.id) or not is_chunk(estop.id):
-            return
+            return ""
         reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
         mine = Estop(estop.id, str(self._own), reason, estop.at)
         order = EstopOrder(PROTOCOL, estop.id, mine)
         report = self._line.ask([order], self._awaited, LIMIT_S, lambda: self._estops.is_cleared(estop.id))
         if report.missing or report.failed:
             _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
+        failed = [f"{name}: {problem}" for name, problem in report.failed.items()]
+        return "; ".join([*(f"{name} has not confirmed" for name in report.missing), *failed])
 
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""

@@ -85,14 +85,17 @@ class EstopLatch:
         with self._guard:
             return self._ledger.knows(estop_id)
 
-    def subscribe(self, callback: Callable[[Estop], None]) -> None:
-        """Calls this, on another thread, with every open and every future e-stop."""
+    def subscribe(self, callback: Callable[[Estop], str]) -> None:
+        """Calls this, on another thread, with every open and every future e-stop; it returns the problem, or empty.
+
+        A future one is confirmed here once each callback has returned.
+        """
         relay = Relay(callback, self.is_open)
         self._relays = [*self._relays, relay]
         for estop in self.open():
             relay.give(estop)
 
-    def unsubscribe(self, callback: Callable[[Estop], None]) -> None:
+    def unsubscribe(self, callback: Callable[[Estop], str]) -> None:
         """Calls it no more."""
         for relay in [one for one in self._relays if one.callback == callback]:
             self._relays = [one for one in self._relays if one is not relay]
@@ -150,11 +153,10 @@ class EstopLatch:
             if fresh:
                 stopping.begin(self._deadman)
         finally:
-            self._wait(Pending(estop.id, stopping, opened=estop))
+            relayed = [relay.give(estop) for relay in self._relays]
+            self._wait(Pending(estop.id, stopping, opened=estop, relayed=relayed))
         if fresh and self._keeps():
             _logger.error("%s, by %s: everything here stops", reason, estop.giver)
-        for relay in self._relays:
-            relay.give(estop)
 
     def _written(self, estop: Estop) -> str:
         """Writes an e-stop to disk unless it was cleared meanwhile; returns the problem."""

@@ -60,11 +60,32 @@ class Pending(Struct, gc=False):
     noted: bool = False
     """Whether it is on disk."""
     problem: str = ""
+    relayed: "Sequence[Relayed]" = ()
+    """Where it is passed on to, such as another system."""
 
     def result(self) -> str | None:
         """The problems, as one text; None while they are not known."""
         failed = [] if self.round is None else self.round.result()
-        return None if failed is None else "; ".join([*failed, *([self.problem] if self.problem else [])])
+        passed_on = [one.result() for one in self.relayed]
+        if failed is None or None in passed_on:
+            return None
+        return "; ".join(filter(None, [*failed, *passed_on, self.problem]))
+
+
+class Relayed:
+    """An e-stop that is passed on, until the subscriber has answered."""
+
+    def __init__(self, estop: Estop) -> None:
+        self.estop: Final = estop
+        self.problem: str | None = None
+        """Empty: it is carried out there."""
+        self._begun = time.monotonic()
+
+    def result(self) -> str | None:
+        """The problem; None while it is not known."""
+        if self.problem is None and time.monotonic() >= self._begun + _ANSWER_S:
+            return f"it is passed on, and not confirmed there within {_ANSWER_S} s"
+        return self.problem
 
 
 class Worker:
@@ -122,27 +143,28 @@ class Worker:
 class Relay:
     """Calls a subscriber with each e-stop while it is open, one after the other."""
 
-    def __init__(self, callback: Callable[[Estop], None], is_open: Callable[[str], bool]) -> None:
+    def __init__(self, callback: Callable[[Estop], str], is_open: Callable[[str], bool]) -> None:
         self.callback: Final = callback
         self._is_open = is_open
         self._guard = threading.Lock()
-        self._waiting: dict[str, Estop] = {}
+        self._waiting: dict[str, Relayed] = {}
         self._worker = Worker(self._next, "trade-estop-relay")
 
-    def give(self, estop: Estop) -> None:
+    def give(self, estop: Estop) -> Relayed:
         """Adds an e-stop; does not wait."""
+        added = Relayed(estop)
         with self._guard:
             self._waiting = {name: one for name, one in self._waiting.items() if self._is_open(name)}
-            self._waiting[estop.id] = estop
+            self._waiting[estop.id] = added
         self._worker.wake()
+        return added
 
     def _next(self) -> float | None:
         with self._guard:
             if not self._waiting:
                 return None
-            estop = self._waiting.pop(next(iter(self._waiting)))
-        if self._is_open(estop.id):
-            self.callback(estop)
+            one = self._waiting.pop(next(iter(self._waiting)))
+        one.problem = self.callback(one.estop) if self._is_open(one.estop.id) else ""
         return 0.0
 
     def close(self) -> None:

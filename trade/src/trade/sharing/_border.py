@@ -278,10 +278,13 @@ class BorderDirection:
 
     # --- e-stops
 
-    def _estop(self, estop: Estop) -> None:
-        """Called by home: an e-stop applies on both sides, and is cleared on each."""
-        with contextlib.suppress(ChannelClosed):
-            self._remote.estopping.carry(estop, self._names[0])
+    def _estop(self, estop: Estop) -> str:
+        """Called by home: an e-stop applies on both sides, and is cleared on each. Returns what has not confirmed."""
+        try:
+            problem = self._remote.estopping.carry(estop, self._names[0])
+        except ChannelClosed:
+            problem = "the gateway has no link there"
+        return f"in system {self._names[1]}: {problem}" if problem else ""
 
     def _end_thread(self) -> None:
         self._closed = True

@@ -289,7 +289,7 @@ class CanPort:
         """
         bus = self._open_bus()
         try:
-            message = bus.recv(timeout_s)
+            message, _ = bus._recv_internal(timeout_s)  # `recv` waits on when the wall clock is set back meanwhile
         except _TROUBLE as gone:
             raise PortLost(str(gone)) from None
         if message is None:
