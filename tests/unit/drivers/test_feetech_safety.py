@@ -93,11 +93,6 @@ def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: Tail
 # --- S18 attach moves and resets nothing
 
 
-def test_S18_attaching_writes_nothing_at_all(tail: TailRig) -> None:
-    tail.attach()
-    assert not trade_hil_sim.writes(tail.log)
-
-
 def test_S18_attaching_to_enabled_servos_writes_nothing_either(rig: TailRig) -> None:
     rig.plug(prepare=lambda sim: [servo.write(40, b"\1", written_now()) for servo in sim.devices] and None)
     assert rig.root().state().enabled

@@ -8,17 +8,16 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, call, sleep_past, written_now
 from tests.unit.drivers.gate import Gate
-from tests.unit.drivers.gripper_rig import HandRig, made_rig, silent
+from tests.unit.drivers.gripper_rig import HandRig, made_rig
 from trade import Container, Handle, where
 from trade.errors import (
     DeadlineExceeded,
-    DeviceError,
     DeviceSilent,
     MotionStopped,
     OutcomeUnknown,
 )
 from trade_drivers import Gripper
-from trade_hil_sim import Heal, Mute, Put, instructions, received
+from trade_hil_sim import Heal, Mute, Put, instructions
 
 pytestmark = pytest.mark.virtual_time
 
@@ -76,23 +75,6 @@ def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_st
 def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
     page = Path(__file__).parents[3].joinpath("docs", "drivers.md").read_text(encoding="utf-8")
     assert "no watchdog" in page[page.index("## Robotiq") :]
-
-
-def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: HandRig, gate: Gate) -> None:
-    gripper = hand.active(healthy=gate)
-    moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    hand.under_way()
-    mark = written_now()
-    gate.says = False
-    assert moving.wait().error is not None
-    wait_until(lambda: not hand.truth.moving, "it is at rest")
-    [stop] = [entry for entry in hand.writes(mark) if not entry.moves]
-    assert hand.truth.width_m > 0.03
-    wait_until(lambda: silent(gripper), "what was measured is too old")
-    assert not received(hand.log, since=stop.t + 0.1)
-    for act in (gripper.close, gripper.activate, gripper.state):
-        with pytest.raises(DeviceError, match="not healthy"):
-            act()
 
 
 # --- S07
@@ -223,6 +205,3 @@ def test_S05_what_is_held_when_its_session_ends_stays_held(
     wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.3, "it had time")
     assert not hand.writes(mark)
     assert hand.truth.holding
-
-
-# --- S20
