@@ -8,38 +8,21 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
 from tests.system.sites import Site
 
 pytestmark = pytest.mark.timeout(300)
 
-POLICY = """
-gateways = ["door"]
-
-[roles.driver]
-register = ["rosie", "cellar"]
-read = ["lobby"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-register = ["lobby"]
-
-[roles.viewer]
-read = ["*"]
-
-[roles.chief]
-read = ["*"]
-administer = ["trade"]
-
-[identities]
-chief = ["chief"]
-arm = ["driver"]
-planner = ["operator"]
-dash = ["viewer"]
-"""
+POLICY = policy_text(
+    "chief=chief arm=driver planner=operator dash=viewer",
+    head='gateways = ["door"]\n',
+    driver="register=rosie,cellar read=lobby",
+    operator="read=* call=rosie lock=rosie register=lobby",
+    viewer="read=*",
+    chief="read=* administer=trade",
+)
 
 
 @pytest.fixture

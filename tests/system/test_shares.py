@@ -11,43 +11,23 @@ from pathlib import Path
 import pytest
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
 
 pytestmark = [pytest.mark.timeout(300)]
 
-LAB = """
-[roles.driver]
-register = ["rosie", "cellar"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-administer = ["rosie"]
-
-[identities]
-arm = ["driver"]
-planner = ["operator"]
-door = ["operator"]
-"""
-CLINIC = """
-[roles.guest]
-register = ["rosie"]
-
-[roles.nurse]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-
-[roles.visitor]
-read = ["rosie"]
-
-[identities]
-guest = ["guest"]
-anna = ["nurse"]
-paul = ["visitor"]
-"""
+LAB = policy_text(
+    "arm=driver planner=operator door=operator",
+    driver="register=rosie,cellar",
+    operator="read=* call=rosie lock=rosie administer=rosie",
+)
+CLINIC = policy_text(
+    "guest=guest anna=nurse paul=visitor",
+    guest="register=rosie",
+    nurse="read=* call=rosie lock=rosie",
+    visitor="read=rosie",
+)
 GATEWAY = """
 system = "lab-0"
 tls = "lab/pki/issued/door"

@@ -8,22 +8,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from tests.support.policies import policy_text
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 
-POLICY = """
-revoked = ["thief"]
-[roles.viewer]
-read = ["*"]
-[roles.operator]
-includes = ["viewer"]
-call = ["rosie.neck"]
-[identities]
-planner = ["operator"]
-"dash-*" = ["viewer"]
-thief = ["operator"]
-"""
+POLICY = policy_text(
+    "planner=operator dash-*=viewer thief=operator",
+    head='revoked = ["thief"]\n',
+    viewer="read=*",
+    operator="includes=viewer call=rosie.neck",
+)
 
 
 @pytest.fixture

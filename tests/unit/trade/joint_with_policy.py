@@ -5,33 +5,18 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.policies import policy_text
 from trade import Container, Handle, Resource, service, where
 from trade.testing import MemorySystem, memory_system
 
-POLICY = """
-revoked = ["thief"]
-
-[roles.operator]
-includes = ["viewer"]
-call = ["rosie.neck"]
-lock = ["rosie.neck"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[roles.driver]
-register = ["rosie", "lab"]
-
-[roles.chief]
-administer = ["*"]
-register = ["rosie"]
-
-[identities]
-planner = ["operator"]
-dash = ["viewer"]
-drv = ["driver"]
-chief = ["chief"]
-"""
+POLICY = policy_text(
+    "planner=operator dash=viewer drv=driver chief=chief",
+    head='revoked = ["thief"]\n',
+    operator="includes=viewer call=rosie.neck lock=rosie.neck",
+    viewer="read=rosie",
+    driver="register=rosie,lab",
+    chief="administer=* register=rosie",
+)
 
 
 class Neck:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 import trade
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container, Handle, Settings, where
 from trade.errors import (
@@ -117,18 +118,9 @@ class Mute:
 number = 3
 """
 
-POLICY = """
-[roles.chief]
-administer = ["*"]
-[roles.driver]
-register = ["*"]
-[roles.viewer]
-read = ["*"]
-[identities]
-chief = ["chief", "viewer"]
-maker = ["driver"]
-dash = ["viewer"]
-"""
+POLICY = policy_text(
+    "chief=chief,viewer maker=driver dash=viewer", chief="administer=*", driver="register=*", viewer="read=*"
+)
 
 
 @pytest.fixture
