@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 
-import can
 import pytest
 
-from tests.support.waiting import PATIENCE_S, wait_until
+from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.legs import HALT, HIP, PATIENT, Leg, leg, rig
+from tests.unit.drivers.legs import HALT, HIP, PATIENT, Leg, leg, rig, turned_by_another
 from trade import Container, where
 from trade.errors import DeviceFault
 
@@ -63,21 +62,7 @@ def test_a_halted_drive_does_not_continue_to_its_old_goal_when_it_is_moved_again
 
 
 def test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled(leg: Leg) -> None:
-    with leg.listen() as other:
-
-        def write(index: int, size: int, value: int) -> None:
-            head = bytes((0x2F - 4 * (size - 1),)) + index.to_bytes(2, "little") + b"\0"
-            data = head + value.to_bytes(4, "little", signed=True)
-            other.send(can.Message(arbitration_id=0x600 + HIP, data=data, is_extended_id=False))
-            while (answer := other.recv(PATIENCE_S)) is None or answer.arbitration_id != 0x580 + HIP:
-                pass
-            assert answer.data[0] == 0x60
-
-        write(0x6060, 1, 3)
-        write(0x60FF, 4, 5000)
-        for word in (0x06, 0x07, 0x0F):
-            write(0x6040, 2, word)
-        started = leg.wait_for("motion_started", HIP)
+    started = turned_by_another(leg, 5000)
     robot = leg.attach()
     rest = leg.wait_for("at_rest", HIP, started.t)
     assert bytes.fromhex("2b4060000f010000") in [e.data for e in leg.frames("sdo_request", HIP, started.t)]

@@ -23,11 +23,6 @@ pytestmark = pytest.mark.virtual_time
 COUNT_RAD = 6.283185 / 4096
 
 
-@pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
-
-
 def state(robot: AttachedRobot, joint: str) -> MotorState | None:
     """The state, or None while it is silent."""
     try:

@@ -3,29 +3,20 @@
 What comes of each fault by itself is in the table of faults.
 """
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 import trade_hil_sim as sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.tail_rig import TailRig, goal_of, tail_rig
+from tests.unit.drivers.tail_rig import TailRig, goal_of, rig, tail
 from trade.errors import DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
 
 pytestmark = pytest.mark.virtual_time
 
-COUNT_RAD = 6.283185 / 4096
+__all__ = ["rig", "tail"]
+
 OVERLOAD, OVERHEATING = 0x20, 0x04
-
-
-@pytest.fixture
-def tail(tmp_path: Path) -> Iterator[TailRig]:
-    with tail_rig(tmp_path) as rig:
-        rig.plug()
-        yield rig
 
 
 @pytest.fixture

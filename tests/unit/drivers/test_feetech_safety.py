@@ -3,8 +3,6 @@
 They have no watchdog: what S06 asks of the device is missing, and these tests show what the driver does instead.
 """
 
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,25 +10,12 @@ import pytest
 import trade_hil_sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, tail_rig
+from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, rig, tail
 from trade.errors import LockedByOther
 
 pytestmark = pytest.mark.virtual_time
 
-SLOWLY_RAD_S = 0.3
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TailRig]:
-    with tail_rig(tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def tail(rig: TailRig) -> TailRig:
-    rig.plug()
-    return rig
-
+__all__ = ["rig", "tail"]
 
 # --- S06 the device has no watchdog: what a driver leaves behind
 

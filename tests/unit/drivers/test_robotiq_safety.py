@@ -1,6 +1,6 @@
 """The motion rules on a gripper, by their numbers; the judge is what the simulated gripper received and did."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -8,7 +8,7 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, call, sleep_past, written_now
 from tests.unit.drivers.gate import Gate
-from tests.unit.drivers.gripper_rig import HandRig, made_rig
+from tests.unit.drivers.gripper_rig import HandRig, hand, rig
 from trade import Container, Handle, where
 from trade.errors import (
     DeadlineExceeded,
@@ -21,19 +21,9 @@ from trade_hil_sim import Heal, Mute, Put, instructions
 
 pytestmark = pytest.mark.virtual_time
 
+__all__ = ["hand", "rig"]
+
 SLOW_M_S = 0.02
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[HandRig]:
-    with made_rig(tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def hand(rig: HandRig) -> HandRig:
-    rig.plug()
-    return rig
 
 
 # --- S01

@@ -18,11 +18,6 @@ pytestmark = pytest.mark.realtime
 COUNTS_PER_RAD = 4096 / math.tau
 
 
-@pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
-
-
 def end_of(head: Rig, since: float = 0.0, device_id: int = 1) -> float:
     """Where it came to rest, in rad."""
     rest = head.wait_for("at_rest", device_id, since)
