@@ -16,7 +16,7 @@ from tests.unit.drivers.gate import Gate
 from trade._context.call_context import CallContext, running
 from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot
-from trade_hil_sim import DynamixelBus, Entry
+from trade_hil_sim import DynamixelBus, Entry, Servo
 
 GOAL, TORQUE, WATCHDOG = 116, 64, 98
 
@@ -67,7 +67,17 @@ class Outcome:
 class Rig(ServoRig):
     """Two Dynamixel servos."""
 
-    original, file, sim_class = HEAD, "head.toml", DynamixelBus
+    original, file, sim_class, servo_class = HEAD, "head.toml", DynamixelBus, Servo
+    first, second, group = "neck.pan", "neck.tilt", "head"
+
+    def goal_of(self, entry: Entry) -> int:
+        return goal_counts(entry)
+
+    def move_by_another(self, goal: int) -> None:
+        """The first servo moves slowly on the command of another program."""
+        servo, now = next(servo for servo in self.sim.devices if servo.device_id == 1), time.monotonic()
+        servo.write(64, b"\1", now)
+        servo.write(112, (5).to_bytes(4, "little") + goal.to_bytes(4, "little"), now)
 
 
 @pytest.fixture

@@ -26,7 +26,16 @@ _NEAR = 20
 class TailRig(ServoRig):
     """Two Feetech servos."""
 
-    original, file, sim_class = TAIL, "tail.toml", FeetechBus
+    original, file, sim_class, servo_class = TAIL, "tail.toml", FeetechBus, Servo
+    first, second, group = "tail.root", "tail.tip", "tail"
+
+    def goal_of(self, entry: Entry) -> int:
+        return goal_of(entry)
+
+    def move_by_another(self, goal: int) -> None:
+        """The first servo moves slowly on the command of another program."""
+        self.poke(40, 1)
+        self.poke(41, 20, *goal.to_bytes(2, "little"), 0, 0, *(200).to_bytes(2, "little"))
 
     def root(self, **options: Any) -> Motor:
         return self.attach(**options).motor("tail.root")

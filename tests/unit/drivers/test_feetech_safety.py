@@ -82,26 +82,3 @@ def test_S18_attaching_to_enabled_servos_writes_nothing_either(rig: TailRig) -> 
     rig.plug(prepare=lambda sim: [servo.write(40, b"\1", written_now()) for servo in sim.devices] and None)
     assert rig.root().state().enabled
     assert not trade_hil_sim.writes(rig.log)
-
-
-def test_S18_what_is_found_moving_is_stopped(rig: TailRig) -> None:
-    rig.plug()
-    rig.poke(40, 1)
-    rig.poke(41, 20, *(3900).to_bytes(2, "little"), 0, 0, *(200).to_bytes(2, "little"))
-    rig.wait_for("motion_started", 1)
-    rig.attach()
-    rig.wait_for("at_rest", 1)
-    assert rig.truth().position_counts < 3800
-    assert abs(goal_of(rig.goals(1)[-1]) - rig.truth().position_counts) <= 3
-    assert not rig.goals(2)
-
-
-def test_S18_enabling_seeds_the_goal_with_the_measured_position_before_torque_is_on(tail: TailRig) -> None:
-    root = tail.root()
-    tail.sim.do(trade_hil_sim.Place(ids=(1,), counts=2400))
-    root.enable()
-    goal, torque = tail.moves(1)
-    assert (goal_of(goal), "torque_enable" in goal.registers) == (2400, False)
-    assert torque.registers == ("torque_enable",)
-    assert tail.truth().position_counts == 2400
-    assert not tail.events("motion_started", 1)

@@ -137,29 +137,25 @@ def test_a_servo_that_rests_at_the_end_of_its_own_range_is_enabled_with_the_end_
     assert bench.truth().torque
 
 
-def test_S23_a_range_that_was_lost_with_the_power_is_a_fault_before_the_next_enabling(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("lost", "says"),
+    [("range", "min_rad -1.4 to max_rad 1.4 is more than the device's own range"), ("mode", "mode")],
+    ids=["range", "mode"],
+)
+def test_S23_a_setting_that_was_lost_with_the_power_is_a_fault_before_the_next_enabling(
+    bench: Bench, lost: str, says: str
+) -> None:
     bench.plug(2048)
     motor = bench.motor()
     motor.enable()
     bench.rig.sim.do(BrownOut(ids=(1,)))
-    bench.own_range(1800, 2200)
+    if lost == "range":
+        bench.own_range(1800, 2200)
+    else:
+        bench.keep(**{"mode" if bench.kind.rig is TailRig else "operating_mode": 1})
     wait_until(lambda: motor.state().fault, "the loss of power is noticed")
     mark = written_now()
-    with pytest.raises(DeviceFault, match=r"min_rad -1.4 to max_rad 1.4 is more than the device's own range"):
-        motor.enable()
-    assert not bench.rig.goals(1, mark)
-    assert not bench.truth().torque
-
-
-def test_S23_a_mode_that_was_lost_with_the_power_is_a_fault_before_the_next_enabling(bench: Bench) -> None:
-    bench.plug(2048)
-    motor = bench.motor()
-    motor.enable()
-    bench.rig.sim.do(BrownOut(ids=(1,)))
-    bench.keep(**{"mode" if bench.kind.rig is TailRig else "operating_mode": 1})
-    wait_until(lambda: motor.state().fault, "the loss of power is noticed")
-    mark = written_now()
-    with pytest.raises(DeviceFault, match="mode"):
+    with pytest.raises(DeviceFault, match=says):
         motor.enable()
     assert not bench.rig.goals(1, mark)
     assert not bench.truth().torque

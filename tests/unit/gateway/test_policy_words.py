@@ -76,9 +76,3 @@ def test_show_lists_identities_with_what_they_may(policy: Path) -> None:
     table = re.sub(r" +", " ", run("show", "--policy", str(policy)).stdout)
     assert "planner operator rosie.neck *" in table
     assert "revoked: thief" in table
-
-
-@pytest.mark.parametrize("command", ["check", "show"])
-def test_help_has_an_example(command: str) -> None:
-    said = run(command, "--help")
-    assert f"For example: trade policy {command}" in re.sub(r"\s+", " ", said.stdout)
