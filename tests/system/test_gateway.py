@@ -3,7 +3,7 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,10 +46,6 @@ def planner(site: Site, arm: Member) -> Member:
     made = site.member("right", "planner")
     made.ask("group", "rosie.arm", "arm")
     return made
-
-
-def moves(member: Member, times: int) -> Callable[[], bool]:
-    return lambda: len(member.ask("moved", "rosie.arm")) == times
 
 
 def test_an_exported_service_is_found_called_and_locked_on_the_other_side_and_reported_gone(

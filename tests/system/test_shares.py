@@ -1,10 +1,6 @@
 """``trade gateway`` between two systems, each with an authority, a policy and a network of its own."""
 
-import json
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +10,7 @@ from tests.support.certificates import Papers
 from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
+from tests.system.sites import GatewayHost
 
 pytestmark = [pytest.mark.timeout(300)]
 
@@ -46,7 +43,7 @@ export = ["rosie.arm"]
 """
 
 
-class Sites:
+class Sites(GatewayHost):
     """A laboratory with a robot and a clinic; one host has a foot in both networks."""
 
     def __init__(self, networks: Networks, folder: Path) -> None:
@@ -66,33 +63,6 @@ class Sites:
         self.papers["clinic"].of("guest", addresses=["10.231.2.1"])
         self.begin()
 
-    def begin(self) -> None:
-        command = ["ip", "netns", "exec", self.networks.host("between")]
-        command += [sys.executable, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
-        with (self.folder / "complaints").open("ab") as complaints:
-            self.gateway = subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=complaints,
-                text=True,
-                env={**os.environ, "TRADE_RUNTIME_DIR": str(self.folder / "runtime"), "TRADE_SYSTEM": "elsewhere"},
-            )
-        self.ready = self.said()
-
-    def said(self) -> dict[str, object]:
-        assert self.gateway.stdout is not None
-        return json.loads(self.gateway.stdout.readline())
-
-    def end(self, how: signal.Signals) -> None:
-        self.gateway.send_signal(how)
-        try:
-            self.gateway.wait(20)
-        finally:
-            self.gateway.kill()
-            self.gateway.wait()
-            assert self.gateway.stdout is not None
-            self.gateway.stdout.close()
-
     def member(self, system: str, host: str, name: str, network: int, papers: str = "") -> Member:
         own = self.folder / f"{name}.toml"
         own.write_text((self.folder / system / "policy.toml").read_text())
@@ -110,11 +80,6 @@ class Sites:
         assert before in text
         self.file.write_text(text.replace(before, after))
         assert self.said()["reloaded"]
-
-    def close(self) -> None:
-        for each in self.members:
-            each.close()
-        self.end(signal.SIGTERM)
 
 
 @pytest.fixture

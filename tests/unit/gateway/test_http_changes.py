@@ -79,9 +79,6 @@ class House:
         """Where counters are."""
         return [one.container for one in self.me.services(where(name="count", group="hall"))]
 
-    def switches(self) -> tuple[bool, bool]:
-        return self.worker.reach.discovers, self.worker.reach.broadcasts
-
 
 @pytest.fixture
 def house(tmp_path: Path) -> Iterator[House]:

@@ -15,7 +15,7 @@ from tests.support.policies import policy_text
 from trade import Container, Handle, HookEvent, Resource, Secret, Trace, current_call, service, where
 from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
-from trade.testing import MemorySystem, memory_system
+from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
@@ -335,12 +335,6 @@ POLICY = policy_text(
     driver="register=rosie",
     tracer="includes=viewer instrument=trade",
 )
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
 
 
 def test_tracing_takes_the_right_to_instrument_and_reading_the_right_to_read(
