@@ -13,19 +13,9 @@ import trade_hil_sim
 from tests.support.simulated_robots import HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, is_silent, written_now
-from trade import service
-from trade.errors import (
-    ConfigurationError,
-    DeviceFault,
-    DeviceSilent,
-    LimitExceeded,
-    OutcomeUnknown,
-)
+from trade import errors, service
 
 pytestmark = pytest.mark.virtual_time
-
-WATCHDOG_S = 0.3
-
 
 # --- S01 late is never
 
@@ -46,7 +36,7 @@ def test_S01_an_enable_that_went_out_and_then_expired_unheard_is_not_said_to_hav
     pan = head.attach().motor("neck.pan")
     head.sim.do(trade_hil_sim.Mute(ids=(1,), instruction="write"))
     error = Outcome(pan.enable, deadline_s=0.05).wait().error
-    assert isinstance(error, OutcomeUnknown | DeviceSilent)
+    assert isinstance(error, errors.OutcomeUnknown | errors.DeviceSilent)
 
 
 # --- S06 the last resort is in the device
@@ -88,7 +78,7 @@ def test_S06_after_the_watchdog_only_an_explicit_enable_lets_it_move_again(head:
     child.close()
     pan = head.attach().motor("neck.pan")
     mark = written_now()
-    with pytest.raises(DeviceFault, match="watchdog"):
+    with pytest.raises(errors.DeviceFault, match="watchdog"):
         pan.move_to(0.0)
     assert not head.moves(since=mark)
     pan.enable()
@@ -120,7 +110,7 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
     container = start_container("driver")
     container.register(Stoppable(), "rosie.wheel")
-    with pytest.raises(ConfigurationError, match="cannot be stopped"):
+    with pytest.raises(errors.ConfigurationError, match="cannot be stopped"):
         container.register(Unstoppable(), "rosie.wheel")
 
 
@@ -129,6 +119,6 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
 def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     robot = head.attach()
-    with pytest.raises(LimitExceeded, match=r"rosie\.neck\.tilt"):
+    with pytest.raises(errors.LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()

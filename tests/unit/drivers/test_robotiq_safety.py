@@ -9,13 +9,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, call, sleep_past, written_now
 from tests.unit.drivers.gate import Gate
 from tests.unit.drivers.gripper_rig import HandRig, hand, rig
-from trade import Container, Handle, where
-from trade.errors import (
-    DeadlineExceeded,
-    DeviceSilent,
-    MotionStopped,
-    OutcomeUnknown,
-)
+from trade import Container, Handle, errors, where
 from trade_drivers import Gripper
 from trade_hil_sim import Heal, Mute, Put, instructions
 
@@ -40,7 +34,7 @@ def test_S01_a_command_of_a_gripper_at_rest_that_expires_while_the_bus_is_held_u
     with call(0.05) as expires_ns:
         sleep_past(expires_ns)
     gate.release()
-    assert isinstance(late.wait().error, DeadlineExceeded)
+    assert isinstance(late.wait().error, errors.DeadlineExceeded)
     assert not hand.writes(mark)
 
 
@@ -49,7 +43,7 @@ def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_st
     hand.sim.do(Mute(instruction="read_write"))
     mark = written_now()
     late = Outcome(lambda: gripper.close(SLOW_M_S), deadline_s=0.1).wait()
-    assert isinstance(late.error, OutcomeUnknown | DeviceSilent | MotionStopped)
+    assert isinstance(late.error, errors.OutcomeUnknown | errors.DeviceSilent | errors.MotionStopped)
     moves = hand.moves(mark)
     assert moves
     assert max(entry.t for entry in moves) - min(entry.t for entry in moves) < 0.1
@@ -80,7 +74,7 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, 
     wait_until(lambda: gripper._exchange._stops, "the stop is queued")  # type: ignore[attr-defined]
     gate.release()
     assert stop.wait().error is None
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     first = instructions(hand.log, since=mark)[0]
     assert (first.name, first.moves) == ("read_write", False)
     assert not hand.truth.moving
@@ -95,7 +89,7 @@ def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -
     wait_until(lambda: hand.truth.moving, "its fingers move")
     mark = written_now()
     gripper.stop()
-    assert isinstance(activating.wait().error, MotionStopped)
+    assert isinstance(activating.wait().error, errors.MotionStopped)
     assert not hand.truth.moving
     assert not gripper.state().activated
     assert not hand.moves(mark)
@@ -107,7 +101,7 @@ def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand
     hand.under_way()
     hand.sim.do(Mute(instruction="read_write", count=1))
     gripper.stop()
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     assert not hand.truth.moving
     assert hand.truth.width_m > 0.03
 
@@ -117,10 +111,10 @@ def test_S08_a_stop_of_a_silent_gripper_is_sent_without_a_reading_and_cannot_act
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
     hand.under_way()
     hand.sim.do(Mute())
-    assert isinstance(moving.wait().error, DeviceSilent)
+    assert isinstance(moving.wait().error, errors.DeviceSilent)
     wait_until(lambda: not hand.truth.moving, "it is at rest")
     mark = written_now()
-    with pytest.raises(DeviceSilent):
+    with pytest.raises(errors.DeviceSilent):
         gripper.stop()
     assert {entry.hex for entry in hand.writes(mark)} == {"00" * 6}
     assert hand.truth.width_m > 0.03
@@ -162,7 +156,7 @@ def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
     run = service(planner, "close").start(SLOW_M_S)
     hand.under_way()
     report = operator.estop("smoke")
-    with pytest.raises(MotionStopped, match=f"before its goal: e-stop {report.id}: smoke") as ended:
+    with pytest.raises(errors.MotionStopped, match=f"before its goal: e-stop {report.id}: smoke") as ended:
         run.result()
     assert "until it is moved again" not in str(ended.value)
     operator.estop_clear([report.id])
@@ -170,7 +164,7 @@ def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
     run = service(planner, "open").start(SLOW_M_S)
     hand.under_way()
     gripper.stop()
-    with pytest.raises(MotionStopped, match=r"before its goal: stop\(\) was called\."):
+    with pytest.raises(errors.MotionStopped, match=r"before its goal: stop\(\) was called\."):
         run.result()
 
 
@@ -180,7 +174,7 @@ def test_S14_what_is_withdrawn_while_it_moves_says_so(
     run = service(planner, "close").start(SLOW_M_S)
     hand.under_way()
     driver.deregister(gripper)
-    with pytest.raises(MotionStopped, match="before its goal: its services are withdrawn"):
+    with pytest.raises(errors.MotionStopped, match="before its goal: its services are withdrawn"):
         run.result()
 
 
