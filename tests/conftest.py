@@ -19,6 +19,7 @@ import pytest
 import trade
 from tests.support.tiers import tier_of
 from trade import Container, Settings, where
+from trade.testing import MemorySystem, memory_system
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a run in the background; what tests start would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -176,3 +177,9 @@ def start_container(system: str) -> Iterator[StartContainer]:
     yield start
     for container in reversed(started):
         container.close()
+
+
+@pytest.fixture
+def memory() -> Iterator[MemorySystem]:
+    with memory_system() as system:
+        yield system

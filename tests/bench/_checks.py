@@ -17,23 +17,14 @@ from tests.bench._links import Link
 from tests.bench._peers import BarePair, bare_link, serve_bare
 from tests.bench._trade import Trade
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 
 _SIZE: Final = 64
 _HOOKS: Final = (1, 10)
 _CALLS, _REPLIES = "call/planner/robot/bare/0/bench/pair", "reply/robot/planner/bare/0"
-_POLICY: Final = """
-[roles.driver]
-register = ["bench"]
-
-[roles.operator]
-read = ["*"]
-call = ["bench"]
-lock = ["bench"]
-
-[identities]
-robot = ["driver"]
-planner = ["operator"]
-"""
+_POLICY: Final = policy_text(
+    "robot=driver planner=operator", driver="register=bench", operator="read=* call=bench lock=bench"
+)
 
 
 def run(n: int, rounds: int) -> None:

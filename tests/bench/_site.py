@@ -17,6 +17,7 @@ from typing import Final
 
 from tests.bench._report import print_skipped
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.system.networks import Networks, why_not
 
 ADDRESSES: Final = {
@@ -31,22 +32,12 @@ SECURE, PLAIN = 7450, 7451
 SYSTEM: Final = {SECURE: "bench-secure", PLAIN: "bench-plain"}
 _PATIENCE_S = 20.0
 
-_POLICY = """
-gateways = ["door", "gate"]
-
-[roles.driver]
-register = ["bench", "rosie"]
-
-[roles.operator]
-read = ["*"]
-call = ["bench"]
-lock = ["bench"]
-
-[identities]
-robot = ["driver"]
-planner = ["operator"]
-mallory = ["operator"]
-"""
+_POLICY = policy_text(
+    "robot=driver planner=operator mallory=operator",
+    head='gateways = ["door", "gate"]\n',
+    driver="register=bench,rosie",
+    operator="read=* call=bench lock=bench",
+)
 _ENTRY = {
     SECURE: 'tls = "pki/issued/{name}"\npolicy = "policy.toml"',
     PLAIN: 'credentials = "bench:secret"\ninsecure_lan = true',

@@ -10,17 +10,7 @@ from tests.contract.rigs.joints import JointRig
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.gate import Gate
-from trade import Container, where
-from trade.errors import (
-    ConfigurationError,
-    IncompleteGroup,
-    LockedByOther,
-    LockLost,
-    MotionStopped,
-    NotLocked,
-    Stopped,
-    TradeError,
-)
+from trade import Container, errors, where
 
 # --- S11
 
@@ -38,9 +28,9 @@ def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire
         wait_until(lambda: shared.exchange._inbox, "the move is admitted")
         assert operator.locking.break_lock(device, "it is mine")
         gate.release()
-        with pytest.raises((LockLost, MotionStopped)):
+        with pytest.raises((errors.LockLost, errors.MotionStopped)):
             run.result()
-        with pytest.raises(LockLost):
+        with pytest.raises(errors.LockLost):
             move(*shared.far[1:])
     lock.release()
     assert not shared.sent_away(mark)
@@ -57,7 +47,7 @@ def test_S11_a_moving_device_gets_no_further_set_points_once_its_lock_is_lost(
         run = shared.started(planner, shared.slowly)
         shared.under_way()
         assert operator.locking.break_lock(device, "it is mine")
-        with pytest.raises(TradeError):
+        with pytest.raises(errors.TradeError):
             run.result()
     lock.release()
     shared.rests()
@@ -80,7 +70,7 @@ def test_S11_a_client_without_the_lock_writes_nothing(
     with planner.lock(where(group=shared.resource.rpartition(".")[0])):
         mark = written_now()
         for act in (*shared.requests(operator), *shared.commands()):  # the last ones are plain calls of methods (S15)
-            with pytest.raises(LockedByOther):
+            with pytest.raises(errors.LockedByOther):
                 act()
         assert shared.asked(operator, ("state",)).name == shared.resource
         assert not shared.ordered(mark)
@@ -113,7 +103,7 @@ def test_S13_a_device_that_comes_after_its_group_was_locked_is_sent_nothing_unde
     either = where(group=group) | where(group="lamp")
     driver.register(Lamp(), "lamp")
     planner.find(where(group="lamp"), wait_s=20)
-    with pytest.raises(IncompleteGroup, match=rf"group='{group}' missing"):
+    with pytest.raises(errors.IncompleteGroup, match=rf"group='{group}' missing"):
         planner.lock(either, wait_s=0).acquire()
     rig.patient()
     with planner.lock(either, partial=True):
@@ -121,7 +111,7 @@ def test_S13_a_device_that_comes_after_its_group_was_locked_is_sent_nothing_unde
         rig.asked(planner, ("state",))
         mark = written_now()
         for request in (rig.readying, rig.far):
-            with pytest.raises(NotLocked):
+            with pytest.raises(errors.NotLocked):
                 rig.asked(planner, request)
         assert not rig.commanded(mark)
         rig.asked(planner, ("stop",))
@@ -161,12 +151,12 @@ def test_S07_a_stop_needs_no_lock_and_only_the_owner_lets_it_move_again(
         run = shared.started(planner, shared.slowly)
         shared.under_way()
         shared.asked(operator, ("stop",))
-        with pytest.raises(MotionStopped):
+        with pytest.raises(errors.MotionStopped):
             run.result()
         shared.rests()
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             operator.locking.resume(device)
-        with pytest.raises(Stopped):
+        with pytest.raises(errors.Stopped):
             shared.asked(planner, shared.far)
         assert planner.locking.resume(device) == [shared.resource]
         assert shared.moves_back(planner)
@@ -176,14 +166,14 @@ def test_S08_a_foreign_stop_latches_until_a_client_resumes(
     shared: SafetyRig, run: Any, planner: Container, operator: Container
 ) -> None:
     shared.asked(operator, ("stop",))
-    with pytest.raises(MotionStopped):
+    with pytest.raises(errors.MotionStopped):
         run.result()
     mark = written_now()
     for request in (shared.far, shared.readying):
         for client in (planner, operator):
-            with pytest.raises(Stopped):
+            with pytest.raises(errors.Stopped):
                 shared.asked(client, request)
-    with pytest.raises(Stopped):
+    with pytest.raises(errors.Stopped):
         shared.move()
     assert not shared.ordered(mark)
     assert operator.locking.resume(where(group=shared.resource)) == [shared.resource]
@@ -197,7 +187,7 @@ def test_S08_a_stop_by_the_owner_does_not_latch(
     if used_by_another:
         shared.asked(operator, shared.harmless)
     shared.asked(planner, ("stop",))
-    assert isinstance(run.exception(20), MotionStopped)
+    assert isinstance(run.exception(20), errors.MotionStopped)
     assert shared.moves_back(planner)
 
 
@@ -213,7 +203,7 @@ def test_S08_a_stop_voids_commands_that_wait_in_the_queue(
     wait_until(lambda: shared.exchange._stops, "the stop is admitted")
     gate.release()
     stop.result()
-    with pytest.raises(MotionStopped):
+    with pytest.raises(errors.MotionStopped):
         run.result()
     assert not shared.sent_away(mark)
     assert not shared.events("motion_started", mark)
@@ -231,7 +221,7 @@ def test_S16_a_group_with_a_missing_member_is_not_locked(
     shared.service(planner, "move_to")
     wait_until(lambda: not planner.services(where(name="move_to", group=second)), "it is gone")
     for group in ("rosie", shared.resource.rpartition(".")[0]):
-        with pytest.raises(IncompleteGroup) as refused:
+        with pytest.raises(errors.IncompleteGroup) as refused:
             planner.lock(where(group=group)).acquire()
         assert refused.value.missing == [second]
     with planner.lock(where(group="rosie"), partial=True):
@@ -250,7 +240,7 @@ def test_S16_coupled_joints_are_locked_together(
     rig.service(planner, "move_to")
     with planner.lock(where(group=rig.resource)) as lock:
         assert lock.resources == (rig.resource, second)
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             move(0.1)
     assert not rig.commanded()
 
@@ -264,13 +254,13 @@ def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(rig: 
     rig.ready()
     gate.hold_up()
     mark = written_now()
-    with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
+    with pytest.raises(errors.ConfigurationError, match="another driver owns this port") as refused:
         rig.bench.attach()
     assert str(rig.bench.sim.port) in str(refused.value)
     assert not rig.heard(mark)
     gate.release()
     moving = rig.set_off()
-    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+    with pytest.raises(errors.ConfigurationError, match="another driver owns this port"):
         rig.bench.attach()
     assert moving.wait().error is None
     assert rig.travelled() == pytest.approx(1.0, abs=0.01)

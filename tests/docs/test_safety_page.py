@@ -21,13 +21,12 @@ RIGS = {
     "Dynamixel": "Rig",
     "CiA 402": "(?:Leg|CanRig)",
     "2F-85": "HandRig",
-    "Feetech": "TailRig",
+    "Feetech": r"(?:Rig \| )?TailRig",
     "ODrive, Damiao": "(?:MotorRig|CanRig)",
     "UR": "ArmRig",
 }
 """The parameter of a driver's test that says which wire it is about."""
 UNNUMBERED = {
-    "test_ctrl_c_on_a_call_stops_the_motion": "S05",
     "test_a_damiao_is_watched_from_attaching_on": "S06",
     "test_an_odrive_without_a_watchdog_is_not_enabled": "S06",
     "test_an_e_stop_is_not_cleared_without_the_right": "S09",

@@ -12,35 +12,19 @@ from urllib.parse import urlsplit
 
 from websockets.sync.client import ClientConnection, connect
 
+from tests.support.policies import EVERYTHING, policy_text
 from tests.support.two_joint_robot import Joint, Robot
 from tests.support.waiting import PATIENCE_S
 from trade import Container, service
 from trade.testing import memory_system
 from trade_gateway.http import HttpGateway, Tokens, add_token
 
-POLICY = """
-[roles.all]
-call = ["*"]
-read = ["*"]
-register = ["*"]
-lock = ["*"]
-administer = ["*"]
-instrument = ["*"]
-
-[roles.operator]
-call = ["robot.a"]
-read = ["robot.a"]
-lock = ["robot.a"]
-
-[roles.viewer]
-read = ["robot"]
-
-[identities]
-tester = ["all"]
-chief = ["all"]
-anna = ["operator"]
-bert = ["viewer"]
-"""
+POLICY = policy_text(
+    "tester=all chief=all anna=operator bert=viewer",
+    all=EVERYTHING,
+    operator="call=robot.a read=robot.a lock=robot.a",
+    viewer="read=robot",
+)
 """Who may do what at an HTTP gateway that is `governed`."""
 
 

@@ -7,44 +7,19 @@ from typing import Any, Final
 
 from msgspec import Raw
 
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.sites import GATEWAY, Site
 from trade._protocol.messages import PROTOCOL, Call, encode_message
 
-POLICY: Final = """
-gateways = ["door"]
-revoked_file = "pki/revoked.toml"
-
-[roles.driver]
-register = ["rosie"]
-read = ["*"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie", "lab"]
-lock = ["rosie"]
-register = ["lab.planner"]
-
-[roles.viewer]
-read = ["*"]
-call = ["lab"]
-register = ["lab.dash"]
-
-[roles.chief]
-read = ["*"]
-administer = ["*"]
-instrument = ["*"]
-register = ["lab.chief"]
-
-[identities]
-arm = ["driver"]
-planner = ["operator"]
-porter = ["operator"]
-thief = ["operator"]
-dash = ["viewer"]
-chief = ["chief"]
-idle = []
-"""
+POLICY: Final = policy_text(
+    "arm=driver planner=operator porter=operator thief=operator dash=viewer chief=chief idle=",
+    head='gateways = ["door"]\nrevoked_file = "pki/revoked.toml"\n',
+    driver="register=rosie read=*",
+    operator="read=* call=rosie,lab lock=rosie register=lab.planner",
+    viewer="read=* call=lab register=lab.dash",
+    chief="read=* administer=* instrument=* register=lab.chief",
+)
 LENIENT: Final = POLICY.replace('dash = ["viewer"]', 'dash = ["viewer", "operator", "driver", "chief"]')
 ARM: Final = "rosie.arm"
 numbers: Final = itertools.count(1)

@@ -23,6 +23,7 @@ from unittest import mock
 import psutil
 
 from tests.support.lock_log import Log
+from tests.support.policies import policy_text
 from tests.system import wall_clock
 from tests.system.networks import Member, Networks, ip
 from tests.system.siege_records import CAN_BUS, Alarm, Fault, Rescue
@@ -60,25 +61,13 @@ _WHO: Final = [
     "hall",
     "anna",
 ]
-_POLICY: Final = f"""
-gateways = ["door"]
-
-[roles.driver]
-register = ["rosie", "dora"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie", "dora"]
-lock = ["rosie", "dora"]
-
-[roles.warden]
-administer = ["*"]
-
-[identities]
-rosie = ["driver"]
-dora = ["driver"]
-warden = ["warden"]
-{"".join(f'{who} = ["operator"]' + chr(10) for who in _WHO)}"""
+_POLICY: Final = policy_text(
+    " ".join(["rosie=driver dora=driver warden=warden", *(f"{who}=operator" for who in _WHO)]),
+    head='gateways = ["door"]\n',
+    driver="register=rosie,dora",
+    operator="read=* call=rosie,dora lock=rosie,dora",
+    warden="administer=*",
+)
 _JOINT: Final = """
 [joint."{name}"]
 bus = "{bus}"

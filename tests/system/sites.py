@@ -18,35 +18,15 @@ GATEWAY = {"private": "tls/10.231.1.1:7450", "public": "tls/10.231.2.1:7450"}
 _HOSTS = {"left": ("private", "10.231.1.2"), "right": ("public", "10.231.2.2"), "right2": ("public", "10.231.2.3")}
 
 
-class Site:
-    """Hosts ``left`` on the private network, ``between`` with the gateway, ``right`` and ``right2`` on the public one.
+class GatewayHost:
+    """Hosts in networks, one of which, ``between``, runs ``trade gateway`` in a process."""
 
-    Args:
-        networks: not laid yet; their creator closes them.
-        folder: for certificates and files; paths in a policy are beside it.
-        policy: the policy of all, as text.
-        public: the groups that the public network lets into the private one, which lets out ``rosie.arm`` in turn, or
-            what ``private`` says.
-        private: see there.
-    """
-
-    def __init__(
-        self, networks: Networks, folder: Path, policy: str, public: str = "[]", private: str = '["rosie.arm"]'
-    ) -> None:
-        self.networks = networks
-        self.folder = folder
-        self.papers = Papers(folder / "pki")
-        self.policy, self.file = folder / "policy.toml", folder / "gateway.toml"
-        self.policy.write_text(policy)
-        self.file.write_text(_gateway_file(public, private))
-        self.members: list[Member] = []
-        self.through: Sequence[str] = ()
-        """A script, with its words, that runs the gateway when it is started the next time."""
-        at = {host: address for host, (_, address) in _HOSTS.items()}
-        networks.lay("net1", between="10.231.1.1", left=at["left"])
-        networks.lay("net2", between="10.231.2.1", right=at["right"], right2=at["right2"])
-        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], purpose="gateway")
-        self.begin()
+    networks: Networks
+    folder: Path
+    file: Path
+    through: Sequence[str] = ()
+    """A script, with its words, that runs the gateway when it is started the next time."""
+    members: list[Member]
 
     def begin(self) -> None:
         """Start the gateway; it is up then."""
@@ -80,6 +60,40 @@ class Site:
 
     def complaints(self) -> str:
         return (self.folder / "complaints").read_text()
+
+    def close(self) -> None:
+        for each in self.members:
+            each.close()
+        self.end(signal.SIGTERM)
+
+
+class Site(GatewayHost):
+    """Hosts ``left`` on the private network, ``between`` with the gateway, ``right`` and ``right2`` on the public one.
+
+    Args:
+        networks: not laid yet; their creator closes them.
+        folder: for certificates and files; paths in a policy are beside it.
+        policy: the policy of all, as text.
+        public: the groups that the public network lets into the private one, which lets out ``rosie.arm`` in turn, or
+            what ``private`` says.
+        private: see there.
+    """
+
+    def __init__(
+        self, networks: Networks, folder: Path, policy: str, public: str = "[]", private: str = '["rosie.arm"]'
+    ) -> None:
+        self.networks = networks
+        self.folder = folder
+        self.papers = Papers(folder / "pki")
+        self.policy, self.file = folder / "policy.toml", folder / "gateway.toml"
+        self.policy.write_text(policy)
+        self.file.write_text(_gateway_file(public, private))
+        self.members: list[Member] = []
+        at = {host: address for host, (_, address) in _HOSTS.items()}
+        networks.lay("net1", between="10.231.1.1", left=at["left"])
+        networks.lay("net2", between="10.231.2.1", right=at["right"], right2=at["right2"])
+        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], purpose="gateway")
+        self.begin()
 
     def launched(
         self,
@@ -130,11 +144,6 @@ class Site:
         text = path.read_text()
         assert before in text
         path.write_text(text.replace(before, after))
-
-    def close(self) -> None:
-        for each in self.members:
-            each.close()
-        self.end(signal.SIGTERM)
 
 
 def _gateway_file(public: str, private: str) -> str:

@@ -280,19 +280,6 @@ def test_a_missing_robot_file_is_named(trade_command: Command) -> None:
     assert "nowhere.toml" in started.stderr
 
 
-def test_ctrl_c_on_a_call_stops_the_motion(rosie_up, run) -> None:
-    rosie = rosie_up()
-    call = run(
-        "-m", "trade_gateway", "call", "rosie.head.move_to", "[1.2, 0.0]", "speed_rad_s=0.05", "--deadline", "60"
-    )
-    wait_until(lambda: bool(events(read_log(rosie.log), "motion_started")))
-    call.signal(signal.SIGINT)
-    assert call.wait() == 130
-    [rest] = [entry for entry in events(read_log(rosie.log), "at_rest") if entry.joint == "neck.pan"]
-    assert rest.position_rad is not None
-    assert rest.position_rad < 1.0
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_S19_shutdown_holds_the_position_and_moves_nothing(number: int, rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
@@ -307,8 +294,10 @@ def test_S19_shutdown_holds_the_position_and_moves_nothing(number: int, rosie_up
     assert events(entries, "torque_off") == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_call_that_is_killed_or_loses_its_terminal_stops_the_motion(number: int, rosie_up, run) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_S05_a_call_that_is_interrupted_killed_or_loses_its_terminal_stops_the_motion(
+    number: int, rosie_up, run
+) -> None:
     rosie = rosie_up()
     words = ("call", "rosie.head.move_to", "[1.2, 0.0]", "speed_rad_s=0.05", "--deadline", "60")
     call = run("-m", "trade_gateway", *words)

@@ -9,22 +9,15 @@ from typing import Any
 import pytest
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from trade import Container, Settings, service, where
 from trade._threads import channel_workers
 from trade._transport.endpoints import free_endpoint
 from trade.errors import Busy
 
-POLICY = """
-[roles.driver]
-register = ["lab"]
-[roles.operator]
-read = ["*"]
-call = ["lab"]
-[identities]
-robot = ["driver"]
-planner = ["operator"]
-mallory = ["operator"]
-"""
+POLICY = policy_text(
+    "robot=driver planner=operator mallory=operator", driver="register=lab", operator="read=* call=lab"
+)
 
 
 class Room:

@@ -3,43 +3,26 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
 from tests.system.sites import Site
 
 pytestmark = pytest.mark.timeout(300)
 
-POLICY = """
-gateways = ["door"]
-
-[roles.driver]
-register = ["rosie", "cellar"]
-read = ["lobby"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-register = ["lobby"]
-
-[roles.viewer]
-read = ["*"]
-
-[roles.chief]
-read = ["*"]
-administer = ["trade"]
-
-[identities]
-chief = ["chief"]
-arm = ["driver"]
-planner = ["operator"]
-dash = ["viewer"]
-"""
+POLICY = policy_text(
+    "chief=chief arm=driver planner=operator dash=viewer",
+    head='gateways = ["door"]\n',
+    driver="register=rosie,cellar read=lobby",
+    operator="read=* call=rosie lock=rosie register=lobby",
+    viewer="read=*",
+    chief="read=* administer=trade",
+)
 
 
 @pytest.fixture
@@ -63,10 +46,6 @@ def planner(site: Site, arm: Member) -> Member:
     made = site.member("right", "planner")
     made.ask("group", "rosie.arm", "arm")
     return made
-
-
-def moves(member: Member, times: int) -> Callable[[], bool]:
-    return lambda: len(member.ask("moved", "rosie.arm")) == times
 
 
 def test_an_exported_service_is_found_called_and_locked_on_the_other_side_and_reported_gone(

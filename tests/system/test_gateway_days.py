@@ -10,6 +10,7 @@ from signal import SIGKILL
 import pytest
 
 from tests.support import simulated_robots as robots
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.conftest import Bench
 from tests.system.networks import Member, Networks, ip
@@ -18,22 +19,12 @@ from trade_hil_sim import events
 
 pytestmark = [pytest.mark.timeout(300)]
 
-POLICY = """
-gateways = ["door"]
-
-[roles.driver]
-register = ["rosie"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-
-[identities]
-rosie = ["driver"]
-arm = ["driver"]
-planner = ["operator"]
-"""
+POLICY = policy_text(
+    "rosie=driver arm=driver planner=operator",
+    head='gateways = ["door"]\n',
+    driver="register=rosie",
+    operator="read=* call=rosie lock=rosie",
+)
 PAN, FAR_RAD, SPEED_RAD_S = "rosie.neck.pan", 1.3, 0.1
 """A motion of 13 s: what is not stopped is still under way when all have noticed."""
 LEASE_S = 2.5

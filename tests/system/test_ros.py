@@ -223,30 +223,23 @@ def test_S03_the_motion_of_a_killed_node_stops_and_the_next_node_moves_again(bri
     bridged.begun(again_at)
 
 
-def test_S03_what_nodes_move_stops_when_their_core_is_killed_and_can_be_moved_with_the_next_one(
-    bridged: Bridged,
+@pytest.mark.parametrize("killed", ["core", "bridge"])
+def test_S03_what_nodes_move_stops_when_the_core_or_the_bridge_is_killed_and_can_be_moved_with_the_next_one(
+    bridged: Bridged, killed: str
 ) -> None:
     bridged.ros.node("teleop").repeat("/pan_by_hand", FAR_RAD, 10)
     bridged.begun()
     killed_at = time.monotonic()
-    bridged.ros.kill_core()
+    kill, start = {
+        "core": (bridged.ros.kill_core, bridged.ros.start_core),
+        "bridge": (bridged.program.process.kill, bridged.restart),
+    }[killed]
+    kill()
     bridged.stopped(killed_at)
-    wait_until(lambda: trade.locks() == [])
+    if killed == "core":
+        wait_until(lambda: trade.locks() == [])
     again_at = time.monotonic()
-    bridged.ros.start_core()
-    bridged.begun(again_at)  # it still says so
-
-
-def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_with_the_next_one(
-    bridged: Bridged,
-) -> None:
-    bridged.ros.node("teleop").repeat("/pan_by_hand", FAR_RAD, 10)
-    bridged.begun()
-    killed_at = time.monotonic()
-    bridged.program.process.kill()
-    bridged.stopped(killed_at)
-    again_at = time.monotonic()
-    bridged.restart()
+    start()
     bridged.begun(again_at)  # it still says so
 
 

@@ -1,53 +1,30 @@
 """``trade gateway`` between two systems, each with an authority, a policy and a network of its own."""
 
-import json
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
+from tests.system.sites import GatewayHost
 
 pytestmark = [pytest.mark.timeout(300)]
 
-LAB = """
-[roles.driver]
-register = ["rosie", "cellar"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-administer = ["rosie"]
-
-[identities]
-arm = ["driver"]
-planner = ["operator"]
-door = ["operator"]
-"""
-CLINIC = """
-[roles.guest]
-register = ["rosie"]
-
-[roles.nurse]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-
-[roles.visitor]
-read = ["rosie"]
-
-[identities]
-guest = ["guest"]
-anna = ["nurse"]
-paul = ["visitor"]
-"""
+LAB = policy_text(
+    "arm=driver planner=operator door=operator",
+    driver="register=rosie,cellar",
+    operator="read=* call=rosie lock=rosie administer=rosie",
+)
+CLINIC = policy_text(
+    "guest=guest anna=nurse paul=visitor",
+    guest="register=rosie",
+    nurse="read=* call=rosie lock=rosie",
+    visitor="read=rosie",
+)
 GATEWAY = """
 system = "lab-0"
 tls = "lab/pki/issued/door"
@@ -66,7 +43,7 @@ export = ["rosie.arm"]
 """
 
 
-class Sites:
+class Sites(GatewayHost):
     """A laboratory with a robot and a clinic; one host has a foot in both networks."""
 
     def __init__(self, networks: Networks, folder: Path) -> None:
@@ -86,33 +63,6 @@ class Sites:
         self.papers["clinic"].of("guest", addresses=["10.231.2.1"])
         self.begin()
 
-    def begin(self) -> None:
-        command = ["ip", "netns", "exec", self.networks.host("between")]
-        command += [sys.executable, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
-        with (self.folder / "complaints").open("ab") as complaints:
-            self.gateway = subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=complaints,
-                text=True,
-                env={**os.environ, "TRADE_RUNTIME_DIR": str(self.folder / "runtime"), "TRADE_SYSTEM": "elsewhere"},
-            )
-        self.ready = self.said()
-
-    def said(self) -> dict[str, object]:
-        assert self.gateway.stdout is not None
-        return json.loads(self.gateway.stdout.readline())
-
-    def end(self, how: signal.Signals) -> None:
-        self.gateway.send_signal(how)
-        try:
-            self.gateway.wait(20)
-        finally:
-            self.gateway.kill()
-            self.gateway.wait()
-            assert self.gateway.stdout is not None
-            self.gateway.stdout.close()
-
     def member(self, system: str, host: str, name: str, network: int, papers: str = "") -> Member:
         own = self.folder / f"{name}.toml"
         own.write_text((self.folder / system / "policy.toml").read_text())
@@ -130,11 +80,6 @@ class Sites:
         assert before in text
         self.file.write_text(text.replace(before, after))
         assert self.said()["reloaded"]
-
-    def close(self) -> None:
-        for each in self.members:
-            each.close()
-        self.end(signal.SIGTERM)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from unittest import mock
 import pytest
 
 from tests.support.lock_log import Done, Log, read
+from tests.support.policies import policy_text
 from tests.support.simulated_robots import at_rest
 from tests.support.waiting import wait_until
 from tests.system.networks import Member, Networks
@@ -28,26 +29,13 @@ _THROUGH: Final = Path(__file__).with_name("other_version.py")
 _BEHAVIOUR: Final = Path(__file__).with_name("behaviour.py")
 _HOSTS: Final = {"near": "left", "wide": "left", "later": "left", "far": "right", "further": "right2"}
 """Behaviours, and where they are: the robots are on ``left``."""
-_POLICY: Final = f"""
-gateways = ["door"]
-
-[roles.driver]
-register = ["rosie", "dora"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie", "dora"]
-lock = ["rosie", "dora"]
-
-[roles.chief]
-includes = ["operator"]
-administer = ["*"]
-
-[identities]
-rosie = ["driver"]
-dora = ["driver"]
-chief = ["chief"]
-{"".join(f'{name} = ["operator"]' + chr(10) for name in _HOSTS)}"""
+_POLICY: Final = policy_text(
+    " ".join(["rosie=driver dora=driver chief=chief", *(f"{name}=operator" for name in _HOSTS)]),
+    head='gateways = ["door"]\n',
+    driver="register=rosie,dora",
+    operator="read=* call=rosie,dora lock=rosie,dora",
+    chief="includes=operator administer=*",
+)
 _FAST_RAD_S, _SLOW_RAD_S = 2.0, 0.05
 _PATIENCE: Final = "stale_after_s = 1\nwatchdog_s = 1"
 """On a busy host a driver or a simulation gets no time for half a second, whatever the version."""

@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.networks import PATIENCE_S, Networks, ip
 
@@ -55,23 +56,12 @@ class Mind:
     def close(self):
         self.over.set()
 """
-POLICY: Final = """
-gateways = ["rover", "base"]
-
-[roles.gateway]
-read = ["*"]
-administer = ["*"]
-register = ["trade"]
-
-[roles.mind]
-register = ["hall"]
-
-[identities]
-rover = ["gateway"]
-base = ["gateway"]
-chief = ["gateway"]
-mind = ["mind"]
-"""
+POLICY: Final = policy_text(
+    "rover=gateway base=gateway chief=gateway mind=mind",
+    head='gateways = ["rover", "base"]\n',
+    gateway="read=* administer=* register=trade",
+    mind="register=hall",
+)
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,11 @@ class Cia402Rig(CanJointRig):
         written = [e for e in asked if e.data[0] & 0xE0 == 0x20 and e.data[1:3] in orders]
         return [*self.bench.frames("rpdo1", since=since), *written]
 
+    def written(self) -> Sequence[object]:
+        """Also commands of network management, except starting one drive."""
+        starts = (bytes((1, FIRST)), bytes((1, SECOND)))
+        return [*self.commanded(), *(entry for entry in self.bench.frames("nmt") if entry.data not in starts)]
+
     def sent_away(self, since: float, within_rad: float = 0.0) -> Sequence[object]:
         return self.bench.goals(FIRST, since)
 

@@ -10,9 +10,10 @@ import pytest
 from tests.contract.rigs.base import DriverProcess, SafetyRig
 from tests.support.simulated_robots import HAND
 from tests.support.waiting import wait_until
-from tests.unit.drivers.conftest import Outcome, written_now
+from tests.unit.drivers.conftest import Outcome
 from tests.unit.drivers.gripper_rig import HandRig, silent
 from trade import Container
+from trade.errors import DeviceError
 from trade_hil_sim import Entry, Mute, WrongModel, events
 
 _SLOW_M_S = 0.02
@@ -141,6 +142,9 @@ class RobotiqRig(SafetyRig):
         assert not self.bench.moves(lost + 0.1)
 
     def falls_silent(self) -> float:
-        [stop] = [entry for entry in self.bench.writes(written_now() - 30)[-1:] if not entry.moves]
+        [stop] = self.bench.writes(self.events("motion_started", 0.0)[-1].t)
+        assert not stop.moves
         wait_until(lambda: silent(self.device), "what was measured is too old")
+        with pytest.raises(DeviceError, match="not healthy"):
+            self.device.state()
         return float(stop.t) + 0.1

@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tests.support.http_clients import Client
+from tests.support.policies import EVERYTHING, policy_text
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import Bench, Program, bench, benches, run
 from trade import Settings
@@ -19,30 +20,12 @@ from trade_gateway.http import add_token
 
 __all__ = ["bench", "benches", "run"]
 
-POLICY = """
-[roles.all]
-call = ["*"]
-read = ["*"]
-register = ["*"]
-lock = ["*"]
-administer = ["*"]
-instrument = ["*"]
-
-[roles.operator]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[identities]
-"{own}" = ["all"]
-chief = ["all"]
-anna = ["operator"]
-bert = ["operator"]
-vera = ["viewer"]
-"""
+POLICY = policy_text(
+    "{own}=all chief=all anna=operator bert=operator vera=viewer",
+    all=EVERYTHING,
+    operator="read=* call=rosie lock=rosie",
+    viewer="read=rosie",
+)
 PAN = "rosie.neck.pan"
 PATIENCE_MS = PATIENCE_S * 1000
 

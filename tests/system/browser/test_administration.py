@@ -10,6 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.support.http_clients import Client
+from tests.support.policies import EVERYTHING, policy_text
 from tests.support.waiting import wait_until
 from tests.system.browser.conftest import Browsers, HttpProcess, View
 from tests.system.conftest import Program
@@ -17,28 +18,12 @@ from trade import Container, Notification, Settings, where
 from trade._transport.endpoints import free_endpoint
 from trade.errors import NoSuchService
 
-POLICY = """
-[roles.all]
-call = ["*"]
-read = ["*"]
-register = ["*"]
-lock = ["*"]
-administer = ["*"]
-instrument = ["*"]
-
-[roles.operator]
-read = ["*"]
-call = ["hall"]
-administer = ["trade", "hall"]
-
-[roles.viewer]
-read = ["*"]
-
-[identities]
-"{own}" = ["all"]
-olga = ["operator"]
-vera = ["viewer"]
-"""
+POLICY = policy_text(
+    "{own}=all olga=operator vera=viewer",
+    all=EVERYTHING,
+    operator="read=* call=hall administer=trade,hall",
+    viewer="read=*",
+)
 MODULE = """
 from trade import service
 

@@ -52,10 +52,6 @@ def _any_version(decoder: Any, payload: bytes) -> Any:
         raise messages.Malformed(str(bad)) from None
 
 
-def _no_renewal(self: lock_table.LockTable, numbers: Any, identity: str) -> list[int]:
-    return list(numbers)
-
-
 _run: Any = local_service.LocalService.run
 
 

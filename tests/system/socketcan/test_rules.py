@@ -15,8 +15,13 @@ from tests.contract.test_safety import (
     test_S06_a_driver_process_that_dies_or_freezes_while_moving_is_stopped_by_the_device,
     test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why,
     test_S06_an_unhealthy_process_holds_once_and_falls_silent,
+    test_S06_every_enabled_joint_has_its_watchdog_armed,
     test_S07_a_stop_gets_through_while_another_joint_is_silent,
     test_S08_a_command_admitted_before_a_stop_is_dropped_after_it,
+    test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire,
+    test_S18_attaching_commands_nothing,
+    test_S19_shutdown_holds_the_position_disarms_the_watchdog_and_moves_nothing,
+    test_S19_shutdown_while_moving_stops_first,
 )
 from tests.system.socketcan.candump import RecordedLeg
 from tests.unit.drivers.legs import PATIENT, Leg
@@ -25,13 +30,7 @@ from tests.unit.drivers.test_cia402_motor import (
     test_a_set_point_has_an_edge_and_the_edge_is_taken_back_when_it_was_taken,
     test_enabling_passes_one_state_after_the_other_and_ends_halted_at_the_current_position,
 )
-from tests.unit.drivers.test_cia402_safety import (
-    test_S06_the_watchdog_of_every_drive_is_armed_at_attach_and_fed_from_then_on,
-    test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire,
-    test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled,
-    test_S18_attaching_commands_nothing,
-    test_S19_shutdown_while_moving_stops_first_and_disarms_what_holds,
-)
+from tests.unit.drivers.test_cia402_safety import test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled
 
 
 @pytest.fixture

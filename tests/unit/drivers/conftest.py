@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
-from tests.support.simulated_robots import HEAD, patient
-from tests.support.waiting import PATIENCE_S, wait_until
+from tests.support.simulated_robots import HEAD
+from tests.support.waiting import PATIENCE_S
+from tests.unit.drivers.bus_rig import ServoRig
 from tests.unit.drivers.gate import Gate
 from trade._context.call_context import CallContext, running
 from trade.errors import DeviceSilent
-from trade_drivers import AttachedRobot, Robot, attach, parse
-from trade_hil_sim import DynamixelBus, Entry, Servo, events, motion_writes, writes
+from trade_drivers import AttachedRobot
+from trade_hil_sim import DynamixelBus, Entry, Servo
 
 GOAL, TORQUE, WATCHDOG = 116, 64, 98
 
@@ -63,73 +64,20 @@ class Outcome:
         return self
 
 
-class Rig:
-    """A simulated bus and the driver attached to it."""
+class Rig(ServoRig):
+    """Two Dynamixel servos."""
 
-    def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
-        self._tmp_path, self._undo = tmp_path, undo
-        self.robot: Robot = patient(parse(HEAD, "head.toml"))
-        self.announced: list[object] = []
+    original, file, sim_class, servo_class = HEAD, "head.toml", DynamixelBus, Servo
+    first, second, group = "neck.pan", "neck.tilt", "head"
 
-    def configure(self, *changes: tuple[str, str]) -> None:
-        """Change the robot file's text."""
-        text = HEAD
-        for before, after in changes:
-            assert before in text, before
-            text = text.replace(before, after)
-        self.robot = patient(parse(text, "head.toml"))
+    def goal_of(self, entry: Entry) -> int:
+        return goal_counts(entry)
 
-    def plug(
-        self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None, paced: bool = False
-    ) -> DynamixelBus:
-        """Simulate the bus of the robot file, or these servos; paced, the bytes take the time they take."""
-        port = self._tmp_path / "neck"
-        if servos:
-            self.sim = DynamixelBus(servos, port, name="neck", paced=paced)
-        else:
-            bus = self.robot.buses[0]
-            self.sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), port, paced=paced)
-        prepare(self.sim)
-        return self._undo.enter_context(self.sim)
-
-    def attach(self, **options: Any) -> AttachedRobot:
-        """Attach the driver; it is closed with the test, whatever that says."""
-        options.setdefault("ports", {"neck": str(self.sim.port)})
-        options.setdefault("register", lambda _, groups: self.announced.append(groups))
-        options.setdefault("deregister", lambda _: None)
-        robot = attach(self.robot, **options)
-        self._undo.callback(_close, robot)
-        return robot
-
-    @property
-    def log(self) -> list[Entry]:
-        return list(self.sim.log.entries)
-
-    def goals(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
-        """Writes that touch a goal position."""
-        return writes(self.log, device_id=device_id, register="goal_position", since=since)
-
-    def moves(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
-        """Writes that could set something moving."""
-        return motion_writes(self.log, device_id=device_id, since=since)
-
-    def events(self, name: str, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
-        return events(self.log, name, device_id=device_id, since=since)
-
-    def wait_for(self, name: str, device_id: int | None = None, since: float = 0.0) -> Entry:
-        """The first such event from then on."""
-        wait_until(lambda: self.events(name, device_id, since), f"{name} of {device_id}")
-        return self.events(name, device_id, since)[0]
-
-    def truth(self, device_id: int) -> Any:
-        return next(device for device in self.sim.state().devices if device.device_id == device_id)
-
-
-def _close(robot: AttachedRobot) -> None:
-    try:
-        robot.close()
-    except Exception as error:  # noqa: BLE001 - what closing says is tested where it matters
-        print(f"closing: {error}")
+    def move_by_another(self, goal: int) -> None:
+        """The first servo moves slowly on the command of another program."""
+        servo, now = next(servo for servo in self.sim.devices if servo.device_id == 1), time.monotonic()
+        servo.write(64, b"\1", now)
+        servo.write(112, (5).to_bytes(4, "little") + goal.to_bytes(4, "little"), now)
 
 
 @pytest.fixture
@@ -150,6 +98,11 @@ def head(rig: Rig) -> Rig:
     """A plugged-in head."""
     rig.plug()
     return rig
+
+
+@pytest.fixture
+def robot(head: Rig) -> AttachedRobot:
+    return head.attach()
 
 
 def goal_counts(entry: Entry) -> int:

@@ -1,17 +1,18 @@
 """A simulated leg of two drives in this process, the driver attached to it, and the simulator's log as the judge."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import can
 import pytest
 
-from tests.support.waiting import wait_until
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.unit.drivers.bus_rig import BusRig
 from trade.errors import TradeError
-from trade_drivers import AttachedRobot, Motor, Robot, attach, parse
-from trade_hil_sim import Entry, events, frames
+from trade_drivers import Motor, Robot, parse
+from trade_hil_sim import Entry, frames
 from trade_hil_sim.cia402 import Cia402Bus
 
 LEG = """
@@ -69,45 +70,32 @@ def only(*modes: int) -> Callable[[Cia402Bus], None]:
     return change
 
 
-class Leg:
-    """The simulated bus and the driver attached to it: on its own adapter, or on an interface of the system."""
+class Leg(BusRig):
+    """Two drives: on an adapter of their own, or on an interface of the system."""
+
+    original, file = LEG, "leg.toml"
 
     def __init__(self, undo: ExitStack, interface: str = "", rate_hz: int = 20) -> None:
-        self._undo = undo
         self._rate_hz = rate_hz  # on an interface
         self.interface = interface
-        self.announced: list[object] = []
-        self.configure()
+        super().__init__(Path("unused"), undo)
 
-    def configure(self, *changes: tuple[str, str]) -> None:
-        """Change the robot file's text."""
-        text = LEG
-        for before, after in changes:
-            assert before in text, before
-            text = text.replace(before, after)
+    def read(self, text: str) -> Robot:
         if self.interface:  # where there is one slow processor, and each frame costs several calls of the system
             text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = {self._rate_hz}\nstale_after_s = 1')
         self.text = text
-        self.robot: Robot = parse(text, "leg.toml")
+        return parse(text, self.file)
 
     def plug(self, *, prepare: Callable[[Cia402Bus], None] = lambda _: None, paced: bool = False) -> Cia402Bus:
         bus = self.robot.buses[0]
         joints, options = self.robot.joints_on(bus.name), {"paced": paced, "interface": self.interface}
-        self.sim = Cia402Bus.from_robot(bus, joints, Path("unused"), **options)
-        prepare(self.sim)
-        self._undo.enter_context(self.sim)
+        self.open(Cia402Bus.from_robot(bus, joints, self._tmp_path, **options), prepare)
         wait_until(lambda: {e.device_id for e in self.frames("boot_up")} >= {HIP, KNEE}, "both have booted")
         return self.sim
 
-    def attach(self, **options: Any) -> AttachedRobot:
-        """Attach the driver; it is closed with the test, whatever that says."""
-        if "ports" not in options and not self.interface:  # the robot file names the interface
-            options["ports"] = {"legs": self.sim.port}
-        options.setdefault("register", lambda _, groups: self.announced.append(groups))
-        options.setdefault("deregister", lambda _: None)
-        robot = attach(self.robot, **options)
-        self._undo.callback(_close, robot)
-        return robot
+    @property
+    def ports(self) -> dict[str, str]:
+        return {} if self.interface else super().ports  # the robot file names the interface
 
     def listen(self) -> can.BusABC:
         """Another client of the bus."""
@@ -116,10 +104,6 @@ class Leg:
         address, _, channel = self.sim.port.removeprefix("socketcand:").partition("/")
         host, _, port = address.partition(":")
         return can.Bus(interface="socketcand", host=host, port=int(port), channel=channel, tcp_tune=True)
-
-    @property
-    def log(self) -> list[Entry]:
-        return list(self.sim.log.entries)
 
     def frames(self, name: str | None = None, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
         return frames(self.log, name, device_id=device_id, since=since)
@@ -136,24 +120,9 @@ class Leg:
             int.from_bytes(e.data[2:], "little", signed=True) for e, word in zip(found, words, strict=True) if word & GO
         ]
 
-    def events(self, name: str, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
-        return events(self.log, name, device_id=device_id, since=since)
-
-    def wait_for(self, name: str, device_id: int | None = None, since: float = 0.0) -> Entry:
-        wait_until(lambda: self.events(name, device_id, since), f"{name} of {device_id}")
-        return self.events(name, device_id, since)[0]
-
-    def truth(self, device_id: int) -> Any:
-        return next(device for device in self.sim.state().devices if device.device_id == device_id)
-
     def drive(self, device_id: int) -> Any:
         """The simulated drive itself, to be changed before the bus is open."""
         return next(device for device in self.sim.devices if device.device_id == device_id)
-
-
-def _close(robot: AttachedRobot) -> None:
-    with suppress(TradeError):  # what closing says is tested where it matters
-        robot.close()
 
 
 def fault_of(motor: Motor) -> str:
@@ -169,6 +138,25 @@ def stop_by_nmt(leg: Leg, node: int) -> None:
     with leg.listen() as other:
         other.send(can.Message(arbitration_id=0, data=bytes((0x02, node)), is_extended_id=False))
         wait_until(lambda: any(e.data == b"\x04" for e in leg.frames("heartbeat", node)[-1:]), "it is stopped")
+
+
+def turned_by_another(leg: Leg, speed: int) -> Entry:
+    """Another program has the hip turn at this speed, in the drive's unit; the entry of its start."""
+    with leg.listen() as other:
+
+        def write(index: int, size: int, value: int) -> None:
+            head = bytes((0x2F - 4 * (size - 1),)) + index.to_bytes(2, "little") + b"\0"
+            data = head + value.to_bytes(4, "little", signed=True)
+            other.send(can.Message(arbitration_id=0x600 + HIP, data=data, is_extended_id=False))
+            while (answer := other.recv(PATIENCE_S)) is None or answer.arbitration_id != 0x580 + HIP:
+                pass
+            assert answer.data[0] == 0x60
+
+        write(0x6060, 1, PROFILE_VELOCITY)
+        write(0x60FF, 4, speed)
+        for word in (0x06, 0x07, 0x0F):
+            write(0x6040, 2, word)
+        return leg.wait_for("motion_started", HIP)
 
 
 @pytest.fixture

@@ -4,13 +4,11 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from math import tau
-from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
 from tests.unit.drivers.legs import Leg
-from trade_drivers import parse
 from trade_hil_sim import Entry
 from trade_hil_sim.damiao import DamiaoBus
 from trade_hil_sim.odrive import OdriveBus
@@ -64,30 +62,18 @@ class MotorRig(Leg):
     """The simulated bus and the driver attached to it."""
 
     kind: str
-    text: str
+    file = "tail.toml"
     sim_class: ClassVar[type[Any]]
     orders: ClassVar[frozenset[str]]
     """Names of frames that could set a motor moving, or let go of it."""
     target: ClassVar[str]
     """The one that says where to."""
 
-    def configure(self, *changes: tuple[str, str]) -> None:
-        text = {"odrive": ODRIVE, "damiao": DAMIAO}[self.kind]
-        for before, after in changes:
-            assert before in text, before
-            text = text.replace(before, after)
-        self.text, self.robot = text, parse(text, "tail.toml")
-
     def plug(self, *, prepare: Callable[[Any], None] = lambda _: None, paced: bool = False) -> Any:
         bus = self.robot.buses[0]
-        self.sim = self.sim_class.from_robot(bus, self.robot.joints_on(bus.name), Path("unused"), paced=paced)
-        prepare(self.sim)
-        self._undo.enter_context(self.sim)
-        return self.sim
-
-    def attach(self, **options: Any) -> Any:
-        options.setdefault("ports", {"tail": self.sim.port})
-        return super().attach(**options)
+        return self.open(
+            self.sim_class.from_robot(bus, self.robot.joints_on(bus.name), self._tmp_path, paced=paced), prepare
+        )
 
     def commanded(self, device_id: int | None = None, since: float = 0.0) -> list[Entry]:
         """Every frame of a client that could move something, or keeps it where it is."""
@@ -107,7 +93,7 @@ class MotorRig(Leg):
 
 
 class OdriveRig(MotorRig):
-    kind = "odrive"
+    kind, original = "odrive", ODRIVE
     sim_class = OdriveBus
     orders = frozenset({"set_axis_state", "set_controller_mode", "set_input_pos", "set_input_vel", "set_input_torque"})
     target = "set_input_pos"
@@ -115,7 +101,7 @@ class OdriveRig(MotorRig):
 
 
 class DamiaoRig(MotorRig):
-    kind = "damiao"
+    kind, original = "damiao", DAMIAO
     sim_class = DamiaoBus
     orders = frozenset({"enable", "disable", "clear_error", "set_zero", "mit", "pos_vel", "vel", "force_pos"})
     target = "pos_vel"

@@ -11,16 +11,7 @@ import trade_hil_sim
 from tests.support.simulated_robots import HEAD, at_rest, patient
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, call, goal_counts, written_now
-from trade import Container, where
-from trade.errors import (
-    DeviceFault,
-    InvalidArgument,
-    LimitExceeded,
-    MotionStopped,
-    Stopped,
-    ToleranceExceeded,
-    TradeError,
-)
+from trade import Container, errors, where
 from trade.testing import MemorySystem, memory_system
 from trade_drivers import AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, events, motion_writes, writes
@@ -161,17 +152,17 @@ def test_relaxed_joints_are_enabled_on_both_sides_before_either_moves(walker: Wa
 @pytest.mark.parametrize(
     ("act", "error"),
     [
-        (lambda legs: legs.move_to([0.1, 0.1, 0.1, 1.6]), LimitExceeded),
-        (lambda legs: legs.move_to([0.1] * 3), InvalidArgument),
-        (lambda legs: legs.move_to([0.1, 0.1, math.nan, 0.1]), InvalidArgument),
-        (lambda legs: legs.move_to([0.1] * 4, 1.5), LimitExceeded),
-        (lambda legs: legs.move_to([0.1] * 4, 0.0), LimitExceeded),
-        (lambda legs: legs.servo([0.1, 0.1, 0.1, -1.6]), LimitExceeded),
-        (lambda legs: legs.servo([0.1] * 4, 1.1), InvalidArgument),
+        (lambda legs: legs.move_to([0.1, 0.1, 0.1, 1.6]), errors.LimitExceeded),
+        (lambda legs: legs.move_to([0.1] * 3), errors.InvalidArgument),
+        (lambda legs: legs.move_to([0.1, 0.1, math.nan, 0.1]), errors.InvalidArgument),
+        (lambda legs: legs.move_to([0.1] * 4, 1.5), errors.LimitExceeded),
+        (lambda legs: legs.move_to([0.1] * 4, 0.0), errors.LimitExceeded),
+        (lambda legs: legs.servo([0.1, 0.1, 0.1, -1.6]), errors.LimitExceeded),
+        (lambda legs: legs.servo([0.1] * 4, 1.1), errors.InvalidArgument),
     ],
 )
 def test_S22_one_value_outside_refuses_all_on_both_buses(
-    walker: Walker, act: Callable[[JointGroup], object], error: type[TradeError]
+    walker: Walker, act: Callable[[JointGroup], object], error: type[errors.TradeError]
 ) -> None:
     with pytest.raises(error):
         act(walker.legs)
@@ -182,7 +173,7 @@ def test_stop_stops_all(walker: Walker) -> None:
     moving = under_way(walker)
     walker.legs.stop()
     assert walker.rests()
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     assert short_of_the_goal(walker)
 
 
@@ -190,7 +181,7 @@ def test_S08_stopping_one_joint_stops_the_other_bus_too(walker: Walker) -> None:
     moving = under_way(walker)
     walker.attached.motor("left.knee").stop()
     error = moving.wait().error
-    assert isinstance(error, MotionStopped)
+    assert isinstance(error, errors.MotionStopped)
     assert "stop() was called" in str(error)
     assert short_of_the_goal(walker)
 
@@ -200,7 +191,7 @@ def test_a_joint_that_is_blocked_stops_the_other_bus_and_is_named(walker: Walker
     moving = under_way(walker)
     walker.sims[side].do(trade_hil_sim.Jam(ids=(1,)))
     error = moving.wait().error
-    assert isinstance(error, ToleranceExceeded)
+    assert isinstance(error, errors.ToleranceExceeded)
     assert error.device == f"rosie.{side}.hip"
     assert short_of_the_goal(walker)
 
@@ -208,7 +199,7 @@ def test_a_joint_that_is_blocked_stops_the_other_bus_and_is_named(walker: Walker
 def test_a_bus_that_falls_silent_stops_the_other(walker: Walker) -> None:
     moving = under_way(walker)
     walker.sims["left"].do(trade_hil_sim.Mute())
-    assert isinstance(moving.wait().error, TradeError)
+    assert isinstance(moving.wait().error, errors.TradeError)
     wait_until(lambda: not any(device.moving for device in walker.sims["right"].state().devices), "it rests")
     assert walker.truth("right.hip") < 1.3
     walker.sims["left"].do(trade_hil_sim.Heal())  # so that closing reaches it
@@ -219,7 +210,7 @@ def test_a_fault_on_one_side_keeps_the_other_from_moving(walker: Walker) -> None
     walker.sims["right"].do(trade_hil_sim.HardwareFault(ids=(2,), bits=0x20))
     wait_until(lambda: walker.legs.state()[2].fault, "the fault is known")
     mark = written_now()
-    with pytest.raises(DeviceFault, match=r"right\.knee"):
+    with pytest.raises(errors.DeviceFault, match=r"right\.knee"):
         walker.legs.move_to([0.5] * 4)
     wait_until(walker.rests, "nothing moves")
     assert not writes(walker.log("right"), register="goal_position", since=mark)
@@ -230,7 +221,7 @@ def test_a_new_move_takes_over_on_both_buses(walker: Walker) -> None:
     old = under_way(walker)
     goals = [-0.3, 0.2, -0.1, 0.3]
     assert walker.legs.move_to(goals) == pytest.approx(goals, abs=0.04)
-    assert isinstance(old.wait().error, MotionStopped)
+    assert isinstance(old.wait().error, errors.MotionStopped)
 
 
 def test_servo_is_followed_on_both_buses_and_S04_ends_on_both(walker: Walker) -> None:
@@ -247,7 +238,7 @@ def test_a_servo_stream_that_one_side_cannot_follow_stops_the_other_side(walker:
     walker.legs.enable()
     walker.sims["right"].do(trade_hil_sim.HardwareFault(ids=(2,), bits=0x20))
     wait_until(lambda: walker.legs.state()[2].fault, "the fault is known")
-    with pytest.raises(DeviceFault):
+    with pytest.raises(errors.DeviceFault):
         walker.legs.servo([1.4] * 4, 1.0)
     wait_until(walker.rests, "they rest")
     assert walker.truth("left.hip") < 1.0
@@ -287,7 +278,7 @@ def test_S11_a_joint_locked_by_another_client_makes_the_whole_group_refuse(walke
         driver, owner, other = (system.container(name) for name in ("driver", "owner", "other"))
         _announced(walker, driver, system)
         move = other.find(where(name="move_to", group="rosie.legs"))
-        with owner.lock(where(group="rosie.left.knee")), pytest.raises(TradeError, match=r"left\.knee"):
+        with owner.lock(where(group="rosie.left.knee")), pytest.raises(errors.TradeError, match=r"left\.knee"):
             move([0.3] * 4)
         assert not walker.moves()
         assert move.with_(deadline_s=20)([0.3] * 4) == pytest.approx([0.3] * 4, abs=0.04)
@@ -301,16 +292,16 @@ def test_S08_a_stop_by_another_client_latches_on_both_buses(walker: Walker) -> N
         for side in ("left", "right"):
             wait_until(lambda side=side: events(walker.log(side), "motion_started"), f"the {side} leg moves")
         other.find(where(name="stop", group="rosie.legs"))()
-        with pytest.raises(MotionStopped):
+        with pytest.raises(errors.MotionStopped):
             run.result()
         assert short_of_the_goal(walker)
         for joint in ("left.hip", "right.knee"):
-            with pytest.raises(Stopped):
+            with pytest.raises(errors.Stopped):
                 mover.find(where(name="move_to", group=f"rosie.{joint}"))(0.0)
 
 
 def test_a_deadline_that_comes_on_the_way_stops_both(walker: Walker) -> None:
     walker.legs.enable()
-    with call(0.8), pytest.raises(MotionStopped, match="deadline"):
+    with call(0.8), pytest.raises(errors.MotionStopped, match="deadline"):
         walker.legs.move_to([1.4] * 4, 0.5)
     assert short_of_the_goal(walker)

@@ -43,11 +43,6 @@ def test_an_unknown_model_is_named_by_its_number(head: Rig) -> None:
     assert "model number 4711" in refused(head)
 
 
-def test_two_devices_with_one_id_are_found_out(rig: Rig) -> None:
-    rig.plug(Servo(1), Servo(1), Servo(2))
-    assert "two devices may share this id" in refused(rig)
-
-
 def test_an_answer_that_comes_twice_is_found_out(head: Rig) -> None:
     head.sim.do(sim.Duplicate(ids=(1,), instruction="ping"))
     assert "two devices may share this id" in refused(head)
@@ -60,11 +55,6 @@ def test_a_device_has_as_long_to_answer_at_first_as_its_measurements_may_be_old(
     rig.configure(('port = "/dev/ttyNOWHERE"', 'port = "/dev/ttyNOWHERE"\nstale_after_s = 2\nwatchdog_s = 2'))
     rig.plug().do(sim.Mute(ids=(1,), instruction=instruction, count=5))
     assert rig.attach().motor("neck.pan").state().name == "rosie.neck.pan"
-
-
-def test_another_baud_rate_looks_like_absence(rig: Rig) -> None:
-    rig.plug(Servo(1, baud=57600), Servo(2, baud=57600))
-    assert "baud rate (register 8)" in refused(rig)
 
 
 def test_a_port_that_is_not_there_is_named(head: Rig) -> None:

@@ -5,10 +5,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import can
 import pytest
 
-from tests.support.waiting import PATIENCE_S, wait_until
+from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.legs import (
     COUNTS_PER_RAD,
@@ -21,6 +20,7 @@ from tests.unit.drivers.legs import (
     leg,
     only,
     rig,
+    turned_by_another,
 )
 from tests.unit.drivers.test_cia402_motor import through
 from trade.errors import ConfigurationError, DeviceFault, TradeError
@@ -142,21 +142,7 @@ def test_S23_a_unit_that_cannot_be_converted_is_refused_with_its_name(
 @pytest.mark.parametrize(("objects", "speed"), [([], 16297), (unit_objects(velocity=RPM, acceleration=RPM_S), 239)])
 def test_S23_a_drive_found_turning_is_halted_whatever_its_unit(rig: Leg, objects: list[Object], speed: int) -> None:
     plug(rig, *objects)
-    with rig.listen() as other:
-
-        def write(index: int, size: int, value: int) -> None:
-            head = bytes((0x2F - 4 * (size - 1),)) + index.to_bytes(2, "little") + b"\0"
-            data = head + value.to_bytes(4, "little", signed=True)
-            other.send(can.Message(arbitration_id=0x600 + HIP, data=data, is_extended_id=False))
-            while (answer := other.recv(PATIENCE_S)) is None or answer.arbitration_id != 0x580 + HIP:
-                pass
-            assert answer.data[0] == 0x60
-
-        write(0x6060, 1, PROFILE_VELOCITY)
-        write(0x60FF, 4, speed)  # 0.5 rad/s
-        for word in (0x06, 0x07, 0x0F):
-            write(0x6040, 2, word)
-        started = rig.wait_for("motion_started", HIP)
+    started = turned_by_another(rig, speed)  # 0.5 rad/s
     robot = rig.attach()
     rig.wait_for("at_rest", HIP, started.t)
     assert bytes.fromhex("2b4060000f010000") in [e.data for e in rig.frames("sdo_request", HIP, started.t)]

@@ -160,7 +160,6 @@ def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
 # --- profiles
 
 
-SAME = st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(GRAIN))
 LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(GRAIN))
 
 

@@ -14,22 +14,12 @@ import trade_hil_sim
 from tests.support.simulated_robots import HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig, is_silent, written_now
-from trade import permit, service
-from trade.errors import (
-    ConfigurationError,
-    DeviceFault,
-    DeviceSilent,
-    LimitExceeded,
-    OutcomeUnknown,
-)
+from trade import errors, permit, service
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 
 pytestmark = pytest.mark.virtual_time
-
-WATCHDOG_S = 0.3
-
 
 # --- S01 late is never
 
@@ -50,7 +40,7 @@ def test_S01_an_enable_that_went_out_and_then_expired_unheard_is_not_said_to_hav
     pan = head.attach().motor("neck.pan")
     head.sim.do(trade_hil_sim.Mute(ids=(1,), instruction="write"))
     error = Outcome(pan.enable, deadline_s=0.05).wait().error
-    assert isinstance(error, OutcomeUnknown | DeviceSilent)
+    assert isinstance(error, errors.OutcomeUnknown | errors.DeviceSilent)
 
 
 # --- S06 the last resort is in the device
@@ -92,7 +82,7 @@ def test_S06_after_the_watchdog_only_an_explicit_enable_lets_it_move_again(head:
     child.close()
     pan = head.attach().motor("neck.pan")
     mark = written_now()
-    with pytest.raises(DeviceFault, match="watchdog"):
+    with pytest.raises(errors.DeviceFault, match="watchdog"):
         pan.move_to(0.0)
     assert not head.moves(since=mark)
     pan.enable()
@@ -124,7 +114,7 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
     container = start_container("driver")
     container.register(Stoppable(), "rosie.wheel")
-    with pytest.raises(ConfigurationError, match="cannot be stopped"):
+    with pytest.raises(errors.ConfigurationError, match="cannot be stopped"):
         container.register(Unstoppable(), "rosie.wheel")
 
 
@@ -133,7 +123,7 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
 def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     robot = head.attach()
-    with pytest.raises(LimitExceeded, match=r"rosie\.neck\.tilt"):
+    with pytest.raises(errors.LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()
 
@@ -184,7 +174,7 @@ def test_a_servo_that_does_not_come_back_after_its_restart_ends_its_enabling(
     wait_until(lambda: trade_hil_sim.instructions(head.log, "reboot"), "it restarts")
     began = time.monotonic()
     error = enabling.wait().error
-    assert isinstance(error, DeviceSilent)
+    assert isinstance(error, errors.DeviceSilent)
     assert "neck.pan did not answer" in str(error)
     assert time.monotonic() - began < 5.0
     assert not head.truth(1).torque
@@ -200,6 +190,6 @@ def test_a_servo_that_lost_what_enabling_wrote_is_not_enabled(head: Rig, monkeyp
         servo.reboot(t)
 
     monkeypatch.setattr(servo, "_torque_on", with_too_weak_a_supply)
-    with pytest.raises(DeviceFault, match="did not keep what enabling it wrote"):
+    with pytest.raises(errors.DeviceFault, match="did not keep what enabling it wrote"):
         pan.enable()
     assert not head.truth(1).torque

@@ -377,19 +377,18 @@ def test_a_motion_lasts_until_the_test_lets_it_arrive(held_up: tuple[Any, Run]) 
     assert not shows_motion(device)
 
 
-def test_a_motion_that_is_held_up_is_cancelled(held_up: tuple[Any, Run]) -> None:
+@pytest.mark.parametrize("how", ["cancelled", "stopped"])
+def test_a_motion_that_is_held_up_is_cancelled_or_stopped(
+    held_up: tuple[Any, Run], trade_system: MemorySystem, how: str
+) -> None:
     device, run = held_up
-    run.ask_to_end()
+    if how == "cancelled":
+        run.ask_to_end()
+    else:
+        trade_system.container("mind").stop("rosie.part")
     assert isinstance(run.exception(30), Cancelled | MotionStopped)
     assert device.went == []
     assert not shows_motion(device)
-
-
-def test_a_motion_that_is_held_up_is_stopped(held_up: tuple[Any, Run], trade_system: MemorySystem) -> None:
-    device, run = held_up
-    trade_system.container("mind").stop("rosie.part")
-    assert isinstance(run.exception(30), Cancelled | MotionStopped)
-    assert device.went == []
 
 
 def test_a_motion_that_is_held_up_ends_with_its_deadline() -> None:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -11,7 +12,7 @@ import pytest
 import trade_hil_sim as sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig
-from tests.unit.drivers.gripper_rig import HandRig, made_rig
+from tests.unit.drivers.gripper_rig import HandRig
 from trade import Container, where
 from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
@@ -22,7 +23,8 @@ pytestmark = pytest.mark.virtual_time
 
 @pytest.fixture
 def hand(tmp_path: Path) -> Iterator[HandRig]:
-    with made_rig(tmp_path) as rig:
+    with ExitStack() as undo:
+        rig = HandRig(tmp_path, undo)
         rig.plug()
         yield rig
 

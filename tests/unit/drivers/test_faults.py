@@ -23,11 +23,6 @@ pytestmark = pytest.mark.virtual_time
 COUNT_RAD = 6.283185 / 4096
 
 
-@pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
-
-
 def state(robot: AttachedRobot, joint: str) -> MotorState | None:
     """The state, or None while it is silent."""
     try:
@@ -63,18 +58,6 @@ def test_a_silent_joint_is_an_error_with_its_name_and_never_a_zero(head: Rig, ro
     with pytest.raises(DeviceSilent, match=r"rosie\.neck\.pan did not answer") as deaf:
         robot.motor("neck.pan").state()
     assert deaf.value.waited_s > 0.25
-
-
-def test_a_silent_joint_leaves_the_other_usable(head: Rig, robot: AttachedRobot) -> None:
-    head.sim.do(sim.Mute(ids=(1,)))
-    await_silence(robot, "neck.pan")
-    assert robot.motor("neck.tilt").move_to(0.4) == pytest.approx(0.4, abs=0.03)
-    tilt = robot.motor("neck.tilt").state()
-    assert tilt.age_s < 1
-    with pytest.raises(DeviceSilent, match=r"neck\.pan"):
-        robot.motor("neck.pan").move_to(0.1)
-    with pytest.raises(DeviceSilent, match=r"neck\.pan"):
-        robot.group("head").state()
 
 
 def test_a_silent_joint_does_not_let_the_watchdog_of_a_moving_one_expire(head: Rig, robot: AttachedRobot) -> None:
@@ -159,47 +142,6 @@ def test_enabling_gives_a_joint_as_long_to_answer_as_its_measurements_may_be_old
 # --- damaged, late, cut, slow, double
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        sim.Truncate(ids=(1,), count=1),
-        sim.Duplicate(ids=(1,), count=3),
-        sim.Dribble(ids=(1,), count=3, s=0.0005),
-        sim.Dribble(ids=(1,), count=1, s=0.006),
-        sim.Mute(ids=(1,), count=1),
-    ],
-    ids=lambda fault: f"{type(fault).__name__}",
-)
-def test_a_single_bad_answer_goes_unnoticed(head: Rig, robot: AttachedRobot, fault: sim.Command) -> None:
-    pan = robot.motor("neck.pan")
-    pan.enable()
-    head.sim.do(fault)
-    assert pan.move_to(0.4) == pytest.approx(0.4, abs=0.03)
-    assert pan.state().fault == ""
-
-
-@pytest.mark.parametrize("fast", [False, True], ids=["sync", "fast sync"])
-@pytest.mark.parametrize("late_s", [0.033, 0.040, 0.060, 0.066, 0.080, 0.1, 0.15])
-def test_a_late_answer_never_becomes_a_wrong_value(rig: Rig, late_s: float, fast: bool) -> None:
-    if fast:
-        rig.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'))
-    rig.plug()
-    robot = rig.attach()
-    robot.motor("neck.pan").move_to(0.5)
-    rig.sim.do(sim.Late(ids=(1,), s=late_s, count=2))
-    rig.sim.do(sim.Place(ids=(2,), counts=2148))
-    begun = written_now()
-
-    def plausible() -> bool:
-        pan, tilt = state(robot, "neck.pan"), state(robot, "neck.tilt")
-        assert pan is None or pan.position_rad == pytest.approx(0.5, abs=0.01)
-        assert pan is None or (pan.temperature_c, pan.fault) == (30.0, "")
-        assert tilt is None or tilt.position_rad == pytest.approx(0, abs=0.01) or tilt.position_rad < -0.14
-        return pan is not None and pan.measured_at > begun + 0.5
-
-    wait_until(plausible, "later measurements came in")
-
-
 @pytest.mark.parametrize("late_s", [0.04, 0.07, 0.075, 0.08, 0.085, 0.09, 0.1, 0.12])
 def test_a_late_position_is_not_taken_for_a_new_one(head: Rig, robot: AttachedRobot, late_s: float) -> None:
     head.sim.do(sim.Late(ids=(1,), s=late_s, count=1, instruction="sync_read"))
@@ -238,11 +180,6 @@ def test_answers_that_are_late_for_as_long_as_they_may_be_are_not_taken_for_new_
     wait_until(lambda: measured_again() or written_now() > until, "its measurements are too old")
     rig.sim.do(sim.Heal())
     wait_until(measured_again, "it is measured again")
-
-
-def test_an_adapter_that_echoes_is_no_trouble(head: Rig, robot: AttachedRobot) -> None:
-    head.sim.do(sim.Echo())
-    assert robot.motor("neck.pan").move_to(0.3) == pytest.approx(0.3, abs=0.03)
 
 
 def test_enabling_copes_with_an_answer_lost(head: Rig, robot: AttachedRobot) -> None:

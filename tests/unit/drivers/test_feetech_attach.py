@@ -1,6 +1,5 @@
 """What a bus of Feetech servos is refused for, and by which words; nothing is written on the way."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,20 +7,15 @@ import pytest
 import trade_hil_sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import written_now
-from tests.unit.drivers.tail_rig import TailRig, tail_rig
+from tests.unit.drivers.tail_rig import TailRig, rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
-from trade_hil_sim.feetech import Servo
 
 pytestmark = pytest.mark.virtual_time
 
+__all__ = ["rig"]
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "servo_arm.toml"
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TailRig]:
-    with tail_rig(tmp_path) as made:
-        yield made
 
 
 def refused(rig: TailRig) -> str:
@@ -51,16 +45,6 @@ def test_a_servo_that_is_set_up_otherwise_is_refused_and_the_register_named(
     rig.poke(address, *data)
     assert complaint in (text := refused(rig))
     assert 'joint."tail.root"' in text
-
-
-def test_another_baud_rate_is_silence(rig: TailRig) -> None:
-    rig.plug(Servo(1, baud=115_200), Servo(2, baud=115_200))
-    assert "no device answers to id 1" in refused(rig)
-
-
-def test_two_devices_of_one_id_are_reported(rig: TailRig) -> None:
-    rig.plug(Servo(1), Servo(1), Servo(2))
-    assert "two devices may share this id" in refused(rig)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 They have no watchdog: what S06 asks of the device is missing, and these tests show what the driver does instead.
 """
 
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,25 +10,12 @@ import pytest
 import trade_hil_sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, tail_rig
+from tests.unit.drivers.tail_rig import TailRig, goal_of, lead_counts, measured_before, rig, tail
 from trade.errors import LockedByOther
 
 pytestmark = pytest.mark.virtual_time
 
-SLOWLY_RAD_S = 0.3
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TailRig]:
-    with tail_rig(tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def tail(rig: TailRig) -> TailRig:
-    rig.plug()
-    return rig
-
+__all__ = ["rig", "tail"]
 
 # --- S06 the device has no watchdog: what a driver leaves behind
 
@@ -93,35 +78,7 @@ def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: Tail
 # --- S18 attach moves and resets nothing
 
 
-def test_S18_attaching_writes_nothing_at_all(tail: TailRig) -> None:
-    tail.attach()
-    assert not trade_hil_sim.writes(tail.log)
-
-
 def test_S18_attaching_to_enabled_servos_writes_nothing_either(rig: TailRig) -> None:
     rig.plug(prepare=lambda sim: [servo.write(40, b"\1", written_now()) for servo in sim.devices] and None)
     assert rig.root().state().enabled
     assert not trade_hil_sim.writes(rig.log)
-
-
-def test_S18_what_is_found_moving_is_stopped(rig: TailRig) -> None:
-    rig.plug()
-    rig.poke(40, 1)
-    rig.poke(41, 20, *(3900).to_bytes(2, "little"), 0, 0, *(200).to_bytes(2, "little"))
-    rig.wait_for("motion_started", 1)
-    rig.attach()
-    rig.wait_for("at_rest", 1)
-    assert rig.truth().position_counts < 3800
-    assert abs(goal_of(rig.goals(1)[-1]) - rig.truth().position_counts) <= 3
-    assert not rig.goals(2)
-
-
-def test_S18_enabling_seeds_the_goal_with_the_measured_position_before_torque_is_on(tail: TailRig) -> None:
-    root = tail.root()
-    tail.sim.do(trade_hil_sim.Place(ids=(1,), counts=2400))
-    root.enable()
-    goal, torque = tail.moves(1)
-    assert (goal_of(goal), "torque_enable" in goal.registers) == (2400, False)
-    assert torque.registers == ("torque_enable",)
-    assert tail.truth().position_counts == 2400
-    assert not tail.events("motion_started", 1)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Rig
-from tests.unit.drivers.tail_rig import TailRig, tail_rig
+from tests.unit.drivers.tail_rig import TailRig
 from trade.errors import ConfigurationError, DeviceFault, DeviceSilent, WrongDevice
 from trade_drivers import Motor
 from trade_hil_sim import BrownOut, motion_writes
@@ -19,8 +20,8 @@ pytestmark = pytest.mark.virtual_time
 
 @pytest.fixture
 def tail(tmp_path: Path) -> Iterator[TailRig]:
-    with tail_rig(tmp_path) as made:
-        yield made
+    with ExitStack() as undo:
+        yield TailRig(tmp_path, undo)
 
 
 def refused(rig: Any) -> WrongDevice:

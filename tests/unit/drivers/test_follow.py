@@ -24,11 +24,6 @@ Row = tuple[float, list[float]] | tuple[float, list[float], list[float] | None]
 
 
 @pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
-
-
-@pytest.fixture
 def group(robot: AttachedRobot) -> JointGroup:
     return robot.group("head")
 

@@ -10,11 +10,6 @@ from trade_drivers import AttachedRobot
 pytestmark = pytest.mark.virtual_time
 
 
-@pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
-
-
 def test_joints_and_groups_become_providers_in_groups_named_after_them(head: Rig, robot: AttachedRobot) -> None:
     assert head.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",), ("rosie.faults",)]
     assert [one.name for one in robot.group("head").resources] == ["rosie.neck.pan", "rosie.neck.tilt"]

@@ -1,18 +1,18 @@
 """One port under two names in a robot file: both keys are in the refusal, and nothing is opened."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import serial  # noqa: F401 - virtual time replaces it only if it was imported before
 
 from tests.support.simulated_robots import HEAD, TAIL
-from tests.unit.drivers.tail_rig import TailRig
+from tests.unit.drivers.tail_rig import TailRig, rig
 from trade.errors import ConfigurationError
 from trade_drivers import Robot, check, load_driver, parse
 from trade_drivers.plugins._driver import Driver
 from trade_hil_sim import received
+
+__all__ = ["rig"]
 
 BOTH = HEAD + TAIL.split('"rosie"')[1]
 LEGS = """
@@ -59,12 +59,6 @@ def refusal(robot: Robot) -> str:
     with pytest.raises(ConfigurationError) as refused:
         check(robot)
     return str(refused.value)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TailRig]:
-    with ExitStack() as undo:
-        yield TailRig(tmp_path, undo)
 
 
 @pytest.mark.virtual_time

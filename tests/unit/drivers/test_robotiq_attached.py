@@ -1,14 +1,12 @@
 """What attaching to a gripper writes, and that nothing but `activate` activates it: rules S18 and S19."""
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.gripper_rig import HandRig, made_rig, silent
+from tests.unit.drivers.gripper_rig import HandRig, hand, rig, silent
 from trade.errors import (
     DeviceFault,
 )
@@ -16,14 +14,9 @@ from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug,
 
 pytestmark = pytest.mark.virtual_time
 
+__all__ = ["hand", "rig"]
+
 SLOW_M_S = 0.02
-
-
-@pytest.fixture
-def hand(tmp_path: Path) -> Iterator[HandRig]:
-    with made_rig(tmp_path) as made:
-        made.plug()
-        yield made
 
 
 def tell(bus: RobotiqBus, *values: int) -> None:

@@ -1,27 +1,19 @@
 """What happens to a gripper on a bad bus, and when the device itself fails, beyond what is in the table of faults."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 import trade_hil_sim as sim
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.gripper_rig import HandRig, made_rig
+from tests.unit.drivers.gripper_rig import HandRig, hand, rig
 from trade.errors import BusGone, DeviceError, DeviceSilent, TradeError
 from trade_drivers import Gripper, GripperState
 
 pytestmark = pytest.mark.virtual_time
 
+__all__ = ["hand", "rig"]
+
 SLOW_M_S = 0.02
-
-
-@pytest.fixture
-def hand(tmp_path: Path) -> Iterator[HandRig]:
-    with made_rig(tmp_path) as made:
-        made.plug()
-        yield made
 
 
 @pytest.fixture
@@ -63,16 +55,15 @@ def test_a_single_bad_answer_goes_unnoticed(hand: HandRig, gripper: Gripper, fau
     assert gripper.state().fault == ""
 
 
-def test_a_gripper_has_as_long_to_answer_as_its_measurements_may_be_old(tmp_path: Path) -> None:
-    with made_rig(tmp_path) as hand:
-        hand.configure(("baud = 115200", "baud = 115200\nstale_after_s = 2"))
-        hand.plug()
-        gripper = hand.active()
-        moving = closing(hand, gripper)
-        hand.sim.do(sim.Mute(count=6))
-        assert moving.wait().result.width_m == pytest.approx(0, abs=0.003)
-        hand.sim.do(sim.Mute(count=6))
-        assert gripper.open().width_m == pytest.approx(0.085, abs=0.003)
+def test_a_gripper_has_as_long_to_answer_as_its_measurements_may_be_old(rig: HandRig) -> None:
+    rig.configure(("baud = 115200", "baud = 115200\nstale_after_s = 2"))
+    rig.plug()
+    gripper = rig.active()
+    moving = closing(rig, gripper)
+    rig.sim.do(sim.Mute(count=6))
+    assert moving.wait().result.width_m == pytest.approx(0, abs=0.003)
+    rig.sim.do(sim.Mute(count=6))
+    assert gripper.open().width_m == pytest.approx(0.085, abs=0.003)
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -1,6 +1,5 @@
 """The contract of grippers on a 2F-85, and what is its own."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ import pytest
 from tests.support.simulated_robots import HAND, HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, written_now
-from tests.unit.drivers.gripper_rig import HandRig, made_rig
+from tests.unit.drivers.gripper_rig import HandRig, hand, rig
 from trade.errors import ConfigurationError, DeviceFault, MotionStopped
 from trade_drivers import Gripper, SerialBus, attach, parse
 from trade_drivers.testing import GripperContract
@@ -18,17 +17,7 @@ from trade_hil_sim.robotiq import _table as simulated
 
 pytestmark = pytest.mark.virtual_time
 
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[HandRig]:
-    with made_rig(tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def hand(rig: HandRig) -> HandRig:
-    rig.plug()
-    return rig
+__all__ = ["hand", "rig"]
 
 
 class TestRobotiqGripper(GripperContract):

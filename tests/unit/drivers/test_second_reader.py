@@ -5,20 +5,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 
 from tests.support.waiting import wait_until
-from tests.unit.drivers.tail_rig import TailRig
-from tests.unit.drivers.test_serial import Pair
+from tests.unit.drivers.tail_rig import TailRig, rig
+from tests.unit.drivers.test_serial import Pair, pair
 from trade.errors import DeviceSilent, TradeError
 from trade_drivers.bus._holders import holders
 from trade_drivers.bus._serial_port import LONGEST_WAIT_S, SerialLine
 from trade_hil_sim import Absent, received
 
 pytestmark = pytest.mark.realtime
+
+__all__ = ["pair", "rig"]
 
 READS = """
 import os, sys
@@ -48,19 +49,6 @@ def other_program(path: str, program: str = READS) -> Iterator[int]:
     finally:
         process.kill()
         process.communicate()
-
-
-@pytest.fixture
-def pair() -> Iterator[Pair]:
-    made = Pair()
-    yield made
-    made.unplug()
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TailRig]:
-    with ExitStack() as undo:
-        yield TailRig(tmp_path, undo)
 
 
 def refusal(act: Callable[[], object]) -> str:

@@ -183,24 +183,15 @@ def test_a_camera_that_does_not_answer_is_silent_and_is_back_by_itself(stage: St
     assert camera.image().data
 
 
-def test_a_picture_that_takes_too_long_is_none(tmp_path: Path) -> None:
+def test_a_picture_that_takes_too_long_or_trickles_in_is_given_up_in_time(tmp_path: Path) -> None:
     with ExitStack() as undo:
         stage = Stage(SEEN.replace("height_px = 120", "height_px = 120\ntimeout_s = 0.2"), tmp_path, undo)
         camera = stage.attach().camera("eye")
-        for fault in (Late(s=5.0), Mute()):
+        for fault in (Late(s=5.0), Mute(), faults.Dribble(s=0.05)):  # each byte in time, all of them in a minute
             stage.sims["eye"].do(fault)
             with pytest.raises(DeviceSilent):
                 camera.image()
             stage.sims["eye"].do(Heal())
-
-
-def test_a_picture_that_trickles_in_is_given_up_in_time(tmp_path: Path) -> None:
-    with ExitStack() as undo:
-        stage = Stage(SEEN.replace("height_px = 120", "height_px = 120\ntimeout_s = 0.2"), tmp_path, undo)
-        camera = stage.attach().camera("eye")
-        stage.sims["eye"].do(faults.Dribble(s=0.05))  # each byte in time, all of them in a minute
-        with pytest.raises(DeviceSilent):
-            camera.image()
 
 
 @pytest.mark.parametrize("fault", [Truncate(missing=20), Garbage(hex="00" * 8)], ids=["truncated", "garbage"])

@@ -7,20 +7,15 @@ from contextlib import suppress
 import pytest
 
 from tests.support.waiting import wait_until
-from tests.unit.drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
+from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from tests.unit.drivers.gate import Gate
-from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, TradeError
+from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, TradeError
 from trade_drivers import AttachedRobot, Motor
 from trade_hil_sim import BrownOut, Servo
 
 pytestmark = pytest.mark.realtime
 
 COUNTS_PER_RAD = 4096 / math.tau
-
-
-@pytest.fixture
-def robot(head: Rig) -> AttachedRobot:
-    return head.attach()
 
 
 def end_of(head: Rig, since: float = 0.0, device_id: int = 1) -> float:
@@ -125,19 +120,6 @@ def test_S04_positions_that_keep_coming_are_followed(head: Rig, robot: AttachedR
         group.servo([0.01 * step, -0.005 * step], 1.0)
     wait_until(lambda: abs(head.truth(1).position_rad - 0.59) < 0.01, "it has followed")
     assert head.truth(2).position_rad == pytest.approx(-0.295, abs=0.01)
-
-
-def test_S01_a_set_point_held_up_beyond_its_time_is_never_written(head: Rig, gate: Gate) -> None:
-    pan = head.attach(healthy=gate).motor("neck.pan")
-    pan.enable()
-    gate.hold_up()
-    mark = written_now()
-    late = Outcome(lambda: pan.set_velocity(0.5, 0.05))
-    with call(0.1) as expires_ns:
-        sleep_past(expires_ns)
-    gate.release()
-    assert isinstance(late.wait().error, DeadlineExceeded)
-    assert not head.moves(since=mark)
 
 
 def test_S08_a_stop_ends_a_set_point_and_what_was_under_way(head: Rig, gate: Gate) -> None:

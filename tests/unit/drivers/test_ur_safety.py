@@ -16,15 +16,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.arm_rig import FAR, SLOW, ArmRig, answers, arm_rig, children, free_rig
 from tests.unit.drivers.attached_arm import ARM, AT_HOME
 from tests.unit.drivers.conftest import Outcome, call, sleep_past, written_now
-from trade import Container, where
-from trade.errors import (
-    BusGone,
-    DeadlineExceeded,
-    DeviceFault,
-    DeviceSilent,
-    MotionStopped,
-    TradeError,
-)
+from trade import Container, errors, where
 from trade_drivers import Arm, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Absent, Local, Mute, Unplug, events, instructions
 
@@ -40,7 +32,7 @@ __all__ = ["arm_rig", "free_rig"]
 def test_S01_a_command_whose_time_has_passed_is_never_sent(rig: ArmRig) -> None:
     with call(0.2) as expires_ns:
         sleep_past(expires_ns)
-        with pytest.raises(DeadlineExceeded):
+        with pytest.raises(errors.DeadlineExceeded):
             rig.arm.move_joints(FAR)
     assert not rig.moves()
 
@@ -53,7 +45,7 @@ def test_S01_what_waits_in_the_process_that_commands_expires_there(rig: ArmRig) 
     late = Outcome(lambda: rig.arm.move_joints(FAR), deadline_s=0.1)
     sleep_past(int((mark + 0.15) * 1e9))
     os.kill(pid, signal.SIGCONT)
-    assert isinstance(late.wait().error, DeadlineExceeded | MotionStopped | DeviceFault)
+    assert isinstance(late.wait().error, errors.DeadlineExceeded | errors.MotionStopped | errors.DeviceFault)
     wait_until(lambda: answers(rig.arm, mark + 0.5), "time has passed")
     assert not rig.moves(mark)
 
@@ -106,7 +98,7 @@ def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchd
     rig.sim.do(Local())  # its dashboard takes no orders
     [pid] = children("control")
     os.kill(pid, signal.SIGKILL)
-    assert isinstance(moving.wait().error, DeviceFault)
+    assert isinstance(moving.wait().error, errors.DeviceFault)
     rig.comes_to_rest()
     assert events(rig.log, "watchdog_expired")
     wait_until(lambda: children("control"), "there is a new one")
@@ -140,7 +132,7 @@ def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_continue(
     assert len(rig.moves(asleep)) < 20  # a set-point that continues for its second is sent more than a hundred times
     mark = written_now()
     if how != "servo":  # whose call was answered when it began
-        assert isinstance(error, DeviceFault)
+        assert isinstance(error, errors.DeviceFault)
         assert "held up for 3600." in str(error)
     wait_until(lambda: answers(rig.arm, mark + 0.3), "time has passed")
     assert not rig.moves(mark)
@@ -181,9 +173,9 @@ def test_S07_a_stop_and_the_state_are_answered_at_once_while_a_lost_controller_i
     rig.sim.do(Unplug())
     wait_until(lambda: _is_gone(rig.arm), "it is noticed")
     for _ in range(20):
-        with pytest.raises(BusGone):
+        with pytest.raises(errors.BusGone):
             rig.arm.state()
-    with pytest.raises(BusGone):
+    with pytest.raises(errors.BusGone):
         rig.arm.stop()
     assert pid in children("control")  # no thread has waited for it
 
@@ -195,9 +187,9 @@ def test_S07_a_driver_is_closed_while_a_silent_controller_is_looked_for(
     rig.sim.do(Absent())
     wait_until(lambda: _is_gone(rig.arm), "it is noticed")
     wait_until(_freezes_who_looks, "there is a process that looks for it")
-    with pytest.raises(BusGone):
+    with pytest.raises(errors.BusGone):
         rig.arm.stop()
-    with suppress(TradeError):
+    with suppress(errors.TradeError):
         rig.robot.close()
     assert not children("states")
 
@@ -206,7 +198,7 @@ def test_S10_a_stop_goes_through_the_dashboard_and_the_process_that_commands(rig
     moving = rig.set_off()
     mark = written_now()
     rig.arm.stop()
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     assert not rig.moving
     assert [e for e in instructions(rig.log, "dashboard", since=mark) if e.detail.startswith("stop ->")]
     assert not rig.moves(mark)
@@ -218,7 +210,7 @@ def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_halts(r
     [pid] = children("control")
     os.kill(pid, signal.SIGSTOP)
     rig.arm.stop()
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     rig.comes_to_rest()
     wait_until(lambda: children("control") and children("control") != [pid], "it is killed and replaced")
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
@@ -228,7 +220,7 @@ def test_S10_a_dashboard_that_does_not_answer_does_not_hinder_a_stop(rig: ArmRig
     moving = rig.set_off()
     rig.sim.do(Mute(instruction="dashboard"))
     rig.arm.stop()
-    assert isinstance(moving.wait().error, MotionStopped)
+    assert isinstance(moving.wait().error, errors.MotionStopped)
     rig.comes_to_rest()
 
 
@@ -253,11 +245,6 @@ def shared(free: ArmRig, start_container: Callable[..., Container]) -> ArmRig:
 @pytest.fixture
 def planner(start_container: Callable[..., Container]) -> Container:
     return start_container("planner")
-
-
-@pytest.fixture
-def other(start_container: Callable[..., Container]) -> Container:
-    return start_container("other")
 
 
 def test_S05_set_points_end_with_their_session(
@@ -287,9 +274,9 @@ def test_S05_the_end_of_a_session_ends_freedrive(shared: ArmRig, start_container
 def _is_gone(arm: Arm) -> bool:
     try:
         arm.state()
-    except BusGone:
+    except errors.BusGone:
         return True
-    except DeviceSilent:
+    except errors.DeviceSilent:
         return False
     return False
 

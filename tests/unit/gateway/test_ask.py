@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from typer.testing import CliRunner
 
 from trade import Container, service, where
 from trade.errors import ConfigurationError, InvalidArgument
-from trade.testing import MemorySystem, memory_system
+from trade.testing import MemorySystem
 from trade_gateway.cli import app
 from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
 
@@ -40,12 +39,6 @@ class Head:
 
     @service(effect="stop")
     def stop(self) -> None: ...
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.policies import policy_text
 from tests.unit.gateway.asked_system import Arm, World, world
 from tests.unit.gateway.test_ask_sentences import sentences
 from trade import service, where
@@ -16,15 +17,7 @@ pytestmark = pytest.mark.virtual_time
 
 __all__ = ["world"]
 
-POLICY = """
-[roles.viewer]
-read = ["*"]
-[roles.robot]
-register = ["*"]
-[identities]
-olga = ["viewer"]
-tester = ["robot"]
-"""
+POLICY = policy_text("olga=viewer tester=robot", viewer="read=*", robot="register=*")
 
 
 def refused(talk: Talk, sentence: str) -> str:

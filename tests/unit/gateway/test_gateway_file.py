@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container
 from trade._security.certificates import Certificate
@@ -33,14 +34,7 @@ from trade_gateway.process._addresses import addresses, forwarding
 pytestmark = pytest.mark.virtual_time
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "gateway.toml"
-POLICY = """
-revoked_file = "revoked.toml"
-gateways = ["door"]
-[roles.viewer]
-read = ["*"]
-[identities]
-planner = ["viewer"]
-"""
+POLICY = policy_text("planner=viewer", head='revoked_file = "revoked.toml"\ngateways = ["door"]\n', viewer="read=*")
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.http_clients import Opened, govern, opened
+from tests.support.policies import EVERYTHING, policy_text
 from tests.support.two_joint_robot import Robot
 from tests.support.waiting import wait_until
 from tests.unit.gateway.moved_counter import Counter
@@ -15,31 +16,13 @@ from trade._audit.events import Event
 from trade.testing import memory_system
 from trade_gateway.supervisor import ChildInfo
 
-POLICY = """
-[roles.all]
-call = ["*"]
-read = ["*"]
-register = ["*"]
-lock = ["*"]
-administer = ["*"]
-instrument = ["*"]
-
-[roles.operator]
-read = ["*"]
-administer = ["trade", "hall"]
-
-[roles.viewer]
-read = ["*"]
-
-[roles.guest]
-read = ["robot.a"]
-
-[identities]
-bert = ["guest"]
-tester = ["all"]
-olga = ["operator"]
-vera = ["viewer"]
-"""
+POLICY = policy_text(
+    "bert=guest tester=all olga=operator vera=viewer",
+    all=EVERYTHING,
+    operator="read=* administer=trade,hall",
+    viewer="read=*",
+    guest="read=robot.a",
+)
 
 
 class Children:
@@ -95,9 +78,6 @@ class House:
     def places(self) -> list[str]:
         """Where counters are."""
         return [one.container for one in self.me.services(where(name="count", group="hall"))]
-
-    def switches(self) -> tuple[bool, bool]:
-        return self.worker.reach.discovers, self.worker.reach.broadcasts
 
 
 @pytest.fixture

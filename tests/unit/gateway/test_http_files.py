@@ -8,36 +8,19 @@ from typing import Any
 import pytest
 
 from tests.support.http_clients import Opened, govern, opened
+from tests.support.policies import EVERYTHING, policy_text
 from tests.support.two_joint_robot import Robot
 from trade.rules import Rules
 from trade.testing import memory_system
 from trade_gateway.cli.watching.rule_file import RuleFile
 
-POLICY = """
-[roles.all]
-call = ["*"]
-read = ["*"]
-register = ["*"]
-lock = ["*"]
-administer = ["*"]
-instrument = ["*"]
-
-[roles.operator]
-read = ["*"]
-administer = ["trade"]
-
-[roles.viewer]
-read = ["*"]
-
-[roles.guest]
-read = ["robot"]
-
-[identities]
-bert = ["guest"]
-tester = ["all"]
-olga = ["operator"]
-vera = ["viewer"]
-"""
+POLICY = policy_text(
+    "bert=guest tester=all olga=operator vera=viewer",
+    all=EVERYTHING,
+    operator="read=* administer=trade",
+    viewer="read=*",
+    guest="read=robot",
+)
 RULES = """
 [rule.go]
 when = { present = { group = "robot.a", name = "go_on" } }

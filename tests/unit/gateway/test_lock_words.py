@@ -1,7 +1,5 @@
 """The words of ``trade lock`` and its kind: help with examples, and what follows two dashes is left as it is."""
 
-import re
-
 import pytest
 from typer.testing import CliRunner
 
@@ -20,13 +18,6 @@ from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 from trade_gateway.cli._output import REMEDIES, say_error
 from trade_gateway.cli.motion._lock import _wanted
-
-
-@pytest.mark.parametrize("command", ["lock", "locks", "unlock", "resume", "estop"])
-def test_help_has_an_example(command: str) -> None:
-    said = CliRunner().invoke(app, [command, "--help"])
-    assert said.exit_code == 0
-    assert f"For example: trade {command}" in re.sub(r"\s+", " ", said.stdout)
 
 
 def test_the_usage_says_where_the_command_goes() -> None:

@@ -8,22 +8,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from tests.support.policies import policy_text
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
 
-POLICY = """
-revoked = ["thief"]
-[roles.viewer]
-read = ["*"]
-[roles.operator]
-includes = ["viewer"]
-call = ["rosie.neck"]
-[identities]
-planner = ["operator"]
-"dash-*" = ["viewer"]
-thief = ["operator"]
-"""
+POLICY = policy_text(
+    "planner=operator dash-*=viewer thief=operator",
+    head='revoked = ["thief"]\n',
+    viewer="read=*",
+    operator="includes=viewer call=rosie.neck",
+)
 
 
 @pytest.fixture
@@ -81,9 +76,3 @@ def test_show_lists_identities_with_what_they_may(policy: Path) -> None:
     table = re.sub(r" +", " ", run("show", "--policy", str(policy)).stdout)
     assert "planner operator rosie.neck *" in table
     assert "revoked: thief" in table
-
-
-@pytest.mark.parametrize("command", ["check", "show"])
-def test_help_has_an_example(command: str) -> None:
-    said = run(command, "--help")
-    assert f"For example: trade policy {command}" in re.sub(r"\s+", " ", said.stdout)

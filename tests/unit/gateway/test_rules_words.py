@@ -165,11 +165,6 @@ def test_an_empty_list_of_rules_is_reported(desk: Desk) -> None:
     assert json.loads(trade("rules", "list", "--json").stdout) == []
 
 
-@pytest.mark.parametrize("command", ["run", "test", "list"])
-def test_help_has_an_example(command: str) -> None:
-    assert f"For example: trade rules {command}" in re.sub(r"\s+", " ", trade("rules", command, "--help").stdout)
-
-
 @pytest.mark.realtime
 def test_nothing_is_left_of_rules_that_have_ended(run: Callable[..., Any], start_container: StartContainer) -> None:
     running, looker = run(), start_container("looker")

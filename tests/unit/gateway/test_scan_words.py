@@ -1,7 +1,6 @@
 """``trade scan`` and its kind: their words, what they show, and the robot file to begin with."""
 
 import json
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,13 +32,6 @@ def line(tmp_path: Path) -> Iterator[DynamixelBus]:
 
 def trade(*words: object) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words])
-
-
-@pytest.mark.parametrize("command", ["scan", "set-id", "set-baud", "calibrate", "doctor"])
-def test_help_has_an_example(command: str) -> None:
-    said = trade(command, "--help")
-    assert said.exit_code == 0
-    assert f"For example: trade {command}" in re.sub(r"\s+", " ", said.stdout)
 
 
 def test_ids_are_numbers_and_ranges() -> None:

@@ -18,7 +18,6 @@ pytestmark = pytest.mark.virtual_time
 TRIGGERS = '[[to_ros.service]]\ngroup = "rosie"\ntype = "std_srvs/srv/Trigger"\n'
 SWITCHES = '[[to_ros.service]]\ngroup = "rosie.head"\ntype = "std_srvs/srv/SetBool"\n'
 LOCKS = '[[to_ros.lock]]\ngroup = "rosie.head"\n'
-NO_GRACE = "[ros]\nversion = 2\ngrace_s = 0\n"
 
 
 def test_all_services_of_a_group_that_a_type_fits_are_offered(stand: Stand) -> None:

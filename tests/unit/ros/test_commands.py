@@ -14,7 +14,6 @@ pytestmark = pytest.mark.virtual_time
 FLOAT = "std_msgs/msg/Float64"
 COMMAND = '[[to_ros.command]]\ntopic = "/head"\ntype = "std_msgs/msg/Float64"\nservice = "rosie.head.go"\n'
 LONG = COMMAND + "deadman_s = 10\n"
-STOPS = '[[to_ros.service]]\ngroup = "rosie.head"\ntype = "std_srvs/srv/Trigger"\nnames = ["stop"]\n'
 LOCK = '[[to_ros.lock]]\ngroup = "rosie.head"\n'
 
 

@@ -238,12 +238,6 @@ def two(request: pytest.FixtureRequest, start_container: Callable[..., Container
 
 
 @pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
-
-
-@pytest.fixture
 def apart(memory: MemorySystem) -> Two:
     """Two containers in memory."""
     battery = Battery()

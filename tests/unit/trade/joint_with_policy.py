@@ -1,37 +1,20 @@
 """A joint behind a policy, in a system in memory: who may do what to it is in a file that a test may rewrite."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.support.policies import policy_text
 from trade import Container, Handle, Resource, service, where
-from trade.testing import MemorySystem, memory_system
 
-POLICY = """
-revoked = ["thief"]
-
-[roles.operator]
-includes = ["viewer"]
-call = ["rosie.neck"]
-lock = ["rosie.neck"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[roles.driver]
-register = ["rosie", "lab"]
-
-[roles.chief]
-administer = ["*"]
-register = ["rosie"]
-
-[identities]
-planner = ["operator"]
-dash = ["viewer"]
-drv = ["driver"]
-chief = ["chief"]
-"""
+POLICY = policy_text(
+    "planner=operator dash=viewer drv=driver chief=chief",
+    head='revoked = ["thief"]\n',
+    operator="includes=viewer call=rosie.neck lock=rosie.neck",
+    viewer="read=rosie",
+    driver="register=rosie,lab",
+    chief="administer=* register=rosie",
+)
 
 
 class Neck:
@@ -59,12 +42,6 @@ def policy(tmp_path: Path) -> Path:
     path = tmp_path / "policy.toml"
     path.write_text(POLICY)
     return path
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
 
 
 def find(container: Container, name: str, group: str = "rosie.neck") -> Handle:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.policies import policy_text
 from trade import Handle
 from trade.testing import MemorySystem, memory_system
 
@@ -93,21 +94,11 @@ class Bolted(Wheel):
     relocatable = False
 '''
 
-POLICY = """
-[roles.chief]
-administer = ["hall"]
-call = ["*"]
-read = ["*"]
-[roles.member]
-register = ["hall"]
-call = ["*"]
-read = ["*"]
-[identities]
-chief = ["chief"]
-old = ["member"]
-new = ["member"]
-dash = ["member"]
-"""
+POLICY = policy_text(
+    "chief=chief old=member new=member dash=member",
+    chief="administer=hall call=* read=*",
+    member="register=hall call=* read=*",
+)
 
 
 def imported(folder: Path, text: str = MODULE) -> ModuleType:

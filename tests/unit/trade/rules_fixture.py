@@ -72,9 +72,6 @@ class Engine:
     def next(self) -> Firing:
         return self._reported.get(timeout=20)
 
-    def quiet(self) -> bool:
-        return self._reported.empty()
-
 
 TELL = 'do = [{ call = { name = "tell" }, args = ["$service", "$container"] }]'
 NOTE = 'do = [{ call = { name = "note" }, args = ["x"] }]'

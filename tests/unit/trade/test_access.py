@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.unit.trade.joint_with_policy import Neck, find, memory, policy, rewritten
+from tests.unit.trade.joint_with_policy import Neck, find, policy, rewritten
 from trade import CallModel, Container, Estop, Handle, Settings, service, where
 from trade._container.builtin_services import OwnServices
 from trade._context.call_context import CallContext, running
@@ -23,7 +23,7 @@ from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
-__all__ = ["memory", "policy"]
+__all__ = ["policy"]
 
 Member = Callable[[str], Container]
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 import pytest
 import zenoh
 
+from tests.support.policies import policy_text
 from trade import Container, Settings, service, where
 from trade._security.network_crossings import crossings
 from trade._security.policy import Policy, Role
@@ -27,26 +28,13 @@ from trade._transport.zenoh import ZenohTransport, configuration
 
 pytestmark = pytest.mark.virtual_time
 
-POLICY: Final = """
-revoked = ["thief"]
-
-[roles.operator]
-call = ["rosie.neck", "lab"]
-read = ["rosie.neck"]
-
-[roles.driver]
-register = ["rosie.neck"]
-
-[roles.viewer]
-read = ["lab"]
-
-[identities]
-planner = ["operator"]
-drv = ["driver"]
-dash = ["viewer"]
-mallory = ["operator", "driver"]
-thief = ["operator", "driver"]
-"""
+POLICY: Final = policy_text(
+    "planner=operator drv=driver dash=viewer mallory=operator,driver thief=operator,driver",
+    head='revoked = ["thief"]\n',
+    operator="call=rosie.neck,lab read=rosie.neck",
+    driver="register=rosie.neck",
+    viewer="read=lab",
+)
 SYSTEM: Final = "rules"
 STAR: Final = ("planner", "drv", "dash", "mallory")
 HEARD: Final = ("stream/rosie.neck/*/*/*/*/*/*", "stream/rosie.neck.$*/*/*/*/*/*/*", "stream/**")

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.policies import policy_text
 from trade import Container, Settings, where
 from trade._migration.delivered_code import CodeStore, hash_of, pack
 from trade._transport.memory import MemoryTransport, Network
@@ -24,21 +25,7 @@ class Lamp:
     def shine(self) -> str:
         return "bright"
 """
-POLICY = """
-[roles.chief]
-administer = ["*"]
-register = ["*"]
-read = ["*"]
-call = ["*"]
-
-[roles.guest]
-read = ["*"]
-call = ["*"]
-
-[identities]
-anna = ["chief"]
-guest = ["guest"]
-"""
+POLICY = policy_text("anna=chief guest=guest", chief="administer=* register=* read=* call=*", guest="read=* call=*")
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.unit.trade.conftest import StartProgram
 from trade import Container, Resource, Settings, permit, service, where
@@ -20,18 +21,12 @@ from trade.errors import CannotConnect, ConfigurationError, LockedByOther, NoSuc
 
 StartContainer = Callable[..., Container]
 
-POLICY = """
-gateways = ["door"]
-[roles.operator]
-call = ["robot"]
-read = ["robot"]
-[roles.driver]
-register = ["robot"]
-[identities]
-planner = ["operator"]
-mallory = ["operator"]
-arm = ["driver"]
-"""
+POLICY = policy_text(
+    "planner=operator mallory=operator arm=driver",
+    head='gateways = ["door"]\n',
+    operator="call=robot read=robot",
+    driver="register=robot",
+)
 
 
 class Joint:

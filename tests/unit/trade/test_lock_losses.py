@@ -7,18 +7,9 @@ import pytest
 
 from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
-from trade import Handle, where
+from trade import Handle, errors, where
 from trade._protocol.keys import Address
 from trade._resources.resource import Latch
-from trade.errors import (
-    ConfigurationError,
-    LockedByOther,
-    LockLost,
-    NoSuchService,
-    NotStopped,
-    ServiceGone,
-    Stopped,
-)
 
 pytestmark = pytest.mark.virtual_time
 
@@ -27,23 +18,23 @@ pytestmark = pytest.mark.virtual_time
 
 class Losses:
     def __init__(self) -> None:
-        self.reported: list[LockLost] = []
+        self.reported: list[errors.LockLost] = []
 
-    def __call__(self, lost: LockLost) -> None:
+    def __call__(self, lost: errors.LockLost) -> None:
         self.reported.append(lost)
 
 
 @pytest.mark.parametrize("victim", ["a", "b"])
 def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot, victim: str) -> None:
     losses, rest = Losses(), "b" if victim == "a" else "a"
-    with pytest.raises(LockLost), robot.me.lock(WHOLE, lease_s=60, on_lost=losses) as lock:
+    with pytest.raises(errors.LockLost), robot.me.lock(WHOLE, lease_s=60, on_lost=losses) as lock:
         robot.find(rest, "go_on")(0.1)
         handle = robot.find(rest)
         robot.system.kill(victim)
         assert robot[rest].stopped.wait(20)
         wait_until(lambda: losses.reported)
         assert not lock.held
-        with pytest.raises(LockLost, match=f"container {victim} has ended"):
+        with pytest.raises(errors.LockLost, match=f"container {victim} has ended"):
             handle(0.2)
     assert robot[rest].written == []
     wait_until(lambda: robot.other.locks() == [])
@@ -72,7 +63,7 @@ def test_S12_a_partition_ends_the_lock_on_both_sides(robot: Robot) -> None:
     with robot.other.lock(WHOLE, wait_s=20):
         robot.system.heal()
         robot.system.settle()
-        with lock.use(), pytest.raises(LockLost):
+        with lock.use(), pytest.raises(errors.LockLost):
             robot.find("b")(0.5)
     assert robot["b"].written == []
 
@@ -83,7 +74,7 @@ def test_S12_on_waking_locks_that_could_not_be_renewed_are_lost_before_anything_
     lock, handle = robot.me.lock([robot.find("a")], lease_s=60).acquire(), robot.find("a")
     before = robot.system.sent()
     lock._confirmed = {address: at - 60 for address, at in lock._confirmed.items()}
-    with lock.use(), pytest.raises(LockLost, match="could not be renewed within its lease"):
+    with lock.use(), pytest.raises(errors.LockLost, match="could not be renewed within its lease"):
         handle(0.1)
     assert robot["a"].written == []
     assert robot.system.sent() - before <= 2  # its release and the answer, no call
@@ -103,7 +94,7 @@ def test_renewals_continue_after_one_to_a_container_that_left(robot: Robot, monk
     def service_of(address: Address, name: str) -> Handle:
         if name == "renew" and address.container == "a":
             gone.append(address)
-            raise ServiceGone(service="renew")
+            raise errors.ServiceGone(service="renew")
         return real(address, name)
 
     monkeypatch.setattr(keeper, "_service", service_of)
@@ -140,7 +131,7 @@ def test_a_part_lost_while_waiting_for_the_rest_makes_no_lock(robot: Robot) -> N
     def acquire() -> None:
         try:
             lock.acquire()
-        except LockLost as error:
+        except errors.LockLost as error:
             outcome.append(error)
 
     waiting = threading.Thread(target=acquire)
@@ -161,7 +152,7 @@ def test_S14_a_device_that_could_not_be_stopped_cannot_be_locked_until_resume(ro
     with lock.use():
         robot.find("a", "go_on")(0.1)
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
-    with pytest.raises(NotStopped, match=r"could not be stopped at .* so no client can lock it"):
+    with pytest.raises(errors.NotStopped, match=r"could not be stopped at .* so no client can lock it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
     [info] = robot.other.locks()
     assert (info.resources, info.holder.owner) == (("a",), "nobody")  # plain: nobody
@@ -176,11 +167,11 @@ def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot
     with robot.me.lock(WHOLE):
         robot.find("a")(0.1)
         robot.find("a", "stop", robot.other)()
-        with pytest.raises(Stopped):
+        with pytest.raises(errors.Stopped):
             robot.find("a")(0.2)
         [stop] = robot.other.call(where(name="stops", container=robot.find("a").container))
         assert (stop.resource, stop.by, stop.estop) == ("a", "tester", False)
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             robot.other.resume(WHOLE)
         assert robot.me.resume(WHOLE) == ["a"]
         assert robot.other.call(where(name="stops", container=robot.find("a").container)) == []
@@ -193,10 +184,10 @@ def test_resuming_waits_for_what_it_names_and_says_what_looks_like_it(robot: Rob
     timer = threading.Timer(0.1, lambda: robot.system.container("late").register(late, "hall.late"))
     timer.start()
     assert robot.me.resume(where(group="hall"), wait_s=20) == ["late"]
-    with pytest.raises(NoSuchService, match=r"hall\.late") as refused:
+    with pytest.raises(errors.NoSuchService, match=r"hall\.late") as refused:
         robot.me.resume(where(group="hall.lat"), wait_s=0)
     assert refused.value.near == ("hall.late",)
-    with pytest.raises(ConfigurationError, match="nothing that matches actuates, so there is nothing to resume"):
+    with pytest.raises(errors.ConfigurationError, match="nothing that matches actuates, so there is nothing to resume"):
         robot.me.resume(where(group="robot", name="where_is_it"), wait_s=0)
 
 
@@ -218,11 +209,11 @@ def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: R
 
 def test_each_refusal_is_an_error_of_its_own(robot: Robot) -> None:
     """One that is raised again keeps every frame that it went through, and what is in them."""
-    handle, refusals = robot.find("a"), list[LockLost]()
-    with pytest.raises(LockLost), robot.me.lock([handle], lease_s=60):
+    handle, refusals = robot.find("a"), list[errors.LockLost]()
+    with pytest.raises(errors.LockLost), robot.me.lock([handle], lease_s=60):
         robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
         for _ in range(5):
-            with pytest.raises(LockLost) as refused:
+            with pytest.raises(errors.LockLost) as refused:
                 handle(0.1)
             refusals.append(refused.value)
     assert len(set(map(id, refusals))) == 5
@@ -233,10 +224,10 @@ def test_a_refused_call_marks_the_lock_as_lost_immediately(robot: Robot) -> None
     losses, handle = Losses(), robot.find("a")
     lock = robot.me.lock(WHOLE, lease_s=60, on_lost=losses).acquire()
     robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
-    with lock.use(), pytest.raises(LockLost, match="to see"):
+    with lock.use(), pytest.raises(errors.LockLost, match="to see"):
         handle(0.1)
     assert not lock.held  # which a renewal would tell in 15 s
-    with pytest.raises(LockLost, match="to see"):
+    with pytest.raises(errors.LockLost, match="to see"):
         lock.check()
     wait_until(lambda: losses.reported)
     wait_until(lambda: robot.other.locks() == [])
@@ -247,12 +238,15 @@ def test_a_lock_of_ones_own_container_learns_of_a_refusal_at_once(robot: Robot) 
     handle = robot.find("own")
     lock = robot.me.lock([handle], lease_s=60).acquire()
     robot.other.break_lock([robot.find("own", whose=robot.other)], "to see")
-    with lock.use(), pytest.raises(LockLost, match="to see"):
+    with lock.use(), pytest.raises(errors.LockLost, match="to see"):
         handle(0.1)
     assert not lock.held
 
 
 def test_giving_back_what_was_taken_away_meanwhile_says_so(robot: Robot) -> None:
-    with pytest.raises(LockLost, match="not held any more when it was given back"), robot.me.lock(WHOLE, lease_s=60):
+    with (
+        pytest.raises(errors.LockLost, match="not held any more when it was given back"),
+        robot.me.lock(WHOLE, lease_s=60),
+    ):
         robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
     assert robot.other.locks() == []

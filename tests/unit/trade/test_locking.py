@@ -12,16 +12,10 @@ import pytest
 
 from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
-from trade import Container, Handle, permit, service, where
+from trade import Container, Handle, errors, permit, service, where
 from trade._locks import api
 from trade._protocol.keys import ServiceKey
 from trade._resources.grants import LockRequest
-from trade.errors import (
-    ConfigurationError,
-    IncompleteGroup,
-    LockedByOther,
-    NoSuchService,
-)
 from trade.testing import memory_system
 
 pytestmark = pytest.mark.virtual_time
@@ -32,13 +26,13 @@ def test_S13_services_of_several_containers_are_locked_together_or_not_at_all(ro
         assert lock.resources == ("a", "b")
         assert (robot.find("a")(0.1), robot.find("b")(0.2)) == (0.1, 0.2)
         for name in "ab":
-            with pytest.raises(LockedByOther, match="is locked by tester/me for 'walk'") as refused:
+            with pytest.raises(errors.LockedByOther, match="is locked by tester/me for 'walk'") as refused:
                 robot.find(name, whose=robot.other)(0.9)
             assert (refused.value.resources, refused.value.own) == ([name], False)
             assert refused.value.since > 0
     assert robot.find("a", whose=robot.other)(0.3) == 0.3
     with robot.other.lock(where(group="robot.b")):
-        with pytest.raises(LockedByOther), robot.me.lock(WHOLE, wait_s=0):
+        with pytest.raises(errors.LockedByOther), robot.me.lock(WHOLE, wait_s=0):
             pass
         assert robot.find("a", whose=robot.other)(0.4) == 0.4  # nothing of it stayed locked
     assert robot.me.locks() == []
@@ -46,10 +40,10 @@ def test_S13_services_of_several_containers_are_locked_together_or_not_at_all(ro
 
 def test_a_lock_is_only_held_once_it_is_whole(robot: Robot) -> None:
     lock = robot.me.lock(where(group="nothing.there"), wait_s=0)
-    with pytest.raises(NoSuchService):
+    with pytest.raises(errors.NoSuchService):
         lock.acquire()
     assert not lock.held
-    with pytest.raises(ConfigurationError, match="a lock is taken once"):
+    with pytest.raises(errors.ConfigurationError, match="a lock is taken once"):
         lock.acquire()
 
 
@@ -73,7 +67,7 @@ def test_P51_how_a_lock_is_used_is_seen_from_elsewhere(robot: Robot) -> None:
         assert seen() == {"a": (0, 0.0), "b": (0, 0.0)}
         for _ in range(2):
             robot.find("a")(0.1)
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             robot.find("b", whose=robot.other)(0.9)
         used = seen()
         assert (used["a"][0], used["b"]) == (2, (0, 0.0))
@@ -107,7 +101,7 @@ def test_S15_another_thread_needs_use_and_the_refusal_says_so(robot: Robot) -> N
     def without() -> None:
         try:
             handle(0.1)
-        except LockedByOther as error:
+        except errors.LockedByOther as error:
             outcomes.append(error)
 
     def with_use() -> None:
@@ -130,7 +124,7 @@ def test_async_with_and_its_tasks(robot: Robot) -> None:
     async def main() -> list[float]:
         async with robot.me.lock([handle]):
             results = await asyncio.gather(handle.acall(0.1), handle.acall(0.2))
-            with pytest.raises(LockedByOther):
+            with pytest.raises(errors.LockedByOther):
                 await robot.find("a", whose=robot.other).acall(0.3)
         await robot.find("a", whose=robot.other).acall(0.4)
         return results
@@ -205,13 +199,13 @@ def test_S15_nested_calls_inherit_while_the_parent_runs_and_no_longer(robot: Rob
     provider, pass_on = relay(robot)
     with robot.me.lock([robot.find("a")]):
         assert pass_on(0.1) == 0.1
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             provider.later()
 
 
 def test_S15_a_lock_is_used_by_delegates_only(robot: Robot) -> None:
     _, pass_on = relay(robot, identity="servant")
-    with robot.me.lock([robot.find("a")]), pytest.raises(LockedByOther):
+    with robot.me.lock([robot.find("a")]), pytest.raises(errors.LockedByOther):
         pass_on(0.1)
     with robot.me.lock([robot.find("a")], delegates=["servant"]):
         assert pass_on(0.2) == 0.2
@@ -220,7 +214,7 @@ def test_S15_a_lock_is_used_by_delegates_only(robot: Robot) -> None:
 def test_S15_a_plain_python_call_has_no_lock_even_on_behalf_of_its_owner(robot: Robot) -> None:
     provider, _ = relay(robot)
     provider.plain = lambda: robot["a"].move(0.5)
-    with robot.me.lock([robot.find("a")]), pytest.raises(LockedByOther):
+    with robot.me.lock([robot.find("a")]), pytest.raises(errors.LockedByOther):
         robot.me.find(where(name="call_plainly"), wait_s=20)()
     robot["a"].move(0.5)
 
@@ -244,7 +238,7 @@ def test_S15_a_thread_that_a_provider_leaves_running_has_no_permit_any_more() ->
         linger = me.find(where(name="linger"), wait_s=20)
         with me.lock([linger]):
             linger()
-            with pytest.raises(LockedByOther):
+            with pytest.raises(errors.LockedByOther):
                 joint.later()
 
 
@@ -339,7 +333,7 @@ def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot)
             assert inner.held
             assert robot.find("a")(0.1) == 0.1
         assert outer.held
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             robot.find("a", whose=robot.other)(0.2)
 
 
@@ -378,7 +372,7 @@ def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
     robot: Robot, walker: Callable[[str], Handle]
 ) -> None:
     """By default a lock waits as long as a call lasts: its owner and purpose are reported all the same."""
-    refused = pytest.raises(LockedByOther, match="is locked by tester/other for 'dance'")
+    refused = pytest.raises(errors.LockedByOther, match="is locked by tester/other for 'dance'")
     with robot.other.lock(WHOLE, purpose="dance"), refused:
         walker("walk")()
     assert robot.me.locks() == []
@@ -387,16 +381,16 @@ def test_S13_a_lock_wait_in_a_service_fails_before_the_deadline_of_its_call(
 def test_a_direct_lock_request_to_a_container_is_answered_in_time(robot: Robot) -> None:
     """As containers in other languages do, whose wait may be the deadline of the call."""
     acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
-    with robot.other.lock(WHOLE, purpose="dance"), pytest.raises(LockedByOther, match="for 'dance'"):
+    with robot.other.lock(WHOLE, purpose="dance"), pytest.raises(errors.LockedByOther, match="for 'dance'"):
         robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], LockRequest(wait_s=1.5))
 
 
 def test_a_service_that_waits_in_vain_fails_before_the_deadline_of_its_call(
     walker: Callable[[str], Handle],
 ) -> None:
-    with pytest.raises(NoSuchService, match=r"nothing\.there"):
+    with pytest.raises(errors.NoSuchService, match=r"nothing\.there"):
         walker("walk_what_is_not_there")()
-    with pytest.raises(NoSuchService, match="not_there"):
+    with pytest.raises(errors.NoSuchService, match="not_there"):
         walker("look_for")("not_there")
 
 
@@ -411,21 +405,21 @@ class _Eye:
 
 def test_a_single_handle_is_refused_with_what_to_write_instead(robot: Robot) -> None:
     handle: Any = robot.find("a")
-    with pytest.raises(ConfigurationError, match=r"lock\(\[handle\]\)"):
+    with pytest.raises(errors.ConfigurationError, match=r"lock\(\[handle\]\)"):
         robot.me.lock(handle).acquire()
 
 
 def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
     for nothing in ([], where(group="robot", name="where_is_it")):
-        with pytest.raises(ConfigurationError):
+        with pytest.raises(errors.ConfigurationError):
             robot.me.lock(nothing).acquire()
 
 
 def test_S16_a_lock_of_an_unknown_group_suggests_a_known_group(robot: Robot) -> None:
-    with pytest.raises(NoSuchService, match="Did you mean robot") as refused:
+    with pytest.raises(errors.NoSuchService, match="Did you mean robot") as refused:
         robot.me.lock(where(group="robt"), wait_s=0).acquire()
     assert robot.me.locks() == []
-    assert not isinstance(refused.value, ConfigurationError)
+    assert not isinstance(refused.value, errors.ConfigurationError)
 
 
 def test_S16_a_lock_waits_until_its_group_is_complete(robot: Robot) -> None:
@@ -456,7 +450,7 @@ def test_S16_a_lock_of_an_incomplete_group_names_the_missing_member_at_its_timeo
         taken = waiting.submit(lock.acquire)
         wait_until(lambda: bool(robot.me._parts.registry._changed._gates), "it waits")
         head.register(joint, "rosie.head")
-        with pytest.raises(IncompleteGroup, match="tilt"):
+        with pytest.raises(errors.IncompleteGroup, match="tilt"):
             taken.result(20)
     assert robot.me.locks() == []
 
@@ -492,7 +486,7 @@ def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) 
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
     robot.system.container("head").register(joint, "rosie.head")
     robot.me.find(where(group="rosie.head", name="move"), wait_s=20)
-    with pytest.raises(IncompleteGroup, match="tilt"):
+    with pytest.raises(errors.IncompleteGroup, match="tilt"):
         robot.me.lock(where(group="rosie")).acquire()
     with robot.me.lock(where(group="rosie"), partial=True) as lock:
         assert lock.resources == ("pan",)
@@ -504,12 +498,12 @@ def test_S17_reading_stays_open_unless_it_is_locked_by_its_handle(robot: Robot) 
         assert read() == 0.0
     with robot.me.lock([mine]):
         assert mine() == 0.0
-        with pytest.raises(LockedByOther):
+        with pytest.raises(errors.LockedByOther):
             read()
 
 
 def test_each_client_may_stop(robot: Robot) -> None:
-    with pytest.raises(ConfigurationError, match="cannot be locked"):
+    with pytest.raises(errors.ConfigurationError, match="cannot be locked"):
         robot.me.lock([robot.find("a", "stop")]).acquire()
     with robot.me.lock(WHOLE):
         robot.find("a", "stop", robot.other)()

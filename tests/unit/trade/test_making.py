@@ -1,25 +1,15 @@
 """Objects made on request, of classes that a container allows; their end, and that of a container."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import trade
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
-from trade import Container, Handle, Settings, where
-from trade.errors import (
-    AccessDenied,
-    CannotInstantiate,
-    ConfigurationError,
-    InUse,
-    NoSuchClass,
-    NoSuchService,
-    NotInstantiable,
-    ServiceGone,
-)
-from trade.testing import MemorySystem, memory_system
+from trade import Container, Handle, Settings, errors, where
+from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
@@ -117,18 +107,9 @@ class Mute:
 number = 3
 """
 
-POLICY = """
-[roles.chief]
-administer = ["*"]
-[roles.driver]
-register = ["*"]
-[roles.viewer]
-read = ["*"]
-[identities]
-chief = ["chief", "viewer"]
-maker = ["driver"]
-dash = ["viewer"]
-"""
+POLICY = policy_text(
+    "chief=chief,viewer maker=driver dash=viewer", chief="administer=*", driver="register=*", viewer="read=*"
+)
 
 
 @pytest.fixture
@@ -143,12 +124,6 @@ def events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     import importlib
 
     return importlib.import_module("workshop").events
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
 
 
 @pytest.fixture
@@ -226,27 +201,27 @@ def test_a_container_that_was_closed_remains_the_default_one_until_another_one_h
             maker.system.instantiate("workshop:Lamp")
             [home, _] = maker.system.instantiate("workshop:Watcher")
             assert home()[0] == name
-    with pytest.raises(ConfigurationError, match="closed"):
+    with pytest.raises(errors.ConfigurationError, match="closed"):
         trade.services()  # not in another system, which a thread that still runs would start
 
 
 def test_a_container_makes_only_what_its_settings_allow(memory: MemorySystem, events: list[str]) -> None:
-    with pytest.raises(NotInstantiable, match=r"It allows no class\. Start it with `trade container --allow"):
+    with pytest.raises(errors.NotInstantiable, match=r"It allows no class\. Start it with `trade container --allow"):
         memory.container("plain").system.instantiate("workshop:Lamp")
 
 
 @pytest.mark.parametrize(
     ("path", "kind", "complaint"),
     [
-        ("subprocess:Popen", NotInstantiable, "may not create a subprocess:Popen. It allows only workshop:"),
-        ("workshop:Lantern", NoSuchClass, "workshop has no such class"),
-        ("workshop:number", NoSuchClass, "workshop has no such class"),
-        ("workshop:Popen", NoSuchClass, "it is defined as subprocess:Popen"),
-        ("workshop:subprocess.Popen", NoSuchClass, "it is defined as subprocess:Popen"),
-        ("workshop:", NoSuchClass, "a path looks like package.module:Class"),
-        ("gone.away:It", NoSuchClass, "No module named 'gone'"),
-        ("broken:It", CannotInstantiate, "RuntimeError: not today"),
-        ("needy:It", CannotInstantiate, "No module named 'no_such_package_anywhere'"),
+        ("subprocess:Popen", errors.NotInstantiable, "may not create a subprocess:Popen. It allows only workshop:"),
+        ("workshop:Lantern", errors.NoSuchClass, "workshop has no such class"),
+        ("workshop:number", errors.NoSuchClass, "workshop has no such class"),
+        ("workshop:Popen", errors.NoSuchClass, "it is defined as subprocess:Popen"),
+        ("workshop:subprocess.Popen", errors.NoSuchClass, "it is defined as subprocess:Popen"),
+        ("workshop:", errors.NoSuchClass, "a path looks like package.module:Class"),
+        ("gone.away:It", errors.NoSuchClass, "No module named 'gone'"),
+        ("broken:It", errors.CannotInstantiate, "RuntimeError: not today"),
+        ("needy:It", errors.CannotInstantiate, "No module named 'no_such_package_anywhere'"),
     ],
 )
 def test_what_is_not_made_says_why(asker: Container, path: str, kind: type[Exception], complaint: str) -> None:
@@ -256,12 +231,12 @@ def test_what_is_not_made_says_why(asker: Container, path: str, kind: type[Excep
 
 def test_a_constructor_that_fails_leaves_nothing(asker: Container) -> None:
     with pytest.raises(
-        CannotInstantiate, match="workshop:Lamp could not be created in container maker: ValueError: a lamp"
+        errors.CannotInstantiate, match="workshop:Lamp could not be created in container maker: ValueError: a lamp"
     ):
         ask(asker, "instantiate", "workshop:Lamp", [-1])
-    with pytest.raises(CannotInstantiate, match="TypeError"):
+    with pytest.raises(errors.CannotInstantiate, match="TypeError"):
         ask(asker, "instantiate", "workshop:Lamp", {"amperes": 1})
-    with pytest.raises(NoSuchService):
+    with pytest.raises(errors.NoSuchService):
         asker.find(where(kind="Lamp"), wait_s=0)
 
 
@@ -269,7 +244,7 @@ def test_a_constructor_that_fails_leaves_nothing(asker: Container) -> None:
 def test_what_cannot_be_registered_is_closed_again(
     asker: Container, events: list[str], path: str, groups: tuple[str, ...]
 ) -> None:
-    with pytest.raises(ConfigurationError):
+    with pytest.raises(errors.ConfigurationError):
         ask(asker, "instantiate", path, (), groups)
     assert events == ["closed"]
 
@@ -284,9 +259,9 @@ def test_what_was_made_is_terminated_at_rest_and_closed(
     assert events == ["turns", "stopped", "closed"]
     assert "Wheel could not be closed" in caplog.text
     memory.settle()
-    with pytest.raises(ServiceGone):
+    with pytest.raises(errors.ServiceGone):
         handles["turn"]()
-    with pytest.raises(ConfigurationError, match="not made by instantiate"):
+    with pytest.raises(errors.ConfigurationError, match="not made by instantiate"):
         ask(asker, "terminate", handles["turn"])
 
 
@@ -304,7 +279,7 @@ def test_only_what_was_made_there_is_terminated(asker: Container, maker: Contain
     clock = asker.find(where(name="clock", container="maker"))
     [kind] = ask(asker, "instantiate", "workshop:Lamp")
     for wrong in (clock, asker.find(where(name="clock", container="asker"))):
-        with pytest.raises(ConfigurationError, match="not made by instantiate"):
+        with pytest.raises(errors.ConfigurationError, match="not made by instantiate"):
             ask(asker, "terminate", wrong)
     maker.system.terminate(kind)
 
@@ -334,12 +309,12 @@ def test_what_is_to_end_only_at_rest_is_left_while_it_moves_or_is_locked(
     handles = {one.name: one for one in ask(asker, "instantiate", "workshop:Wheel", (), ["cart"])}
     memory.settle()
     handles["turn"]()
-    with pytest.raises(InUse, match="wheel moves"):
+    with pytest.raises(errors.InUse, match="wheel moves"):
         ask(asker, "terminate_container", "", True)
     handles["stop"]()
     with (
         asker.lock(where(group="cart"), purpose="parade"),
-        pytest.raises(InUse, match=r"wheel is locked by .*asker for 'parade'"),
+        pytest.raises(errors.InUse, match=r"wheel is locked by .*asker for 'parade'"),
     ):
         ask(asker, "terminate_container", "", True)
     assert events == ["turns", "stopped"]
@@ -389,11 +364,11 @@ def test_S18_what_does_not_take_its_state_or_moves_by_it_is_not_offered_and_clos
     asker: Container, memory: MemorySystem, events: list[str], hour: int
 ) -> None:
     said = {25: "ValueError: no such hour", 13: "LockedByOther"}[hour]
-    with pytest.raises(CannotInstantiate, match=said):
+    with pytest.raises(errors.CannotInstantiate, match=said):
         ask(asker, "instantiate", STATEFUL, (), ["hall"], {"hour": hour})
     memory.settle()
     assert events == ["clock closed"]
-    with pytest.raises(NoSuchService):
+    with pytest.raises(errors.NoSuchService):
         asker.find(where(kind="Clock"), wait_s=0)
 
 
@@ -416,7 +391,7 @@ def test_the_asked_container_refuses_a_client_that_may_not_administer(
 ) -> None:
     dash = memory.container("careless", identity="dash")
     memory.settle()
-    with pytest.raises(AccessDenied, match=f"dash may not administer trade.{name}"):
+    with pytest.raises(errors.AccessDenied, match=f"dash may not administer trade.{name}"):
         ask(dash, name, *args)
     assert maker.healthy()
     assert events == []
@@ -430,9 +405,9 @@ def test_a_client_that_has_lost_the_role_meanwhile_is_refused(
     [kind] = ask(careless, "instantiate", "workshop:Lamp", (), ["hall"])
     governed.write_text(POLICY.replace('chief = ["chief", "viewer"]', 'chief = ["viewer"]'))
     maker.load_policy(governed)
-    with pytest.raises(AccessDenied, match=r"chief may not administer trade.instantiate"):
+    with pytest.raises(errors.AccessDenied, match=r"chief may not administer trade.instantiate"):
         ask(careless, "instantiate", "workshop:Lamp", (), ["hall"])
-    with pytest.raises(AccessDenied, match=r"chief may not administer trade.terminate"):
+    with pytest.raises(errors.AccessDenied, match=r"chief may not administer trade.terminate"):
         ask(careless, "terminate", kind)
     assert maker.find(where(name="kind")) == kind
 
@@ -442,7 +417,7 @@ def test_a_container_offers_what_it_makes_by_its_own_rights(
 ) -> None:
     governed.write_text(POLICY.replace('register = ["*"]', 'register = ["garage"]'))
     maker.load_policy(governed)
-    with pytest.raises(AccessDenied, match="maker may not register Lamp in hall"):
+    with pytest.raises(errors.AccessDenied, match="maker may not register Lamp in hall"):
         ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
     assert events == ["closed"]
 

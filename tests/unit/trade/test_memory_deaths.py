@@ -212,18 +212,10 @@ class Storm:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_all_registries_are_the_same_after_a_storm_of_registrations(seed: int) -> None:
+@pytest.mark.parametrize("faults", [False, True], ids=["registrations", "partitions and deaths"])
+def test_all_registries_are_the_same_after_a_storm(seed: int, faults: bool) -> None:
     with memory_system(seed=seed) as system:
-        storm = Storm(system, seed, faults=False)
-        storm.rage(60)
-        assert storm.over()
-        assert len(labels(system.container("a"))) == storm.count()
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_all_registries_are_the_same_after_a_storm_with_partitions_and_deaths(seed: int) -> None:
-    with memory_system(seed=seed) as system:
-        storm = Storm(system, seed, faults=True)
-        storm.rage(80)
+        storm = Storm(system, seed, faults=faults)
+        storm.rage(80 if faults else 60)
         assert storm.over()
         assert len(labels(system.container("a"))) == storm.count()

@@ -2,39 +2,22 @@
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from tests.support.waiting import wait_until
 from tests.unit.trade.moving_providers import MODULE, Scene, imported
-from trade import Container, Handle, where
+from trade import Handle, errors, where
 from trade._migration import quiesce, target
 from trade._migration.factory import path_of
-from trade.errors import (
-    AccessDenied,
-    Busy,
-    CannotInstantiate,
-    CannotMigrate,
-    ConfigurationError,
-    ContainerLost,
-    DeadlineExceeded,
-    LockedByOther,
-    NoSuchClass,
-    NoSuchService,
-    NotInstantiable,
-    ServiceGone,
-    Stopped,
-    TradeError,
-)
 
 pytestmark = pytest.mark.virtual_time
 
 
 def refused(scene: Scene, which: Handle, to: str = "new", **options: Any) -> BaseException:
     """Have it moved in vain; whatever was made there is closed, and nothing is left of it."""
-    with pytest.raises(TradeError) as error:
+    with pytest.raises(errors.TradeError) as error:
         scene.asker.migrate(which, to=to, **options)
     scene.memory.settle()
     there = [one for one in scene.asker.services() if one.container == "new" and one.groups != ("trade",)]
@@ -57,7 +40,7 @@ def test_what_is_locked_stays_also_if_who_asks_has_the_lock(scene: Scene) -> Non
     count, _ = scene.counter()
     with scene.asker.lock([count], purpose="mine"):
         error = refused(scene, count)
-        assert isinstance(error, LockedByOther)
+        assert isinstance(error, errors.LockedByOther)
         assert (error.owner, error.purpose) == ("chief/asker", "mine")
     assert continues(scene, count)
 
@@ -65,7 +48,7 @@ def test_what_is_locked_stays_also_if_who_asks_has_the_lock(scene: Scene) -> Non
 def test_a_lock_on_what_reads_counts_too(scene: Scene) -> None:
     count, shown = scene.counter()
     with scene.asker.lock([shown], purpose="look"):
-        assert isinstance(refused(scene, count), LockedByOther)
+        assert isinstance(refused(scene, count), errors.LockedByOther)
 
 
 def test_what_moves_stays_and_is_not_stopped(scene: Scene) -> None:
@@ -73,7 +56,7 @@ def test_what_moves_stays_and_is_not_stopped(scene: Scene) -> None:
     turn = scene.offer(wheel)["turn"]
     turn()
     error = refused(scene, turn)
-    assert isinstance(error, LockedByOther)
+    assert isinstance(error, errors.LockedByOther)
     assert error.owner.startswith("chief/asker/")
     assert error.purpose == "a motion that has not ended"
     assert wheel.resources[0].moving
@@ -84,7 +67,7 @@ def test_a_stop_that_holds_is_not_forgotten_by_moving(scene: Scene) -> None:
     services["turn"]()
     scene.new.handle(services["stop"].key)()
     error = refused(scene, services["turn"])
-    assert isinstance(error, Stopped)
+    assert isinstance(error, errors.Stopped)
     assert error.by == "new"
     scene.asker.resume([services["turn"]])
     assert scene.asker.migrate(services["turn"], to="new")
@@ -95,7 +78,7 @@ def test_nothing_migrates_during_an_e_stop(scene: Scene) -> None:
     scene.asker.estop("smoke")
     scene.memory.settle()
     error = refused(scene, count)
-    assert isinstance(error, Stopped)
+    assert isinstance(error, errors.Stopped)
     assert error.estop
     scene.asker.estop_clear([one.id for one in scene.asker.estops()])
 
@@ -109,7 +92,7 @@ def test_a_call_that_does_not_end_keeps_it(scene: Scene, monkeypatch: pytest.Mon
     assert inside.wait(30)
     error = refused(scene, shown)
     leave.set()
-    assert isinstance(error, LockedByOther)
+    assert isinstance(error, errors.LockedByOther)
     assert error.purpose == "a call or a motion that has not ended"
     assert run.result(30) == 4
 
@@ -119,7 +102,7 @@ def test_a_provider_does_not_move_itself_away_under_its_own_call(scene: Scene, m
     count, _ = scene.counter()
     here = scene.old.handle(count.key)
     scene.module.before["count"] = lambda: scene.old.migrate(here, to="new")
-    with pytest.raises(LockedByOther, match="a call or a motion that has not ended"):
+    with pytest.raises(errors.LockedByOther, match="a call or a motion that has not ended"):
         count()
     assert continues(scene, count)
 
@@ -128,7 +111,7 @@ def test_a_lock_that_is_broken_meanwhile_ends_the_attempt(scene: Scene) -> None:
     count, _ = scene.counter()
     scene.module.before["restore"] = lambda: scene.asker.break_lock([count], "no time for that")
     error = refused(scene, count)
-    assert isinstance(error, LockedByOther)
+    assert isinstance(error, errors.LockedByOther)
     assert "no time for that" in str(error)
     assert continues(scene, count)
 
@@ -138,7 +121,7 @@ def test_a_stop_that_comes_meanwhile_ends_the_attempt(scene: Scene) -> None:
     services = scene.offer(wheel)
     scene.module.Wheel.restore_state = lambda _self, _state: scene.asker.handle(services["stop"].key)()
     error = refused(scene, services["turn"])
-    assert isinstance(error, Stopped)
+    assert isinstance(error, errors.Stopped)
     scene.asker.resume([services["turn"]])
     services["turn"]()
     assert wheel.resources[0].moving
@@ -149,7 +132,7 @@ def test_it_is_moved_by_one_at_a_time(scene: Scene) -> None:
     heard: list[BaseException | None] = []
 
     def again() -> None:
-        with pytest.raises(LockedByOther) as error:
+        with pytest.raises(errors.LockedByOther) as error:
             scene.new.migrate(where(name="shown"), to="new")
         heard.append(error.value)
 
@@ -165,7 +148,7 @@ def test_it_is_moved_by_one_at_a_time(scene: Scene) -> None:
 
 def test_hardware_is_pinned_to_its_host(scene: Scene) -> None:
     error = refused(scene, scene.offer(scene.module.Bolted())["turn"])
-    assert isinstance(error, ConfigurationError)
+    assert isinstance(error, errors.ConfigurationError)
     assert "it drives wheel of this host; only a class that is relocatable can leave" in str(error)
 
 
@@ -174,7 +157,7 @@ def test_what_shares_a_resource_with_another_one_stays(scene: Scene) -> None:
     other.resources = one.resources
     scene.old.register(other, "hall")
     error = refused(scene, scene.offer(one)["turn"])
-    assert isinstance(error, ConfigurationError)
+    assert isinstance(error, errors.ConfigurationError)
     assert "it shares wheel with other services of this container" in str(error)
 
 
@@ -182,9 +165,9 @@ def test_S18_what_is_commanded_while_state_is_restored_is_refused(scene: Scene) 
     scene.module.Wheel.restore_state = lambda wheel, _state: wheel.turn()
     services = scene.offer(scene.module.Wheel())
     error = refused(scene, services["turn"])
-    assert isinstance(error, CannotMigrate)
+    assert isinstance(error, errors.CannotMigrate)
     assert "restore_state there: LockedByOther: wheel is locked by new/new" in str(error)
-    with pytest.raises(LockedByOther, match="restoring the state"):
+    with pytest.raises(errors.LockedByOther, match="restoring the state"):
         scene.asker.restore_state(services["turn"], None)
 
 
@@ -198,7 +181,7 @@ def test_S18_a_provider_that_was_given_up_may_not_command_later_either(
         leave.wait(30)
         try:
             wheel.turn()
-        except LockedByOther as error:
+        except errors.LockedByOther as error:
             outcomes.append(error)
 
     scene.module.Wheel.restore_state = linger
@@ -214,7 +197,7 @@ def test_S18_a_provider_that_starts_a_motion_past_all_permits_is_closed(scene: S
 
     scene.module.Wheel.restore_state = move
     error = refused(scene, scene.offer(scene.module.Wheel())["turn"])
-    assert isinstance(error, CannotMigrate)
+    assert isinstance(error, errors.CannotMigrate)
     assert "a motion that has not ended" in str(error)
     assert scene.module.events == ["made", "close"]
 
@@ -226,7 +209,7 @@ def test_S18_a_provider_that_starts_a_motion_past_all_permits_is_closed(scene: S
 def test_there_must_be_another_container_of_that_name(scene: Scene, to: str) -> None:
     count, _ = scene.counter()
     error = refused(scene, count, to=to)
-    assert isinstance(error, NoSuchService)
+    assert isinstance(error, errors.NoSuchService)
     assert continues(scene, count)
 
 
@@ -234,7 +217,7 @@ def test_only_what_the_other_container_allows_is_made_there(scene: Scene) -> Non
     count, _ = scene.counter()
     scene.memory.container("closed")
     scene.memory.settle()
-    assert isinstance(refused(scene, count, to="closed"), NotInstantiable)
+    assert isinstance(refused(scene, count, to="closed"), errors.NotInstantiable)
     assert continues(scene, count)
 
 
@@ -242,7 +225,7 @@ def test_a_class_that_is_not_there_is_not_made(scene: Scene) -> None:
     count, _ = scene.counter()
     imported(scene.folder, "")
     error = refused(scene, count)
-    assert isinstance(error, NoSuchClass)
+    assert isinstance(error, errors.NoSuchClass)
     assert "migrants_there has no such class" in str(error)
     assert continues(scene, count)
 
@@ -261,7 +244,7 @@ def test_a_class_that_is_another_version_there_is_not_made(scene: Scene, old: st
     assert old in MODULE
     module = imported(scene.folder, MODULE.replace(old, new))
     error = refused(scene, count)
-    assert isinstance(error, CannotMigrate)
+    assert isinstance(error, errors.CannotMigrate)
     assert "another version" in str(error)
     assert module.events == []
     assert continues(scene, count)
@@ -276,14 +259,14 @@ def test_a_changed_docstring_makes_no_other_version(scene: Scene) -> None:
 
 def test_a_constructor_that_fails_there_changes_nothing(scene: Scene) -> None:
     count, _ = scene.counter()
-    assert isinstance(refused(scene, count, args=[1, 2, 3]), CannotInstantiate)
+    assert isinstance(refused(scene, count, args=[1, 2, 3]), errors.CannotInstantiate)
     assert continues(scene, count)
 
 
 def test_a_full_container_says_so(scene: Scene) -> None:
     count, shown = scene.counter()
     tickets = [prepare(scene).ticket for _ in range(target.MOST)]
-    with pytest.raises(Busy):
+    with pytest.raises(errors.Busy):
         scene.asker.migrate(count, to="new")
     for ticket in tickets:
         assert not ask(scene, "arrived")(ticket)
@@ -303,7 +286,7 @@ def test_a_providers_exception_is_reported_and_changes_nothing(scene: Scene, met
 
     scene.module.before[method] = fail
     error = refused(scene, count)
-    assert isinstance(error, CannotMigrate)
+    assert isinstance(error, errors.CannotMigrate)
     assert f"{method}_state" in str(error)
     assert "OSError: the disk is full. It continues where it was" in str(error)
     assert continues(scene, count)
@@ -319,7 +302,7 @@ def test_a_provider_that_takes_too_long_with_its_state_stays(
     scene.module.before[method] = lambda: leave.wait(30)
     error = refused(scene, count)
     leave.set()
-    assert isinstance(error, CannotMigrate)
+    assert isinstance(error, errors.CannotMigrate)
     assert f"{method}_state has not ended after" in str(error)
     assert continues(scene, count)
 
@@ -342,7 +325,7 @@ def test_a_client_that_may_not_administer_the_group_is_refused(scene: Scene) -> 
         lambda: scene.asker.save_state(count),
         lambda: scene.asker.restore_state(count, {"total": 0}),
     ):
-        with pytest.raises(AccessDenied, match="chief may not administer Counter in hall"):
+        with pytest.raises(errors.AccessDenied, match="chief may not administer Counter in hall"):
             attempt()
     assert scene.module.events == []
 
@@ -357,7 +340,7 @@ def test_a_client_that_loses_the_role_during_preparation_is_refused(scene: Scene
     scene.policy()
     count, _ = scene.counter()
     scene.module.before["restore"] = lambda: scene.old.load_policy(scene.policy(chief="member", load=False))
-    assert isinstance(refused(scene, count), AccessDenied)
+    assert isinstance(refused(scene, count), errors.AccessDenied)
     scene.policy()
     assert continues(scene, count)
 
@@ -367,7 +350,7 @@ def test_both_sides_must_be_allowed_to_offer_it(scene: Scene, who: str, complain
     count, _ = scene.counter()
     path = scene.policy(**{who: "chief"})
     scene.old.load_policy(path)
-    with pytest.raises(AccessDenied, match=complaint):
+    with pytest.raises(errors.AccessDenied, match=complaint):
         if who == "new":
             scene.asker.migrate(count, to="new")
         else:
@@ -395,7 +378,7 @@ def test_an_unfetched_prepared_provider_is_closed_when_it_expires(
     monkeypatch.setattr(target, "TICKET_S", 0.05)
     ticket = prepare(scene).ticket
     wait_until(lambda: scene.module.events == ["made 1", "close 0"])
-    with pytest.raises(CannotMigrate, match="the prepared provider has expired"):
+    with pytest.raises(errors.CannotMigrate, match="the prepared provider has expired"):
         ask(scene, "arrive")(ticket)
 
 
@@ -409,10 +392,10 @@ def test_a_ticket_is_valid_once_and_only_for_its_container(scene: Scene) -> None
     ticket = prepare(scene).ticket
     stranger = scene.asker.find(where(name="arrive", group="trade", container="new"))
     assert not scene.asker.find(where(name="arrived", group="trade", container="new"))(ticket)
-    with pytest.raises(CannotMigrate):
+    with pytest.raises(errors.CannotMigrate):
         stranger(ticket)
     ask(scene, "arrive")(ticket)
-    with pytest.raises(CannotMigrate):
+    with pytest.raises(errors.CannotMigrate):
         ask(scene, "arrive")(ticket)
     assert ask(scene, "arrived")(ticket)
     scene.memory.settle()
@@ -423,7 +406,7 @@ def test_asking_whether_a_provider_arrived_prevents_a_later_arrival(scene: Scene
     ticket = prepare(scene).ticket
     assert not ask(scene, "arrived")(ticket)
     assert scene.module.events == ["made 1", "close 0"]
-    with pytest.raises(CannotMigrate):
+    with pytest.raises(errors.CannotMigrate):
         ask(scene, "arrive")(ticket)
 
 
@@ -431,18 +414,15 @@ def test_a_migration_whose_caller_gave_up_moves_nothing(scene: Scene) -> None:
     count, _ = scene.counter()
     migrate = scene.asker.find(where(name="migrate", group="trade", container="old"))
     scene.module.before["save"] = lambda: time.sleep(0.3)
-    with pytest.raises((DeadlineExceeded, TimeoutError)):
+    with pytest.raises((errors.DeadlineExceeded, TimeoutError)):
         migrate.with_(deadline_s=0.2)(count, "new")
     wait_until(lambda: scene.old.locks() == [])
     assert continues(scene, count)
 
 
-Fault = Callable[[Container], None]
-
-
 def test_a_container_that_dies_while_it_prepares_leaves_it_where_it_was(scene: Scene) -> None:
     count, _ = scene.counter()
     scene.module.before["restore"] = lambda: scene.memory.kill("new")
-    with pytest.raises((ContainerLost, ServiceGone)):
+    with pytest.raises((errors.ContainerLost, errors.ServiceGone)):
         scene.asker.migrate(count, to="new")
     assert continues(scene, count)

@@ -6,30 +6,18 @@ from typing import Any
 
 import pytest
 
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container, NotificationInfo, service
 
 pytestmark = pytest.mark.realtime
 
-POLICY = """
-[roles.keeper]
-register = ["rosie"]
-call = ["rosie"]
-administer = ["trade"]
-
-[roles.watcher]
-instrument = ["trade"]
-
-[roles.driver]
-includes = ["watcher"]
-call = ["rosie.base"]
-
-[identities]
-keeper = ["keeper"]
-asker = ["driver"]
-watcher = ["watcher"]
-stranger = []
-"""
+POLICY = policy_text(
+    "keeper=keeper asker=driver watcher=watcher stranger=",
+    keeper="register=rosie call=rosie administer=trade",
+    watcher="instrument=trade",
+    driver="includes=watcher call=rosie.base",
+)
 
 ASKER = """
 from pathlib import Path

@@ -1,7 +1,6 @@
 """The planner of ``examples/planner.py`` knows a goal, and builds its plans from what services say of themselves."""
 
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from examples.planner import NoPlan, Planner, Step
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Container, errors, service
 from trade._transport.endpoints import free_endpoint
-from trade.testing import MemorySystem, memory_system
+from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
@@ -75,12 +74,6 @@ class Circle(Part):
 
     @service(needs=["deep(f(?x))"], achieves=["deep(?x)"])
     def dig(self) -> None: ...
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.waiting import wait_until
-from tests.unit.trade.joint_with_policy import POLICY, Neck, find, memory, policy, rewritten
+from tests.unit.trade.joint_with_policy import POLICY, Neck, find, policy, rewritten
 from trade import Container, Settings
 from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied
@@ -14,7 +14,7 @@ from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
-__all__ = ["memory", "policy"]
+__all__ = ["policy"]
 
 
 @pytest.fixture

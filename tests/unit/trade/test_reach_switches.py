@@ -27,10 +27,6 @@ def clock_of(looking: Container, name: str, wait_s: float = 20) -> Handle:
     return looking.find(where(name="clock", container=name), wait_s=wait_s)
 
 
-def knows(looking: Container, name: str) -> bool:
-    return name in {info.name for info in looking.containers()}
-
-
 def test_a_container_that_broadcasts_is_found_by_one_that_discovers(apart: tuple[Container, Container]) -> None:
     one, other = apart
     one.system.set_broadcast(True)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import pytest
 
@@ -242,69 +242,54 @@ class NoServices:
 
 
 S17 = 'it moves something but cannot be stopped; give it a method marked @service(effect="stop")'
-REFUSED = {
-    "S17: uses something": (Unstoppable, "a", (), f"Unstoppable: {S17}"),
-    "S17: is something": (UnstoppableResource, "a", (), f"UnstoppableResource: {S17}"),
-    "no services": (
-        NoServices,
-        "",
-        (),
-        "NoServices: it has no services; mark methods of its class with @trade.service",
-    ),
+UNDONE = "the interface has this service, but the class does not implement it"
+REFUSED: dict[str, tuple[Any, ...]] = {
+    "S17: uses something": (Unstoppable, f"Unstoppable: {S17}", "a"),
+    "S17: is something": (UnstoppableResource, f"UnstoppableResource: {S17}", "a"),
+    "no services": (NoServices, "NoServices: it has no services; mark methods of its class with @trade.service"),
     "interface not implemented": (
         MissesImplementation,
-        "",
+        f"MissesImplementation.brightness: {UNDONE}",
+        (),
         (LampProtocol,),
-        "MissesImplementation.brightness: the interface has this service, but the class does not implement it",
     ),
-    "protocol's own stub": (
-        StubOnly,
-        "",
-        (),
-        "StubOnly.brightness: the interface has this service, but the class does not implement it",
-    ),
-    "not callable": (
-        Emptied,
-        "",
-        (),
-        "Emptied.switch: the interface has this service, but the class does not implement it",
-    ),
+    "protocol's own stub": (StubOnly, f"StubOnly.brightness: {UNDONE}"),
+    "not callable": (Emptied, f"Emptied.switch: {UNDONE}"),
     "several missing": (
         Emptied,
-        "",
-        (Heater,),
         "Emptied: the interface has the services switch, warm, cool, but the class does not implement them",
-    ),
-    "cancel names nothing": (
-        CancelsNothing,
-        "",
         (),
-        "CancelsNothing.walk: cancel='halt' names no service of this class",
+        (Heater,),
     ),
-    "unsendable argument": (Unsendable, "a", (), "a.take: argument 'callback' has a type that cannot be sent"),
-    "unsendable result": (UnsendableResult, "a", (), "a.give: its result has a type that cannot be sent"),
-    "*args": (Variadic, "a", (), "a.take: a service cannot take *values: int; name its parameters"),
-    "**kwargs": (Keywords, "a", (), "a.take: a service cannot take **values: int; name its parameters"),
-    "unreadable annotation": (Unreadable, "a", (), "a.take: its annotations cannot be read"),
-    "empty segment": (Lamp, "rosie..head", (), "Lamp: 'rosie..head' is no group; use words joined by dots"),
-    "blank": (Lamp, "my robot", (), "Lamp: 'my robot' is no group"),
-    "wildcard": (Lamp, "rosie.*", (), "Lamp: 'rosie.*' is no group"),
-    "slash": (Lamp, "a/b", (), "Lamp: 'a/b' is no group"),
-    "empty group": (Lamp, [""], (), "Lamp: '' is no group"),
-    "not a text": (Lamp, [5], (), "Lamp: 5 is no group"),
-    "too long": (Lamp, "a" * 81, (), "is no group"),
-    "reserved": (Lamp, "trade", (), "'trade' is reserved"),
-    "beneath the reserved": (Lamp, "trade.mine", (), "'trade' is reserved"),
+    "cancel names nothing": (CancelsNothing, "CancelsNothing.walk: cancel='halt' names no service of this class"),
+    "unsendable argument": (Unsendable, "a.take: argument 'callback' has a type that cannot be sent", "a"),
+    "unsendable result": (UnsendableResult, "a.give: its result has a type that cannot be sent", "a"),
+    "*args": (Variadic, "a.take: a service cannot take *values: int; name its parameters", "a"),
+    "**kwargs": (Keywords, "a.take: a service cannot take **values: int; name its parameters", "a"),
+    "unreadable annotation": (Unreadable, "a.take: its annotations cannot be read", "a"),
+    "empty segment": (Lamp, "Lamp: 'rosie..head' is no group; use words joined by dots", "rosie..head"),
+    "blank": (Lamp, "Lamp: 'my robot' is no group", "my robot"),
+    "wildcard": (Lamp, "Lamp: 'rosie.*' is no group", "rosie.*"),
+    "slash": (Lamp, "Lamp: 'a/b' is no group", "a/b"),
+    "empty group": (Lamp, "Lamp: '' is no group", [""]),
+    "not a text": (Lamp, "Lamp: 5 is no group", [5]),
+    "too long": (Lamp, "is no group", "a" * 81),
+    "reserved": (Lamp, "'trade' is reserved", "trade"),
+    "beneath the reserved": (Lamp, "'trade' is reserved", "trade.mine"),
 }
+"""An object, what is said of it, its groups, and the interfaces that it claims."""
 
 
-@pytest.mark.parametrize(("kind", "groups", "implements", "message"), REFUSED.values(), ids=list(REFUSED))
+@pytest.mark.parametrize("case", REFUSED.values(), ids=list(REFUSED))
 def test_an_unusable_service_is_refused_at_registration_with_place_and_remedy(
-    here: Container, kind: type, groups: str, implements: tuple[type, ...], message: str
+    here: Container, case: tuple[Any, ...]
 ) -> None:
-    with pytest.raises(ConfigurationError) as refused:
-        here.register(kind(), groups or (), implements=implements)
-    assert message in str(refused.value)
+    def is_refused(kind: type, message: str, groups: Any = (), implements: Any = ()) -> None:
+        with pytest.raises(ConfigurationError) as refused:
+            here.register(kind(), groups, implements=implements)
+        assert message in str(refused.value)
+
+    is_refused(*case)
     assert names(here) == set()
 
 

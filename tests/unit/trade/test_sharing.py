@@ -10,20 +10,8 @@ from msgspec import Struct
 from tests.support.two_joint_robot import Joint
 from tests.support.two_systems import member
 from tests.support.waiting import wait_until
-from trade import Container, Handle, progress, service, where
+from trade import Container, Handle, errors, progress, service, where
 from trade._context.sessions import foreign
-from trade.errors import (
-    Cancelled,
-    ConfigurationError,
-    InvalidArgument,
-    LimitExceeded,
-    LockedByOther,
-    LockLost,
-    NotSerialisable,
-    ServiceGone,
-    SessionEnded,
-    Stopped,
-)
 from trade.sharing import Border
 from trade.testing import MemorySystem, memory_system
 
@@ -64,7 +52,7 @@ class Brain:
     @service(effect="read")
     def fail(self, how: str) -> None:
         if how == "limit":
-            raise LimitExceeded(what="pan", value=2.0, lower=0.0, upper=1.0, unit="rad")
+            raise errors.LimitExceeded(what="pan", value=2.0, lower=0.0, upper=1.0, unit="rad")
         raise Odd(how)
 
     @service
@@ -153,12 +141,12 @@ def test_what_is_exported_is_found_as_it_is_at_home_and_nothing_else_is(two: Two
 def test_calls_give_results_and_errors_of_their_own_types(two: Two) -> None:
     assert two.find("middle")(Point(0, 0), Point(2, 4)) == Point(1, 2)
     assert two.find("middle")(one=Point(0, 0), other=Point(2, 4)) == Point(1, 2)
-    with pytest.raises(LimitExceeded, match="pan") as beyond:
+    with pytest.raises(errors.LimitExceeded, match="pan") as beyond:
         two.find("fail")("limit")
     assert beyond.value.upper == 1.0
     with pytest.raises(Odd, match="odd"):
         two.find("fail")("odd")
-    with pytest.raises(InvalidArgument, match="other"):
+    with pytest.raises(errors.InvalidArgument, match="other"):
         two.find("middle")(Point(0, 0), 3)
 
 
@@ -180,7 +168,7 @@ def test_progress_comes_back_and_cancelling_goes_there(two: Two) -> None:
     run = two.find("long").start()
     wait_until(lambda: run.progress() == "half way", "progress crosses")
     run.cancel()
-    with pytest.raises(Cancelled):
+    with pytest.raises(errors.Cancelled):
         run.result(20)
     assert two.brain.cancelled.is_set()
 
@@ -191,11 +179,11 @@ def test_handles_of_what_is_shared_are_translated_and_others_do_not_cross(two: T
     assert two.joint.written == [0.5]
     assert two.find("itself")() == middle
     [other] = two.anna.services(where(name="clock", container="anna"))
-    with pytest.raises(InvalidArgument, match="not shared with system memory"):
+    with pytest.raises(errors.InvalidArgument, match="not shared with system memory"):
         two.find("apply")(other, 0.5)
     [cellar] = two.planner.services(where(name="move", group="cellar"))
     two.brain.home = cellar
-    with pytest.raises(NotSerialisable, match="not shared with system clinic"):
+    with pytest.raises(errors.NotSerialisable, match="not shared with system clinic"):
         two.find("itself")()
 
 
@@ -208,7 +196,7 @@ def test_services_that_come_and_go_at_home_come_and_go_in_the_other_system(two: 
     assert move(0.1) == 0.1
     two.robot.deregister(legs)
     wait_until(lambda: not move.alive, "it is withdrawn")
-    with pytest.raises(ServiceGone):
+    with pytest.raises(errors.ServiceGone):
         move(0.2)
     middle = two.find("middle")
     two.lab.kill(two.robot)
@@ -255,10 +243,10 @@ def test_S03_a_client_that_was_gone_when_its_call_came_moves_nothing(two: Two) -
     page = two.anna.open_session("page")
     two.clinic.settle()  # its sign of life was seen: one that comes later would say that it is present
     two.theirs._parts.session_ended(page.name)
-    with page.use(), pytest.raises(SessionEnded):
+    with page.use(), pytest.raises(errors.SessionEnded):
         go(1.0)
     two.find("who")
-    with page.use(), pytest.raises(SessionEnded):
+    with page.use(), pytest.raises(errors.SessionEnded):
         two.find("middle")(Point(0, 0), Point(2, 4))  # a reading call opens no session for an unknown client either
     assert not two.joint.resource.moving
 
@@ -282,12 +270,12 @@ def test_S08_a_clients_own_stop_does_not_latch_and_a_foreign_one_does(two: Two) 
     stop()
     go(1.0)
     two.find("stop", two.bob)()
-    with pytest.raises(Stopped, match="clinic/bob via door"):
+    with pytest.raises(errors.Stopped, match="clinic/bob via door"):
         go(1.0)
     assert two.anna.resume(where(group="rosie.head")) == ["pan"]
     go(1.0)
     two.planner.find(where(name="stop", group="rosie.head"))()
-    with pytest.raises(Stopped, match="planner"):
+    with pytest.raises(errors.Stopped, match="planner"):
         go(1.0)
 
 
@@ -301,11 +289,11 @@ def test_a_lock_in_another_system_is_a_lock_at_home_under_the_clients_name(two: 
         assert two.find("move")(0.1) == 0.1
         [there] = two.planner.locks()
         assert (there.holder.owner, there.holder.purpose) == ("clinic/anna via door", "look")
-        with pytest.raises(LockedByOther, match="clinic/anna via door"):
+        with pytest.raises(errors.LockedByOther, match="clinic/anna via door"):
             at_home(0.9)
-        with pytest.raises(LockedByOther, match="anna/anna"):
+        with pytest.raises(errors.LockedByOther, match="anna/anna"):
             two.find("move", two.bob)(0.9)
-        with pytest.raises(LockedByOther), two.bob.lock(where(group="rosie.head"), wait_s=0):
+        with pytest.raises(errors.LockedByOther), two.bob.lock(where(group="rosie.head"), wait_s=0):
             pass
     with two.bob.lock(where(group="rosie.head"), wait_s=0):  # given back on both sides when it returns
         pass
@@ -322,10 +310,13 @@ def test_an_owner_at_home_keeps_the_lock_and_is_asked_to_release_it(two: Two) ->
         heard.set()
 
     with two.planner.lock(where(group="rosie.head"), on_request=hear):
-        with pytest.raises(LockedByOther, match="planner/planner"), two.anna.lock(where(group="rosie"), wait_s=0):
+        with (
+            pytest.raises(errors.LockedByOther, match="planner/planner"),
+            two.anna.lock(where(group="rosie"), wait_s=0),
+        ):
             pass
         assert two.anna.locks() == []
-        with pytest.raises(LockedByOther, match="planner/planner"):
+        with pytest.raises(errors.LockedByOther, match="planner/planner"):
             two.find("move")(0.1)
         assert two.anna.request_release(where(name="move"), "hurry") == ["planner/planner"]
         assert heard.wait(20)
@@ -371,7 +362,7 @@ def test_a_lock_that_is_lost_on_one_side_is_lost_on_both_and_what_it_moves_stops
     with two.planner.lock(where(group="rosie.head"), wait_s=20):
         pass
     if "broken" in how:
-        with pytest.raises(LockLost), lock.use():
+        with pytest.raises(errors.LockLost), lock.use():
             two.find("move")(0.5)
 
 
@@ -381,7 +372,7 @@ def test_software_and_what_reads_are_locked_at_home_too(two: Two) -> None:
     with two.anna.lock([two.find("who"), middle]):
         assert middle(Point(0, 0), Point(2, 4)) == Point(1, 2)
         for refused in (here["who"], lambda: here["middle"](Point(0, 0), Point(2, 4))):
-            with pytest.raises(LockedByOther, match="clinic/anna via door"):
+            with pytest.raises(errors.LockedByOther, match="clinic/anna via door"):
                 refused()
     assert long.alive
 
@@ -397,7 +388,7 @@ def test_S09_an_e_stop_holds_on_both_sides_and_is_cleared_on_each(two: Two) -> N
     wait_until(lambda: [one.id for one in two.planner.estops()] == [report.id], "it crossed")
     assert "in system clinic, by bob/bob" in two.planner.estops()[0].reason
     two.bob.estop_clear([report.id])
-    with pytest.raises(Stopped, match="smoke"):
+    with pytest.raises(errors.Stopped, match="smoke"):
         two.find("move")(0.1)
     assert two.planner.estop_clear([report.id]).complete
     two.planner.resume(where(group="rosie.head"))
@@ -417,7 +408,7 @@ def test_S09_an_e_stop_is_confirmed_once_it_holds_on_both_sides(two: Two, lost: 
     if lost:
         assert "guest/door" in {*report.missing, *report.failed}
     else:
-        with pytest.raises(Stopped, match="smoke"):
+        with pytest.raises(errors.Stopped, match="smoke"):
             two.planner.find(where(name="go_on", group="rosie.head"))(1.0)
         assert not two.joint.resource.moving
 
@@ -476,5 +467,5 @@ def test_a_second_resource_of_one_name_is_not_shared(two: Two, caplog: pytest.Lo
 
 
 def test_a_system_shares_nothing_with_itself(two: Two) -> None:
-    with pytest.raises(ConfigurationError, match="name another one"):
+    with pytest.raises(errors.ConfigurationError, match="name another one"):
         Border(two.ours, two.planner)

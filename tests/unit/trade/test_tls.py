@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from tests.support.certificates import Papers
+from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container, Settings, service, where
 from trade._security import certificates
@@ -499,17 +500,7 @@ def test_a_container_does_not_listen_where_its_certificate_is_not_for(papers: Pa
     assert read(tls=added, system="lab", listen=[listen], policy=Path("policy.toml")).listen == (listen,)
 
 
-RULES = """
-[roles.driver]
-register = ["robot"]
-
-[roles.viewer]
-read = ["robot"]
-
-[identities]
-arm = ["driver"]
-planner = ["viewer"]
-"""
+RULES = policy_text("arm=driver planner=viewer", driver="register=robot", viewer="read=robot")
 
 
 def test_with_a_policy_a_container_gets_nothing_from_identities_outside_it(

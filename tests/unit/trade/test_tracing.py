@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 import trade._telemetry.spans as noted
+from tests.support.policies import policy_text
 from trade import Container, Handle, HookEvent, Resource, Secret, Trace, current_call, service, where
 from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
-from trade.testing import MemorySystem, memory_system
+from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
@@ -328,25 +329,12 @@ def test_a_container_may_be_traced_from_its_start(start_container: Any) -> None:
 
 # --- who may
 
-POLICY = """
-[roles.viewer]
-read = ["rosie", "trade"]
-[roles.driver]
-register = ["rosie"]
-[roles.tracer]
-includes = ["viewer"]
-instrument = ["trade"]
-[identities]
-dash = ["viewer"]
-drv = ["driver"]
-chief = ["tracer"]
-"""
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
+POLICY = policy_text(
+    "dash=viewer drv=driver chief=tracer",
+    viewer="read=rosie,trade",
+    driver="register=rosie",
+    tracer="includes=viewer instrument=trade",
+)
 
 
 def test_tracing_takes_the_right_to_instrument_and_reading_the_right_to_read(

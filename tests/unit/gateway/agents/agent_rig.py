@@ -13,43 +13,23 @@ from mcp import ClientSession
 from mcp.shared.memory import create_client_server_memory_streams
 from mcp.types import CancelledNotification, CancelledNotificationParams, ClientNotification
 
+from tests.support.policies import policy_text
 from trade import Container, Resource, service
 from trade_gateway.clients import ClientApi
 from trade_gateway.language import read_lexicon
 from trade_gateway.mcp import Approvals, Tools, converse
 
-POLICY = """
-[roles.behaviour]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-register = ["approvals"]
-
-[roles.operator]
-read = ["*"]
-call = ["approvals"]
-administer = ["rosie.legs"]
-
-[roles.robot]
-register = ["rosie"]
-
-[identities]
-agent = ["behaviour"]
-reader = ["viewer"]
-ann = ["operator"]
-bob = ["visitor"]
-robot = ["robot"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[roles.visitor]
-call = ["approvals"]
-read = ["approvals"]
-
-[approval]
-"agent*" = ["rosie.legs"]
-"""
+POLICY = (
+    policy_text(
+        "agent=behaviour reader=viewer ann=operator bob=visitor robot=robot",
+        behaviour="read=* call=rosie lock=rosie register=approvals",
+        operator="read=* call=approvals administer=rosie.legs",
+        robot="register=rosie",
+        viewer="read=rosie",
+        visitor="call=approvals read=approvals",
+    )
+    + '[approval]\n"agent*" = ["rosie.legs"]\n'
+)
 
 
 class Part:

@@ -1,19 +1,12 @@
 """The robot, the agent and what the policy lets it do."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.unit.gateway.agents.agent_rig import POLICY, Robot
 from trade import Container
-from trade.testing import MemorySystem, memory_system
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
+from trade.testing import MemorySystem
 
 
 @pytest.fixture

@@ -83,12 +83,25 @@ def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros
 # --- the master
 
 
-def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
-    topic = graph.advertise("/state", TEXT, latched=True)
-    topic.send({"data": "kept"})
+def open_all(graph: Ros1) -> list[str]:
+    """A latched topic, a subscription and a service; what the subscription hears."""
     heard: list[str] = []
     graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
+    graph.advertise("/state", TEXT, latched=True).send({"data": "kept"})
     graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
+    return heard
+
+
+def are_open_again(peer: Any, heard: list[str]) -> None:
+    peer.do("hear", "/state", "std_msgs/String")
+    assert peer.wait_for("heard")["data"] == "kept"
+    peer.do("advertise", "/orders", "std_msgs/String", True)
+    peer.do("send", "/orders", {"data": "go"})
+    wait_until(lambda: heard == ["go"], "the subscription is open again")
+
+
+def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(graph: Ros1, stand: Stand) -> None:
+    heard = open_all(graph)
     watch = Watch(graph)
     old = stand.peer("old")
     watch.until("/old", there=True)
@@ -102,13 +115,9 @@ def test_a_master_that_was_killed_and_restarted_gets_all_registrations_again(gra
 
     peer = stand.peer("fresh")
     watch.until("/fresh", there=True)
-    peer.do("hear", "/state", "std_msgs/String")
-    assert peer.wait_for("heard")["data"] == "kept"
     peer.do("call", "/lights", "std_srvs/Trigger", {})
     assert peer.wait_for("called")["success"]
-    peer.do("advertise", "/orders", "std_msgs/String", True)
-    peer.do("send", "/orders", {"data": "go"})
-    wait_until(lambda: heard == ["go"], "the subscription is open again")
+    are_open_again(peer, heard)
     assert ("/old", False) not in watch.reported
     old.end()
     watch.until("/old", there=False)
@@ -146,11 +155,7 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
 
 
 def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open(graph: Ros1, stand: Stand) -> None:
-    heard: list[str] = []
-    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
-    topic = graph.advertise("/state", TEXT, latched=True)
-    topic.send({"data": "kept"})
-    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
+    heard = open_all(graph)
     peer = stand.peer("arm")
     watch = Watch(graph)
     watch.until("/arm", there=True)
@@ -161,11 +166,7 @@ def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open
     wait_until(lambda: watch.reported.count(("/arm", True)) == 2, "it is seen again")
     wait_until(lambda: not graph.healthy, "all is well again")
     assert our_node().pid != before.pid
-    peer.do("hear", "/state", "std_msgs/String")
-    assert peer.wait_for("heard")["data"] == "kept"
-    peer.do("advertise", "/orders", "std_msgs/String", True)
-    peer.do("send", "/orders", {"data": "go"})
-    wait_until(lambda: heard == ["go"], "the subscription is open again")
+    are_open_again(peer, heard)
     wait_until(lambda: answers(graph), "its service is found")
 
 
