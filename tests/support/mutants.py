@@ -70,6 +70,27 @@ def _watchdog_off(patch: Patch) -> None:
     patch(DynamixelExchange, "__init__", unwatched)
 
 
+def _late_wake(patch: Patch) -> None:
+    """A stop that comes when the stops were just served waits for the next cycle."""
+    from trade_drivers.bus._cycle import BusCycle
+
+    patch(BusCycle, "idle", lambda self, s: (self.wake.wait(s), self.serve_stops(), self.wake.clear()))
+
+
+def _one_still_sample(patch: Patch) -> None:
+    """A joint that one measurement shows at rest is left alone by a stop."""
+    from trade_drivers.joints._cycle import Exchange
+
+    patch(Exchange, "_at_rest", lambda self, axis, now_ns: axis.motion is None and axis.still >= 1)
+
+
+def _no_margin(patch: Patch) -> None:
+    """A motion continues until the deadline of its call, when its caller no longer waits for the answer."""
+    from trade_drivers.bus import _gate
+
+    patch(_gate, "_ANSWER_NS", 0)
+
+
 def _discovery_stays_on(patch: Patch) -> None:
     """A search for containers never ends."""
     from trade._discovery.dialer import Dialer
@@ -198,6 +219,9 @@ HOW: Final[dict[str, Callable[[Patch], None]]] = {
     "no-dedupe": _no_dedupe,
     "stop-loses": _stop_loses,
     "watchdog-off": _watchdog_off,
+    "late-wake": _late_wake,
+    "one-still-sample": _one_still_sample,
+    "no-margin": _no_margin,
     "discovery-stays-on": _discovery_stays_on,
     "uses-uncounted": _uses_uncounted,
     "no-priority": _no_priority,
