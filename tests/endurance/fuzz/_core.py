@@ -31,6 +31,7 @@ from trade._registry.predicates import fits_all, parse_predicates
 from trade._services.decorator import marked_methods
 from trade._services.signature import Signature
 from trade._transport.endpoints import Endpoint
+from trade._transport.scouting import read_hello
 from trade.errors import ConfigurationError, InvalidArgument, TradeError
 
 ME: Final = Address("anna", "kitchen", "e1")
@@ -167,5 +168,6 @@ TARGETS: Final = [
     Target("constraint", _constraint, UNREADABLE, _constraint_written),
     Target("predicates", _predicates, (ConfigurationError,), lambda found: ", ".join(map(str, found)).encode()),
     Target("endpoint", _text(Endpoint.read), (ConfigurationError,), lambda read: str(read).encode()),
+    Target("hello", read_hello),
     Target("inherited-lock", _text(_inherited), (ConfigurationError,)),
 ]

@@ -28,6 +28,7 @@ from trade._audit.store import AuditStore
 from trade._protocol.messages import EMPTY, PROTOCOL, Estop, encode_message
 from trade._protocol.remote_errors import pack_error
 from trade._protocol.samples import StreamSample
+from trade._transport.scouting import hello
 from trade.errors import LimitExceeded, LockedByOther
 from trade_drivers.vendors.dynamixel._frames import crc16 as dynamixel_crc
 from trade_drivers.vendors.feetech._frames import packet as feetech_packet
@@ -118,6 +119,7 @@ def _wire() -> Iterator[tuple[str, bytes]]:
     yield "predicates", b"on(cup, table)"
     for endpoint in ("tcp/127.0.0.1:7450", "tls/[::1]:7450?a=b", "tls/robot.example:1#iface=eth0"):
         yield "endpoint", endpoint.encode()
+    yield "hello", hello("de88bef20f15d9afd64d6f625e211ef4", ["tcp/10.9.0.5:7450", "tls/[fd00::2]:7450"])
     yield "inherited-lock", b'[["anna", "desk", "e1"], ["rosie.neck.pan"], [["e2", 7]]]'
 
 
