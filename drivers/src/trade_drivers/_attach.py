@@ -210,6 +210,7 @@ def _angle_store(robot: Robot, state_dir: Path | None, undo: ExitStack) -> Angle
         _log.warning("the last known angles of an earlier name of this system cannot be copied: %s", bad)
     angles = AngleStore(state_dir / "angles" / f"{robot.name}.sqlite", _log.warning)
     undo.callback(angles.close)  # closes after the buses, to save where they left their joints, too
+    angles.load()  # what is wrong in it is said before a bus is opened
     return angles
 
 

@@ -1,8 +1,9 @@
 """S23 for zeros: an angle is compared with the last known one before any motion, as a loss of power may shift it."""
 
+import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from math import tau
+from contextlib import ExitStack, closing
+from math import inf, tau
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -141,6 +142,24 @@ def test_S23_a_dip_of_power_while_the_driver_is_up_is_a_fault_with_both_angles(b
     bench.lose_power(bench.kind.zero)
     wait_until(lambda: "its zero is in doubt" in fault(motor), "the dip is a fault")
     bench.refuses(motor, measured(motor), mark)
+
+
+@pytest.mark.parametrize("row", [("abc", "def"), (None, None), (inf, inf), (1.0, -1.0), (b"x", 1.0)], ids=str)
+def test_S23_a_saved_angle_that_is_none_is_refused_before_a_bus_is_opened(
+    damiao: Bench, row: tuple[object, object]
+) -> None:
+    damiao.attach().close()
+    [file] = (damiao.folder / "angles").glob("*.sqlite")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("insert or replace into angle values (?, ?, ?)", (damiao.kind.joint, *row))
+    mark = written_now()
+    with pytest.raises(
+        ConfigurationError, match=rf"{file.name}: .* of {damiao.kind.joint} is .*Delete this file, and compare"
+    ):
+        damiao.attach()
+    assert not damiao.rig.frames(since=mark)
+    file.unlink()
+    damiao.attach().motor(damiao.kind.joint)
 
 
 def fault(motor: Motor) -> str:
