@@ -3,6 +3,8 @@
 import logging
 import socket
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,8 +14,10 @@ from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from trade import Container, Settings
 from trade._transport.endpoints import Endpoint, free_endpoint
-from trade._transport.port_guard import MOST_STRANGERS, PortGuard
+from trade._transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
 
+PER_S, FLOOD_S = 50, 8
+SOON_S = 10.0
 pytestmark = [
     pytest.mark.realtime,
     pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only"),
@@ -111,3 +115,44 @@ def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
         with caplog.at_level(logging.INFO), Container(settings("mind", connect=[endpoint])) as mind:
             wait_until(lambda: len(mind.addresses()) == 2)
             wait_until(lambda: len(driver.addresses()) == 2)
+
+
+def test_connections_that_their_clients_have_ended_count_and_the_log_names_rate_and_source(
+    door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
+) -> None:
+    port = door.getsockname()[1]
+    guard = PortGuard([port], lambda: 0, MOST_WITH_TLS)
+    try:
+        there: list[socket.socket] = []
+        for _ in range(MOST_WITH_TLS + 2):
+            with socket.create_connection(("127.0.0.1", port), timeout=5):
+                there.append(door.accept()[0])  # and the other end hangs up
+        wait_until(lambda: "are not links" in caplog.text)
+        assert "a second" in caplog.text
+        assert "of them from 127.0.0.1" in caplog.text
+        wait_until(lambda: not dial(port))
+        for one in there:
+            one.close()
+        wait_until(lambda: dial(port))
+    finally:
+        guard.close()
+
+
+def test_links_come_back_soon_after_a_flood_of_connects_to_a_port_with_tls(system: str, tmp_path: Path) -> None:
+    papers = Papers(tmp_path / "pki")
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    port = Endpoint.read(endpoint).port
+
+    def settings(name: str, **how: list[str]) -> Settings:
+        return Settings.read(system=system, container=name, tls=papers.of(name), environment={}, **how)  # type: ignore[arg-type]
+
+    with Container(settings("driver", listen=[endpoint])):
+        for _ in range(PER_S * FLOOD_S):
+            with socket.socket() as one:
+                one.setblocking(False)
+                one.connect_ex(("127.0.0.1", port))
+                threading.Event().wait(1 / PER_S)
+        ended = time.monotonic()
+        with Container(settings("mind", connect=[endpoint])) as mind:
+            wait_until(lambda: len(mind.addresses()) == 2)
+        assert time.monotonic() - ended < SOON_S  # without the guard, the transport needs 0.1 s for each of them

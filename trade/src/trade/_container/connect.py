@@ -15,7 +15,7 @@ from trade._security.zenoh_acl import acl
 from trade._settings import Settings
 from trade._transport.credentials import user_secret
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
-from trade._transport.port_guard import PortGuard
+from trade._transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade._transport.zenoh_links import Links
 from trade.errors import ConfigurationError
@@ -47,7 +47,8 @@ def join(
     except ConfigurationError:
         transport.close()
         raise
-    guard = PortGuard((own.port for own in transport.links.listen), transport.links.count)
+    most = MOST_STRANGERS if certificate is None else MOST_WITH_TLS
+    guard = PortGuard((own.port for own in transport.links.listen), transport.links.count, most)
     leaving.callback(guard.close)
     if certificate is not None:
         leaving.callback(ExpiryWatch(certificate, warned).close)

@@ -1,18 +1,22 @@
 """Protects the transport's ports against floods: with too many unlinked connections, no new one is accepted.
 
-The transport accepts every connection and ends those that fail at ten a second (zenoh 1.10, measured): at 1,000
-connections a second, each would hold a descriptor for minutes. A socket filter on the listening sockets makes the
-kernel drop new connections meanwhile. Existing links are not affected, and the stop line is separate. Linux only.
+The transport accepts every connection at once. On a port with TLS, it ends those that fail one after the other, at ten
+a second (zenoh 1.10, measured), and makes no link before that: connections that were let in for 20 s at 25 a second
+delay links by half a minute. A socket filter on the listening sockets makes the kernel drop new connections meanwhile.
+Existing links are not affected, and the stop line is separate. Linux only.
 """
 
 import contextlib
 import ctypes
 import logging
 import os
+import select
 import socket
 import struct
 import sys
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
@@ -20,10 +24,17 @@ from typing import Final
 _logger = logging.getLogger("trade")
 
 MOST_STRANGERS: Final = 128
+MOST_WITH_TLS: Final = 24
+"""What the transport ends within 2.4 s."""
 _LOOK_S: Final = 0.25
+_AGAIN_S: Final = 0.02
+"""The time between two looks while connections arrive."""
+_QUIET_S: Final = 10.0
+"""A flood is over after this time without too many strangers."""
 _CONNECTIONS: Final = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _OPEN_FILES: Final = Path("/proc/self/fd")
-_ESTABLISHED: Final = "01"
+_OPEN: Final = ("01", "08")
+"""Established; and hung up by the other end, but not ended here."""
 _SO_ATTACH_FILTER: Final = 26
 _SO_DETACH_FILTER: Final = 27
 _DROP_ALL: Final = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))
@@ -36,39 +47,56 @@ class PortGuard:
     Args:
         ports: the ports to watch.
         links: returns the number of links.
+        most: the largest number of connections that are not links.
     """
 
-    def __init__(self, ports: Iterable[int], links: Callable[[], int]) -> None:
+    def __init__(self, ports: Iterable[int], links: Callable[[], int], most: int = MOST_STRANGERS) -> None:
         self._ports = frozenset(ports)
         self._links = links
+        self._most = most
         self._sockets = _listening(self._ports) if sys.platform == "linux" and _OPEN_FILES.is_dir() else []
         self._shut = False
+        self._flood: _Flood | None = None
+        self._known = frozenset[str]()
+        """The far ends of the connections at the last look."""
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trade-port-guard", daemon=True)
+        for sock in self._sockets if most < MOST_STRANGERS else ():
+            sock.listen(most // 2)  # between two looks, a burst fills no more of the queue
         if self._sockets:
             self._thread.start()
 
     def _run(self) -> None:
-        while not self._ending.wait(_LOOK_S):
-            try:
-                if self._shut or _open_files() > MOST_STRANGERS:  # counting connections costs more
-                    self._update(_connections(self._ports) - self._links())
-            except OSError as bad:
-                _logger.debug("the ports of the transport cannot be inspected: %s", bad)
+        with select.epoll() as arrivals:
+            for sock in self._sockets:
+                arrivals.register(sock, select.EPOLLIN | select.EPOLLET)
+            look_until = 0.0
+            while not self._ending.is_set():
+                came, now = arrivals.poll(_LOOK_S), time.monotonic()
+                look_until = now + _QUIET_S if came or self._shut else look_until
+                if now < look_until or self._flood is not None:
+                    self._look(now)
+                    self._ending.wait(_AGAIN_S)
         if self._shut:
             self._filter(shut=False)
 
-    def _update(self, strangers: int) -> None:
-        if not self._shut and strangers > MOST_STRANGERS:
-            _logger.warning(
-                "%d connections at port %s are not links: no new connection is accepted until they end. Stops and "
-                "e-stops still arrive on the stop line",
-                strangers,
-                ", ".join(map(str, sorted(self._ports))),
-            )
+    def _look(self, now: float) -> None:
+        try:
+            there = _connections(self._ports)
+        except OSError as bad:
+            _logger.debug("the ports of the transport cannot be inspected: %s", bad)
+            return
+        strangers, new, self._known = len(there) - self._links(), there - self._known, there
+        if self._flood is None and strangers > self._most // 2:
+            self._flood = _Flood(now, ", ".join(map(str, sorted(self._ports))), there)
+        elif self._flood is not None:
+            self._flood.note(new)
+        if not self._shut and strangers > self._most:
             self._filter(shut=True)
-        elif self._shut and strangers <= MOST_STRANGERS // 2:
+        elif self._shut and strangers <= self._most // 2:
             self._filter(shut=False)
+        if self._flood is not None and self._flood.said(now, strangers, self._most, shut=self._shut):
+            self._flood = None
 
     def _filter(self, *, shut: bool) -> None:
         program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(_DROP_ALL))
@@ -110,18 +138,62 @@ def _is_guarded(sock: socket.socket, ports: frozenset[int]) -> bool:
     return bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)) and sock.getsockname()[1] in ports
 
 
-def _open_files() -> int:
-    """The number of open files of this process, strangers' connections included."""
-    return sum(1 for _ in os.scandir(_OPEN_FILES))
-
-
-def _connections(ports: frozenset[int]) -> int:
-    """The number of connections to these ports of this host."""
+def _connections(ports: frozenset[int]) -> frozenset[str]:
+    """The far ends of the connections to these ports of this host, as ``address:port`` in the kernel's words."""
     ends = {f":{port:04X}" for port in ports}
-    count = 0
+    found: set[str] = set()
     for path in _CONNECTIONS:
         with contextlib.suppress(FileNotFoundError), path.open(encoding="ascii") as lines:
             for line in lines:
                 fields = line.split(maxsplit=4)
-                count += fields[3] == _ESTABLISHED and fields[1][-5:] in ends
-    return count
+                if fields[3] in _OPEN and fields[1][-5:] in ends:
+                    found.add(fields[2])
+    return frozenset(found)
+
+
+class _Flood:
+    """What is said of a flood: once when connections are refused, and once when it is over."""
+
+    def __init__(self, now: float, ports: str, ends: Iterable[str]) -> None:
+        self._began = self._last = now
+        self._ports = ports
+        self._said = False
+        self._came = Counter[str]()
+        self.note(ends)
+
+    def note(self, ends: Iterable[str]) -> None:
+        """These far ends are new."""
+        self._came.update(end.partition(":")[0] for end in ends)
+
+    def said(self, now: float, strangers: int, most: int, *, shut: bool) -> bool:
+        """Logs what is due; returns whether it is over."""
+        if shut:
+            self._last = now
+            if not self._said:
+                self._said = True
+                _logger.warning(
+                    "%d connections at port %s are not links (%s): no new connection is accepted until they end. Stops "
+                    "and e-stops still arrive on the stop line",
+                    strangers,
+                    self._ports,
+                    self._sources(now),
+                )
+        if strangers > most // 2:
+            self._last = now
+        over = now - self._last > _QUIET_S
+        if over and self._said:
+            _logger.warning("connections at port %s are accepted again (%s)", self._ports, self._sources(self._last))
+        return over
+
+    def _sources(self, now: float) -> str:
+        """How many were let in, how fast, and where most are from."""
+        (source, count), total = self._came.most_common(1)[0], self._came.total()
+        rate = total / max(now - self._began, _LOOK_S)
+        return f"{total} were let in, {rate:.0f} a second, {count} of them from {_address(source)}"
+
+
+def _address(kernels: str) -> str:
+    """An address as people write it."""
+    raw = bytes.fromhex(kernels)
+    words = b"".join(raw[first : first + 4][::-1] for first in range(0, len(raw), 4))
+    return socket.inet_ntop(socket.AF_INET6 if len(words) > 4 else socket.AF_INET, words).removeprefix("::ffff:")
