@@ -9,9 +9,6 @@ from tests.endurance.explore._records import Held, Moved, Stopped
 from tests.endurance.explore._robots import KINDS
 from trade_hil_sim import Entry, events
 
-_MEASURED_S: Final = 0.15
-"""Drivers measure rest in a cycle, and a Dynamixel shows no speed below 0.036 rad/s; its course ends a moment later."""
-
 _HELD_RAD: Final = 0.005
 """Three counts of a servo: a joint that is made to hold where it was measured may turn so far."""
 _REFUSED: Final = frozenset({"LockLost", "LockedByOther", "NotLocked"})
@@ -54,7 +51,8 @@ def _moves_in(log: Sequence[Entry], stop: Stopped, ended: float) -> list[str]:
     """Rules S08, S09 and S11: what a stop or the loss of a lock has brought to rest gets no goal, and does not move."""
     rests = stop.since + stop.rests_s
     goals = KINDS[stop.group].goals(log, rests, stop.until)
-    late = [since for since, until in _motions(log, ended) if max(since, rests + _MEASURED_S) < min(until, stop.until)]
+    still = rests + KINDS[stop.group].settles_s
+    late = [since for since, until in _motions(log, ended) if max(since, still) < min(until, stop.until)]
     return [
         *(
             f"{stop.group} got {one.name} of {one.registers or one.hex} at {one.t:.6f}, "
@@ -70,7 +68,7 @@ def _moves_in(log: Sequence[Entry], stop: Stopped, ended: float) -> list[str]:
 
 def _moves_without_call(group: str, log: Sequence[Entry], moved: Sequence[Moved], ended: float) -> list[str]:
     """Rules S04 to S06: each motion is within the time of calls that move its group, and of what these may leave."""
-    asked = list(_joined((one.since, one.until + one.lasts_s + _MEASURED_S) for one in moved))
+    asked = list(_joined((one.since, one.until + one.lasts_s + KINDS[group].settles_s) for one in moved))
     for since, until in _motions(log, ended):
         over = max((end for begin, end in asked if begin <= since <= end), default=None)
         if over is None:

@@ -20,6 +20,9 @@ from trade_hil_sim.odrive import OdriveBus
 _BRAKES_RAD: Final = 0.15
 """From 2.5 rad/s at 20 rad/s^2: how far from where it rests the last set-point of a joint that is held may be."""
 
+_CREEPS_S: Final = 1.0
+"""A Dynamixel shows no speed below 0.036 rad/s: a slow joint has still 0.03 rad to go when it seems to rest."""
+
 
 def _goal_register(entry: Entry) -> float | None:
     """Servos get a goal only while they move: where to does not matter."""
@@ -51,6 +54,8 @@ class RobotKind:
     goal: Callable[[Entry], float | None]
     """The target of an instruction or frame in rad of the device's own shaft; None: it is no goal."""
     can: bool = False
+    settles_s: float = 0.15
+    """How long it may move after its driver has measured rest: a cycle."""
 
     @property
     def home(self) -> str:
@@ -89,7 +94,7 @@ KINDS: Final = {
     kind.group: kind
     for kind in (
         RobotKind("rosie.tail", TAIL, FeetechBus, _goal_register),
-        RobotKind("rosie.head", HEAD, DynamixelBus, _goal_register),
+        RobotKind("rosie.head", HEAD, DynamixelBus, _goal_register, settles_s=_CREEPS_S),
         RobotKind("rosie.leg", LEG, Cia402Bus, _cia402, can=True),
         RobotKind("rosie.arm", ODRIVE.replace("tail", "arm"), OdriveBus, _odrive, can=True),
         RobotKind("rosie.hand", DAMIAO.replace("tail", "hand"), DamiaoBus, _damiao, can=True),

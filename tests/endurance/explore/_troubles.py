@@ -75,9 +75,11 @@ def _prompt(stage: Stage, what: str, report: StopReport | EstopReport, took_s: f
 def _break(stage: Stage, kind: RobotKind) -> None:
     asked = stage.disturb()
     try:
-        stage.operator.break_lock(where(group=kind.group), reason="drawn")
+        broken = stage.operator.break_lock(where(group=kind.group), reason="drawn")
     except errors.TradeError:
         return
+    if not broken:
+        return  # no client had it, or one on the other side of the gateway, whose locks it does not break
     since = time.monotonic()
     stage.stopped.append(Stopped("broken lock", kind.group, since, since + _HOLDS_S, _BRAKES_S, asked))
 
