@@ -5,12 +5,12 @@ import os
 import sys
 import threading
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from trade.testing.virtual._scheduler import Scheduler, VirtualTimeError
 
 _PROCESSES: Final = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "os.exec"}
-_SOCKETS: Final = {"socket.connect", "socket.bind", "socket.getaddrinfo", "socket.sendto"}
+_CONNECT: Final = "socket.connect"
 _LOOK_S: Final = 0.5
 OUTSIDE_S: Final = 10.0
 """How long a thread may wait outside, in real seconds."""
@@ -20,14 +20,15 @@ _running: list[Scheduler] = []
 
 
 def _audit(event: str, args: tuple[Any, ...]) -> None:
-    if not _running or (event not in _PROCESSES and event not in _SOCKETS) or not _running[0].knows_this_thread():
+    if not _running or (event not in _PROCESSES and event != _CONNECT) or not _running[0].knows_this_thread():
         return
     if event in _PROCESSES:
         said = _words(args) if event == "subprocess.Popen" else event
         raise VirtualTimeError(f"a process was started ({said}): virtual time has threads of this process only")
-    if event != "socket.getaddrinfo" or args[0] not in {"localhost", "127.0.0.1", "::1", "", None}:
-        said = f"{event}, {args[0] if event == 'socket.getaddrinfo' else args[1]}"
-        raise VirtualTimeError(f"a real socket was used ({said}): virtual time reaches no other process")
+    if isinstance(args[1], tuple) and not str(cast("tuple[Any, ...]", args[1])[0]).startswith(
+        ("127.", "::1", "localhost")
+    ):
+        raise VirtualTimeError(f"a real socket was used (to {args[1]}): virtual time reaches no other host")
 
 
 def _words(args: tuple[Any, ...]) -> str:

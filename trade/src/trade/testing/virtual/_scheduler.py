@@ -142,8 +142,6 @@ class Scheduler:
 
     def wake(self, task: Task, woken: bool = True) -> None:
         """Make a waiting thread ready."""
-        if _thread.get_ident() != self._current.ident:
-            self._me()
         task.turn += 1
         task.woken = woken
         for waiting in task.waits_in:
@@ -233,10 +231,13 @@ class Scheduler:
         if self._ended:
             raise self.interrupt or VirtualTimeError("virtual time is over") if task is self._main else Ended
         if task is not self._current:
-            name = threading.current_thread().name
+            known = next((one for one in threading.enumerate() if one.ident == _thread.get_ident()), None)
             why = "it was there before virtual time began" if task is None else "it waits outside of virtual time"
-            self.foreign = VirtualTimeError(f"thread {name} ran beside {self._current.name}: {why}")
-            raise self.foreign
+            name = "of a library in C" if known is None else known.name
+            error = VirtualTimeError(f"thread {name} ran beside {self._current.name}: {why}")
+            if known is not None and not isinstance(known, threading._DummyThread):  # a library hears of it itself
+                self.foreign = error
+            raise error
         return self._current
 
     def _hand_over(self, me: Task) -> None:
