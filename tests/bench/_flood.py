@@ -124,9 +124,6 @@ def _ask(pipe: Connection, request: object):
     return hear(pipe)
 
 
-# --- the robot
-
-
 def _serve(pipe: Connection, papers: Path, policy: Path, door: str) -> None:
     from trade import service
 
@@ -147,9 +144,6 @@ def _serve(pipe: Connection, papers: Path, policy: Path, door: str) -> None:
         pipe.send("up")
         while _heard(pipe):
             pipe.send(Neck.ran)
-
-
-# --- the honest caller
 
 
 def _plan(pipe: Connection, papers: Path, policy: Path, door: str) -> None:
@@ -177,9 +171,6 @@ def _took_ms(call) -> float:
     except TradeError:
         return math.inf
     return (time.perf_counter() - began) * 1e3
-
-
-# --- the flood
 
 
 def _flood(pipe: Connection, papers: Path, policy: Path, door: str, callee: str) -> None:
@@ -249,9 +240,6 @@ def _heard(pipe: Connection):
         return pipe.recv()
     except (EOFError, OSError):
         return None
-
-
-# --- the report
 
 
 def _print(results: Mapping[str, Sequence[Felt]], n: int) -> None:

@@ -97,9 +97,6 @@ def _print_targets(joiners: Sequence[Seen], kib: Sequence[float], of: str) -> No
     print_target(f"{of}find: us", find_us, f"at most {_MOST_FIND_US:.0f}", lambda us: us <= _MOST_FIND_US)
 
 
-# --- the server
-
-
 def _serve(pipe: Connection, providers: int, services: int) -> None:
     from trade import Container, Settings
 
@@ -113,9 +110,6 @@ def _serve(pipe: Connection, providers: int, services: int) -> None:
             pipe.recv()
         except EOFError:  # the run is over
             return
-
-
-# --- the late joiner
 
 
 def _join(providers: int, services: int, traced: bool) -> Seen:

@@ -117,9 +117,6 @@ def _print_targets(seen: Sequence[Seen]) -> None:
     print_target("lock: most / least", [locks], "at most 2", lambda ratio: ratio <= 2)
 
 
-# --- one size, in a process of its own
-
-
 def measure(size: int, whole: int | None = None) -> Seen:
     """Build a system of that many containers, and look at the last one that joins.
 

@@ -116,9 +116,6 @@ def _load(cycle: Cycle, seconds: float) -> float:
     return (time.process_time() - spent) / (time.monotonic() - began)
 
 
-# --- ways to exchange
-
-
 class Answers:
     """How many cycles lacked an answer; a machine that is suspended for a moment loses one, a faulty bus many."""
 
@@ -183,9 +180,6 @@ def _robot(*, fast: bool) -> str:
     return bus + "".join(_JOINT.format(id=device_id) for device_id in _IDS)
 
 
-# --- bytes of one cycle
-
-
 def _ask(fast: bool) -> bytes:
     block = _READ[0].to_bytes(2, "little") + _READ[1].to_bytes(2, "little")
     return encode(0xFE, _FAST_SYNC_READ if fast else _SYNC_READ, block + bytes(_IDS))
@@ -209,9 +203,6 @@ def _limit_hz(fast: bool) -> float:
 
 def _cycle_bytes(fast: bool) -> int:
     return len(_ask(fast)) + _answer_bytes(fast) + len(_write())
-
-
-# --- the report
 
 
 def _print(

@@ -12,8 +12,6 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.gate import Gate
 from trade import Container, errors, where
 
-# --- S11
-
 
 def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire(
     shared: SafetyRig, gate: Gate, planner: Container, operator: Container
@@ -77,9 +75,6 @@ def test_S11_a_client_without_the_lock_writes_nothing(
         assert shared.moves_back(planner)
 
 
-# --- S13
-
-
 def test_S13_a_lock_is_granted_once_devices_that_still_move_are_at_rest(
     shared: SafetyRig, planner: Container, operator: Container
 ) -> None:
@@ -118,9 +113,6 @@ def test_S13_a_device_that_comes_after_its_group_was_locked_is_sent_nothing_unde
     with planner.lock(either):
         rig.asked(planner, rig.readying)
         assert rig.moves_back(planner)
-
-
-# --- S05, S07, S08
 
 
 @pytest.fixture
@@ -209,9 +201,6 @@ def test_S08_a_stop_voids_commands_that_wait_in_the_queue(
     assert not shared.events("motion_started", mark)
 
 
-# --- S16
-
-
 def test_S16_a_group_with_a_missing_member_is_not_locked(
     shared: JointRig, driver: Container, planner: Container
 ) -> None:
@@ -243,9 +232,6 @@ def test_S16_coupled_joints_are_locked_together(
         with pytest.raises(errors.LockedByOther):
             move(0.1)
     assert not rig.commanded()
-
-
-# --- S20
 
 
 def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(rig: SafetyRig, gate: Gate) -> None:

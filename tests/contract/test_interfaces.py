@@ -129,9 +129,6 @@ def test_servos_drives_and_grippers_are_one_robot(robot: AttachedRobot) -> None:
     assert robot.gripper("left.hand").state().fault == ""
 
 
-# --- on hardware
-
-
 @pytest.fixture
 def head_file(tmp_path: Path) -> Path:
     file = tmp_path / "head.toml"

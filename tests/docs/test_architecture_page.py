@@ -79,9 +79,6 @@ def _defined(module: ast.Module) -> Iterator[str]:
             yield from (f"{node.name}.{one.name}" for one in node.body if isinstance(one, ast.FunctionDef))
 
 
-# --- the tables of rooms
-
-
 def shown() -> dict[str, dict[str, set[str]]]:
     """The page: by package and room, the classes that its row names."""
     found: dict[str, dict[str, set[str]]] = {package: {} for package in PACKAGES}

@@ -61,9 +61,6 @@ def gateway(folder: Path, text: str) -> Plan:
     return read_gateway_file(save(folder, "gateway.toml", text))
 
 
-# --- docs/guide.md
-
-
 @of("guide.md", "Let a system configure itself")
 def test_rules(tmp_path: Path, text: str) -> None:
     [rule] = read_rules(save(tmp_path, "rules.toml", text)).values()
@@ -133,9 +130,6 @@ def test_a_share(tmp_path: Path, text: str) -> None:
     assert set(gateway(tmp_path, door.text + text).shares) == {"clinic"}
 
 
-# --- docs/drivers.md
-
-
 @pytest.mark.realtime
 @of("drivers.md", "The robot file")
 def test_a_robot_file(tmp_path: Path, text: str) -> None:
@@ -186,9 +180,6 @@ def test_an_entry_point(text: str) -> None:
 @of("drivers.md", "In an afternoon: a sensor as a plug-in")
 def test_the_entry_points_are_those_of_the_example(text: str) -> None:
     assert text in (ROOT / "examples" / "plugin" / "pyproject.toml").read_text(encoding="utf-8")
-
-
-# --- other pages
 
 
 @of("access-control.md", "The policy")

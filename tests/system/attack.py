@@ -63,8 +63,6 @@ class Attack:
         issued = self.site.papers.authority.folder / "issued" / who
         return issued if issued.exists() else self.site.papers.of(who)
 
-    # --- bare sessions
-
     def open(self, identity: str, mode: str = "peer") -> str:
         """A session with that certificate, linked to the gateway, and as a peer to its neighbour; its name."""
         name = f"{identity}{next(numbers)}"

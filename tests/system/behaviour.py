@@ -41,8 +41,6 @@ class Behaviour:
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    # --- what it is asked
-
     def sees(self) -> list[str]:
         """The robots that have anything to offer here."""
         found = self._container.services(where(kind="Motor"))
@@ -68,8 +66,6 @@ class Behaviour:
     def end(self) -> None:
         self._over.set()
         self._thread.join()
-
-    # --- what it does
 
     def _run(self) -> None:
         while not self._over.wait(0.02):

@@ -82,8 +82,6 @@ class Careless(ABC):
         self.ways = [self._go]
         """How it moves a joint."""
 
-    # --- what each kind of client has its own words for; all of these raise Refused
-
     @abstractmethod
     def joints(self, robot: str) -> list[str]:
         """Those of a robot that it knows of: the names of their resources, which are those of their groups."""
@@ -110,8 +108,6 @@ class Careless(ABC):
     @abstractmethod
     def resume(self, joint: str) -> None:
         """Let it move again after another client's stop."""
-
-    # --- what all do
 
     def _run_or_end(self) -> None:
         try:
@@ -234,8 +230,6 @@ class Careless(ABC):
         except Refused as no:  # the next one tries again
             self._log.note(Answer(t=now(), number="", how=f"{what}: {no.error}"))
 
-    # --- in the end
-
     def works(self) -> list[str]:
         """What is wrong once it locks everything and moves every joint; waits for them."""
         until, wrong = now() + _IN_THE_END_S, ["nothing was tried"]
@@ -261,8 +255,6 @@ class Careless(ABC):
         except Refused as no:
             return [str(no)]
         return []
-
-    # --- from its beginning to its end
 
     def serve(self) -> None:
         """Be it, until its input ends."""

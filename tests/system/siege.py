@@ -274,8 +274,6 @@ class Stand:
         self.clients[slot][1].kill()
         self.clients[slot] = self._client(slot)
 
-    # --- troubles
-
     def siege(self, seconds: float, fewest: int, kinds: Sequence[str]) -> None:
         """A few troubles at a time, until that time is over and every kind was had so often; all is undone then.
 
@@ -515,8 +513,6 @@ class Stand:
         )
         reported = json.loads(said.stdout) if said.returncode == 0 else {"through": False, "said": said.stderr}
         return Rescue(t=began, whom=whom, until=time.monotonic(), through=reported["through"], said=reported["said"])
-
-    # --- after it
 
     def quiet(self) -> None:
         """No client holds a lock any more, and no e-stop is open."""

@@ -69,9 +69,6 @@ def as_arm(attack: Attack) -> Iterator[str]:
     yield from own_session(attack, "arm")
 
 
-# --- a denied identity tries every verb, and asks no policy but its own
-
-
 def test_a_read_only_client_neither_moves_nor_locks(attack: Attack) -> None:
     before = attack.moved()
     for words in (("move", ARM, "1"), ("lock", ARM), ("hold", ARM)):
@@ -139,9 +136,6 @@ def test_services_of_a_container_without_the_right_to_offer_are_invisible(attack
     attack.arm.ask("deregister_one", "rosie.leg")
 
 
-# --- by other ways
-
-
 def test_a_notification_does_nothing_that_its_owner_has_no_right_to(attack: Attack) -> None:
     for member in (attack.dash, attack.planner):
         member.ask("greet_joining", "lab.planner.bell", ARM)
@@ -180,9 +174,6 @@ def test_a_nested_call_has_the_rights_of_its_container_and_not_of_the_first_call
     assert attack.moved() == before
     attack.dash.ask("call", "relay", "lab.planner.relay", "planner", "2")
     assert attack.moved() == [*before, 2]
-
-
-# --- forged messages
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
@@ -332,9 +323,6 @@ def test_a_private_container_with_the_name_of_a_public_one_takes_nothing_from_it
     attack.site.members.remove(twin)
 
 
-# --- certificates
-
-
 @pytest.fixture(scope="module")
 def bad_certificates(attack: Attack) -> dict[str, tuple[Path, str]]:
     """Folders that no container would start with, and the error for each."""
@@ -366,9 +354,6 @@ def test_an_invalid_certificate_is_refused(
     assert not attack.intruder.ask("linked_now", name)
     for session in (name, good):
         attack.intruder.ask("close", session)
-
-
-# --- no rights at all; the last one changes the policy
 
 
 def silent(attack: Attack, name: str, who: str) -> bool:

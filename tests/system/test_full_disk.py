@@ -89,9 +89,6 @@ def test_a_container_started_on_a_full_disk_works_is_found_and_keeps_its_record_
     assert trade_command("audit", "verify").returncode == 0
 
 
-# --- files that people made, or that are made for them: as they were, or whole
-
-
 def test_an_authority_that_cannot_be_written_is_none_and_can_be_made_later(disk: SmallDisk) -> None:
     disk.fill()
     with pytest.raises(OSError, match="space"):

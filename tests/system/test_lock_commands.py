@@ -248,9 +248,6 @@ def test_resume_of_nothing_is_of_no_such_service(trade_command: Command) -> None
     assert said.stderr.startswith("NoSuchService: no service matches group='rosie'")
 
 
-# --- stops
-
-
 def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
     stopped = trade_command("estop", "--reason", "smoke", "--json")

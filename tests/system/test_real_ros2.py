@@ -135,9 +135,6 @@ def lab(ros: RealRos2) -> RosProgram:
     return node
 
 
-# --- what ROS sees
-
-
 def test_the_bridge_is_a_node_with_topics_services_and_actions(ros: RealRos2, bridged: Bridged) -> None:
     assert "/trade\n" in ros.ros2("node", "list").ended()
     topics = ros.ros2("topic", "list", "-t").ended()
@@ -181,9 +178,6 @@ def test_P08_c_python_ros_1_and_a_real_ros_2_are_in_one_system(
         assert "data: 24.5" in ros.ros2("topic", "echo", "--once", "/battery_of_ros1").ended()
         trade.find(where(name="move_to", group="rosie.hand"), wait_s=PATIENCE_S)(0.08)
         assert "data: 0.08" in ros.ros2("topic", "echo", "--once", "/width").ended()
-
-
-# --- what ROS moves
 
 
 def test_S03_commands_of_a_topic_move_a_joint_until_their_node_is_killed(ros: RealRos2, bridged: Bridged) -> None:
@@ -261,9 +255,6 @@ def test_S03_the_goal_of_a_killed_node_ends_and_its_motion_stops(ros: RealRos2, 
     wait_until(lambda: ("stop", None) in bridged.hand.commands, "it is stopped")
     assert bridged.hand.went == []
     wait_until(lambda: bridged.robot.locks() == [], "its lock is released")
-
-
-# --- what comes from ROS
 
 
 def test_a_service_of_a_node_is_called_and_stopped(ros: RealRos2, bridged: Bridged) -> None:

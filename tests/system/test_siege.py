@@ -66,9 +66,6 @@ def test_nothing_moves_that_must_not_whatever_faults_occur(besieged: Stand) -> N
     assert count["held back"] > 0 or "delay" not in KINDS
 
 
-# --- the judge itself
-
-
 def begun(t: float, counts: int, since: int = 2048) -> Entry:
     return Entry(
         t=t,

@@ -73,8 +73,6 @@ class Stand:
     def _through(self, version: int) -> list[str]:
         return [str(_THROUGH), str(version)]
 
-    # --- from one version to another
-
     def change_gateway(self, version: int) -> None:
         began = time.monotonic()
         self.site.through = self._through(version)
@@ -91,8 +89,6 @@ class Stand:
         before = driver.pid
         os.kill(driver.pid, signal.SIGTERM)
         wait_until(lambda: driver.pid != before, f"the driver of {robot} is started again")
-
-    # --- looking
 
     def command(self, host: str, version: int, *words: str) -> "subprocess.CompletedProcess[str]":
         """What ``trade WORDS`` of a version says on that host."""

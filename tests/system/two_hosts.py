@@ -125,8 +125,6 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
         for name in ("base", "rover"):
             self.begin(name)
 
-    # --- what befalls them
-
     def begin(self, host: str) -> None:
         """Start a gateway."""
         words = ["-m", "trade_gateway", "gateway", str(self._folder / f"{host}.toml"), "--json"]
@@ -178,8 +176,6 @@ providers = [{{ class = "beats:Mind", groups = ["hall"], args = ["{folder}", "{n
 
     def plug(self) -> None:
         ip("-n", self._networks.host("cable-switch"), "link", "set", "rover", "up")
-
-    # --- what became of it
 
     def lives(self) -> list[Life]:
         """Of all objects there ever were, by their first beat."""

@@ -2,8 +2,6 @@
 
 from tests.support.lock_log import Ask, Done, Held, Record, Seen
 
-# --- what happens at a driver
-
 
 class Command(Record):
     """The gate let a command through; the time is that before it was asked."""
@@ -52,9 +50,6 @@ class Beat(Record):
     """The driver's process runs; what lies further apart than it should is time it did not have."""
 
     epoch: str
-
-
-# --- what is done to them
 
 
 class Fault(Record):

@@ -47,9 +47,6 @@ def _robot(name: str) -> Any:
     return parse((EXAMPLES / name).read_text(encoding="utf-8"), name)
 
 
-# --- drivers: answers
-
-
 def _until_empty(take: Callable[[bytearray], object], corrupt: type[Exception]) -> Callable[[bytes], int]:
     """Take packets until there is none left; every one makes what is held shorter."""
 
@@ -159,9 +156,6 @@ class _Connection:
 
 def _dashboard_line(data: bytes) -> str:
     return dashboard._line(_Connection(data), 1e9)  # type: ignore[arg-type]
-
-
-# --- simulators: requests
 
 
 def _packets(reader: Callable[[], Any]) -> Callable[[bytes], Any]:

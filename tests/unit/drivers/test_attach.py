@@ -35,9 +35,6 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
     return prepare
 
 
-# --- which devices answer
-
-
 def test_an_unknown_model_is_named_by_its_number(head: Rig) -> None:
     head.sim.do(sim.WrongModel(ids=(1,), number=4711))
     assert "model number 4711" in refused(head)
@@ -80,9 +77,6 @@ def test_a_port_for_a_bus_that_is_not_in_the_file_is_refused(head: Rig) -> None:
     assert "there is no bus 'arm'" in refused(head, ports={"arm": "/dev/null"})
 
 
-# --- how it is set
-
-
 @pytest.mark.parametrize(
     ("registers", "remedy"),
     [
@@ -115,9 +109,6 @@ def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig)
     robot = rig.attach()
     assert "overload" in robot.motor("neck.pan").state().fault
     robot.motor("neck.tilt").move_to(0.1)
-
-
-# --- mistakes that show in the file alone
 
 
 def test_a_servo_on_a_can_bus_is_refused(head: Rig) -> None:
@@ -176,9 +167,6 @@ def test_a_group_over_two_buses_is_a_provider_like_any_other(rig: Rig) -> None:
         robot.close()
 
 
-# --- what is installed
-
-
 def test_the_installed_drivers_are_listed_by_name() -> None:
     assert "dynamixel" in drivers()
     assert issubclass(drivers()["dynamixel"][0].load(), Driver)
@@ -195,9 +183,6 @@ def test_a_driver_that_cannot_be_imported_or_is_none_is_refused(head: Rig, monke
         points = [EntryPoint("dynamixel", value, "trade.drivers")]
         monkeypatch.setattr(driver_module, "entry_points", lambda group, points=points: points)
         assert complaint in refused(head)
-
-
-# --- together or not at all
 
 
 def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> None:

@@ -27,9 +27,6 @@ def channel() -> str:
     return f"test_can_{next(_numbers)}"
 
 
-# --- the bus
-
-
 @pytest.mark.parametrize(("size", "bits"), [(0, 55), (8, 135)])
 def test_a_frame_takes_at_most_the_bits_of_the_standard(size: int, bits: int) -> None:
     assert frame_bits(size) == bits
@@ -123,9 +120,6 @@ def test_a_bus_off_is_a_loss_and_what_comes_before_it_is_only_noted(channel: str
     port.close()
 
 
-# --- a bus behind socketcand
-
-
 @pytest.fixture
 def bus() -> Iterator[CanBus]:
     with CanBus(paced=False) as simulated:
@@ -208,9 +202,6 @@ def test_a_server_that_does_not_greet_is_a_loss_and_not_a_hang(greeting: bytes) 
         with pytest.raises(PortLost):
             port.open()
         host.join()
-
-
-# --- the drive
 
 
 @pytest.mark.parametrize(

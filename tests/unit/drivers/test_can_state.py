@@ -23,9 +23,6 @@ __all__ = ["leg", "rig"]
 _numbers = itertools.count()
 
 
-# --- the service
-
-
 def test_a_healthy_bus_says_so(leg: Leg) -> None:
     state = leg.attach().monitor("legs").bus_state()
     assert (state.name, state.port, state.up) == ("rosie.bus.legs", leg.sim.port, True)
@@ -71,9 +68,6 @@ def test_the_state_of_the_bus_is_a_service_of_the_robot_that_any_client_can_call
     assert not [handle for handle in asker.services(where(group="rosie.bus")) if handle.effect != "read"]
 
 
-# --- health
-
-
 def test_joints_groups_and_the_bus_report_that_the_bus_is_unhealthy_and_healthy_again(leg: Leg) -> None:
     reported: list[tuple[object, str]] = []
     robot = leg.attach(set_health=lambda provider, health: reported.append((provider, health)))
@@ -110,9 +104,6 @@ def test_health_is_degraded_from_error_passive_on(frame_id: int, data: int, heal
             assert "bus-off" in health
     assert monitor.health() == health
     port.close()
-
-
-# --- what the operating system reports
 
 
 def attribute(kind: int, value: bytes) -> bytes:

@@ -82,9 +82,6 @@ def swing(group: JointGroup) -> Outcome:
     )
 
 
-# --- trajectories
-
-
 def test_drives_that_support_it_receive_a_trajectory_position_at_every_sync(leg: Leg) -> None:
     group = leg.attach().group("leg")
     group.move_to([0.3, 0.1])
@@ -137,9 +134,6 @@ def test_a_drive_in_position_mode_is_closer_to_its_trajectory_than_one_with_goal
         assert swing(group).wait().error is None
         mean.append(sum(off) / len(off))
     assert mean[1] < mean[0] / 2
-
-
-# --- speeds
 
 
 @pytest.mark.parametrize("mode", TURNING)
@@ -209,9 +203,6 @@ def test_S22_a_speed_comes_to_rest_at_the_end_of_the_range(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     wait_until(lambda: hip.set_velocity(2.0, valid_s=0.5) or hip.state().position_rad > 0.98, "it is at the end")
     assert leg.truth(HIP).position_rad <= 1.001
-
-
-# --- from one to another
 
 
 ASKS: dict[str, Callable[[Drive], object]] = {
@@ -284,9 +275,6 @@ def test_an_old_target_velocity_does_not_come_to_life_when_it_is_enabled(rig: Le
     assert max(speeds(rig, HIP, rest)) <= 0
 
 
-# --- drives that lack something
-
-
 def test_a_drive_without_these_modes_gets_goals(rig: Leg) -> None:
     rig.plug(prepare=only(PROFILE_POSITION, HOMING))
     robot = rig.attach()
@@ -318,9 +306,6 @@ def test_a_drive_that_would_relax_after_a_quick_stop_is_not_used_in_these_modes(
     robot = rig.attach()
     assert swing(robot.group("leg")).wait().error is None
     assert set(modes(rig)) == {PROFILE_POSITION}
-
-
-# --- set-points by themselves
 
 
 def run(stream: Following | Turning, cycles: int, measured: int = 0) -> list[int]:

@@ -142,9 +142,6 @@ def test_a_driver_that_was_held_up_does_not_take_its_drives_for_silent(
     assert len(rig.frames("nmt")) == attached
 
 
-# --- processes that stand still
-
-
 class Stand:
     """A simulated leg in a process of its own."""
 
@@ -234,9 +231,6 @@ def ask(process: "subprocess.Popen[str]", line: str) -> str:
     assert process.stdout is not None
     print(line, file=process.stdin, flush=True)
     return process.stdout.readline().strip()
-
-
-# --- drives that network management has stopped
 
 
 @pytest.mark.realtime

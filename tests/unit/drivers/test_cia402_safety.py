@@ -18,9 +18,6 @@ QUICK_STOP = 0x02
 """Of bits 1, 2 and 7 of the controlword only the first (CiA 402-2, device control commands)."""
 
 
-# --- time
-
-
 @pytest.mark.realtime
 def test_S01_a_search_for_home_that_does_not_end_in_time_is_halted_before_its_deadline(
     rig: Leg, start_container: Callable[..., Container]
@@ -35,9 +32,6 @@ def test_S01_a_search_for_home_that_does_not_end_in_time_is_halted_before_its_de
             search.with_(deadline_s=1.5)(34, 0.01)
         began = rig.wait_for("motion_started", HIP).t
         assert any(word & HALT or word & 0x86 == QUICK_STOP for word in rig.controlwords(HIP, began))
-
-
-# --- stop
 
 
 def test_a_halted_drive_does_not_continue_to_its_old_goal_when_it_is_moved_again(leg: Leg) -> None:
@@ -56,9 +50,6 @@ def test_a_halted_drive_does_not_continue_to_its_old_goal_when_it_is_moved_again
         max(e.position_rad for e in leg.log if e.device_id == HIP and e.t > mark and e.position_rad is not None)
         < rest + 0.01
     )
-
-
-# --- attaching and leaving
 
 
 def test_S18_a_moving_drive_without_an_owner_is_stopped_and_left_enabled(leg: Leg) -> None:

@@ -191,9 +191,6 @@ def test_S23_a_homing_is_as_fast_in_every_unit(rig: Leg, objects: list[Object]) 
     assert rates == pytest.approx([COUNTS_PER_RAD, 20 * COUNTS_PER_RAD], rel=0.01)
 
 
-# --- scale
-
-
 @pytest.mark.parametrize(
     "objects",
     [
@@ -317,9 +314,6 @@ def test_S23_units_that_a_loss_of_power_has_changed_are_used_from_then_on(rig: L
     motor.enable()
     assert [drive.store.get(name) for name in RAMPS] == [716, 4774, 4774, 4774]
     assert motor.move_to(0.1) == pytest.approx(0.1, abs=0.01)
-
-
-# --- range
 
 
 @pytest.mark.parametrize(("limit", "at"), [("position_limit_max", 42_373), ("position_limit_min", -42_373)])

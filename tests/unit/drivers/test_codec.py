@@ -28,9 +28,6 @@ def joint(**changes: object) -> Joint:
     return Joint(name="neck.pan", bus="neck", model="XL430-W250", **values)  # type: ignore[arg-type]
 
 
-# --- packets
-
-
 def test_the_crc_is_that_of_the_manual() -> None:
     assert crc16(b"123456789") == 0xFEE8
     assert crc16(bytes.fromhex("FFFFFD0001030001")) == 0x4E19
@@ -78,9 +75,6 @@ def test_an_echoed_instruction_is_no_answer() -> None:
     ping = bytes.fromhex("FFFFFD000103000119 4E")
     whole = status(1, 0, b"")
     assert take_status(bytearray(ping + whole)) == whole
-
-
-# --- the table
 
 
 def vendor_table(model: str) -> dict[str, tuple[int, int]]:
@@ -140,9 +134,6 @@ def test_counts_are_twos_complement_where_the_table_says_so() -> None:
         table.PROFILE_VELOCITY.encode(-1)
 
 
-# --- radians and counts
-
-
 @given(st.integers(0, 4095), st.booleans(), st.floats(-3, 3))
 def test_counts_and_angles_convert_back_and_forth(counts: int, reversed_: bool, offset_rad: float) -> None:
     scale = Scale(joint(reversed=reversed_, offset_rad=offset_rad), GRAIN)
@@ -155,9 +146,6 @@ def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
         ends = sorted(round(axis.scale.counts(angle)) for angle in (-1.0, 1.0))
         assert axis.low <= ends[0] < ends[1] <= axis.high
         assert axis.high - axis.low <= ends[1] - ends[0] + 2
-
-
-# --- profiles
 
 
 LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(GRAIN))
@@ -181,9 +169,6 @@ def test_joints_arrive_together(legs: list[Leg]) -> None:
 def test_a_joint_alone_uses_its_limits() -> None:
     (profile,) = together([Leg(2000, 104, 53, GRAIN)])
     assert profile[:2] == (53, 104)
-
-
-# --- names
 
 
 def test_the_public_names_exist() -> None:

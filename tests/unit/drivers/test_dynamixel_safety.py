@@ -21,8 +21,6 @@ from trade_drivers.vendors.dynamixel import DynamixelDriver
 
 pytestmark = pytest.mark.virtual_time
 
-# --- S01 late is never
-
 
 def test_S01_a_command_that_expires_while_a_silent_joint_holds_the_bus_up_is_never_written(head: Rig) -> None:
     robot = head.attach()
@@ -41,9 +39,6 @@ def test_S01_an_enable_that_went_out_and_then_expired_unheard_is_not_said_to_hav
     head.sim.do(trade_hil_sim.Mute(ids=(1,), instruction="write"))
     error = Outcome(pan.enable, deadline_s=0.05).wait().error
     assert isinstance(error, errors.OutcomeUnknown | errors.DeviceSilent)
-
-
-# --- S06 the last resort is in the device
 
 
 class Child:
@@ -89,16 +84,10 @@ def test_S06_after_the_watchdog_only_an_explicit_enable_lets_it_move_again(head:
     assert pan.move_to(0.0) == pytest.approx(0.0, abs=0.03)
 
 
-# --- S07, S08 stop
-
-
 def test_S07_no_exchange_waits_longer_than_a_stop_may() -> None:
     from trade_drivers.bus import _serial_port
 
     assert _serial_port.LONGEST_WAIT_S < 0.050
-
-
-# --- S17
 
 
 def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_container) -> None:
@@ -118,17 +107,11 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
         container.register(Unstoppable(), "rosie.wheel")
 
 
-# --- S22 limits
-
-
 def test_S22_one_value_outside_refuses_the_whole_group(head: Rig) -> None:
     robot = head.attach()
     with pytest.raises(errors.LimitExceeded, match=r"rosie\.neck\.tilt"):
         robot.group("head").move_to([0.1, 0.7])
     assert not head.moves()
-
-
-# --- S08
 
 
 @pytest.mark.parametrize(("still", "holds"), [(0, True), (1, True), (2, False)])
@@ -152,9 +135,6 @@ def test_S08_a_stop_holds_a_joint_that_only_its_last_measurement_shows_at_rest(
         assert bool(trade_hil_sim.writes(head.log, device_id=1, register="goal_position", since=mark)) == holds
     finally:
         exchange.wire.close()
-
-
-# --- enabling
 
 
 def test_a_servo_that_does_not_come_back_after_its_restart_ends_its_enabling(

@@ -126,8 +126,6 @@ class Model(RuleBasedStateMachine):
         assert all(job.ended for job in self.jobs)
         assert all(ticket.ended for ticket in self.tickets.values())
 
-    # --- by what happens
-
     def turn_of(self, job: Job) -> None:
         """Before one shares a device with an earlier one, that one has ended."""
         earlier = self.jobs[: self.jobs.index(job)]
@@ -159,8 +157,6 @@ class Model(RuleBasedStateMachine):
         self.tickets[number] = ticket
         assert all(joint.resource.stops != before for joint, before in zip(joints, stops, strict=True))  # void at once
         assert ticket.ended == (self.exchange.refusing is not None)
-
-    # --- what happens
 
     some = st.sets(st.integers(0, 2), min_size=1)
 

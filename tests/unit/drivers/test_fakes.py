@@ -35,8 +35,6 @@ pytestmark = pytest.mark.virtual_time
 JOINTS = ["rosie.neck.pan", "rosie.neck.tilt"]
 ANGLES = [0.1, -0.2, 0.3, 0.0, 0.5, -0.6]
 
-# --- the contracts; those set to None are of motion that takes time
-
 
 class TestFakeMotor(MotorContract):
     @pytest.fixture
@@ -96,9 +94,6 @@ class TestFakeVectorSensor(SensorContract):
     @pytest.fixture
     def sensor(self) -> Sensor:
         return FakeSensor("rosie.wrist", [0.0, 1.0, -9.8], "N")
-
-
-# --- what devices that move have in common
 
 
 def started(device: Any) -> Any:
@@ -165,9 +160,6 @@ def test_locks_and_e_stops_refuse_what_others_command(make: Callable[[], Any], s
         with pytest.raises(Stopped):
             move(goal)
     assert device.went == []
-
-
-# --- each one
 
 
 def test_it_is_found_as_a_joint_group_and_an_e_stop_holds_it() -> None:
@@ -326,9 +318,6 @@ def test_a_sensor_takes_only_finite_values_of_its_size(value: Any) -> None:
 def test_a_sensor_has_a_unit_of_readings() -> None:
     with pytest.raises(InvalidArgument, match="degC"):
         FakeSensor("rosie.oven.temperature", 70.0, "F")
-
-
-# --- a motion that takes time
 
 
 def activated_gripper() -> FakeGripper:

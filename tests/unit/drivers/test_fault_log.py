@@ -255,9 +255,6 @@ def test_only_so_many_are_kept_and_the_acknowledged_that_are_gone_go_first(bench
     assert {info.kind for info in bench.open(most=3).faults()} == wanted
 
 
-# --- from one process to the next
-
-
 def test_what_was_open_and_is_found_again_at_once_is_the_same_fault_and_not_another_time(bench: Bench) -> None:
     log = bench.open()
     bench.begin()
@@ -307,9 +304,6 @@ def test_faults_with_fields_of_a_later_version_are_read(bench: Bench) -> None:
     bench.written()
     assert bench.reported == []
     assert {info.device for info in bench.open().faults()} == {PAN, TILT}
-
-
-# --- bad disks
 
 
 @pytest.mark.parametrize("rubbish", [b"nonsense" * 1000, b"SQLite format 3\0" + random.Random(3).randbytes(9000)])

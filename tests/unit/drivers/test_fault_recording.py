@@ -221,9 +221,6 @@ def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> No
     assert 0 < spent["look"] < 0.2 * spent["cycle"], spent
 
 
-# --- devices that report no faults
-
-
 def asked(log: FaultLog, name: str, device: object) -> FaultPoller:
     recorder = FaultPoller(log, "faults of a test")
     recorder.start({name: device}, {name})

@@ -39,9 +39,6 @@ def await_answers(robot: AttachedRobot, joint: str) -> None:
     wait_until(lambda: state(robot, joint) is not None, f"{joint} answers")
 
 
-# --- silence
-
-
 def test_a_silent_joint_is_an_error_with_its_name_and_never_a_zero(head: Rig, robot: AttachedRobot) -> None:
     robot.motor("neck.pan").move_to(0.5)
     head.sim.do(sim.Mute(ids=(1,)))
@@ -139,9 +136,6 @@ def test_enabling_gives_a_joint_as_long_to_answer_as_its_measurements_may_be_old
     assert rig.truth(1).torque
 
 
-# --- damaged, late, cut, slow, double
-
-
 @pytest.mark.parametrize("late_s", [0.04, 0.07, 0.075, 0.08, 0.085, 0.09, 0.1, 0.12])
 def test_a_late_position_is_not_taken_for_a_new_one(head: Rig, robot: AttachedRobot, late_s: float) -> None:
     head.sim.do(sim.Late(ids=(1,), s=late_s, count=1, instruction="sync_read"))
@@ -186,9 +180,6 @@ def test_enabling_copes_with_an_answer_lost(head: Rig, robot: AttachedRobot) -> 
     head.sim.do(sim.Mute(ids=(1,), instruction="write", count=2))
     robot.motor("neck.pan").enable()
     assert head.truth(1).torque
-
-
-# --- unplugged
 
 
 def test_an_unplugged_bus_is_named_and_comes_back_by_itself(head: Rig, robot: AttachedRobot) -> None:
@@ -236,9 +227,6 @@ def test_closing_while_unplugged_ends_all_the_same(head: Rig, robot: AttachedRob
     with pytest.raises(BusGone):
         robot.close()
     robot.close()
-
-
-# --- the device itself
 
 
 def test_a_hardware_error_ends_the_move_and_is_named(head: Rig, robot: AttachedRobot) -> None:

@@ -36,9 +36,6 @@ def taken(data: bytes, size: int, ids: Sequence[int] = IDS) -> list[Status]:
         found.append(one)
 
 
-# --- packets
-
-
 @pytest.mark.parametrize(
     ("made", "wire"),
     [
@@ -117,9 +114,6 @@ def test_half_an_answer_waits_for_its_other_half(cut: int) -> None:
     assert take_status(buffer, IDS, 2) == Status(1, 0, b"\1\2")
 
 
-# --- registers
-
-
 @pytest.mark.parametrize(
     ("register", "counts", "raw"),
     [
@@ -157,9 +151,6 @@ def test_what_is_read_and_written_together_lies_together() -> None:
     assert (CYCLIC, SLOW, GOAL_BLOCK) == ((56, 6), (40, 27), (41, 7))
     goal = Goal(-100, 20, 15)
     assert goal_block(goal) == bytes((20, 0x64, 0x80, 0, 0)) + (150).to_bytes(2, "little")
-
-
-# --- how far ahead
 
 
 def joint(**changes: object) -> Joint:

@@ -36,9 +36,6 @@ def await_fault(robot: AttachedRobot, says: str) -> None:
     wait_until(lambda: (now := state(robot)) is not None and says in now.fault, f"its fault is {says!r}")
 
 
-# --- answers
-
-
 @pytest.mark.parametrize("hex_", ["ff", "ffff01", "ffff0108", "ffff01ff0000"])
 def test_garbage_goes_unnoticed(tail: TailRig, robot: AttachedRobot, hex_: str) -> None:
     root = robot.motor("tail.root")
@@ -74,9 +71,6 @@ def test_a_joint_that_is_now_another_device_does_not_even_get_a_hold(tail: TailR
     with pytest.raises(DeviceSilent):
         root.stop()
     assert not tail.moves(1, found)
-
-
-# --- its own protection
 
 
 def test_a_servo_that_was_too_hot_does_not_come_back_by_itself(tail: TailRig, robot: AttachedRobot) -> None:
@@ -133,9 +127,6 @@ def test_an_overload_found_when_attaching_is_cleared_by_enabling(tail: TailRig) 
     assert not tail.truth().torque
 
 
-# --- memory
-
-
 def test_enabling_locks_an_EEPROM_that_is_found_open(tail: TailRig, robot: AttachedRobot) -> None:
     tail.poke(55, 0)
     robot.group("tail").enable()
@@ -160,9 +151,6 @@ def test_a_restart_is_noticed_and_only_an_enable_lets_it_move_again(tail: TailRi
         root.move_to(0.0)
     root.enable()
     assert root.move_to(0.0) == pytest.approx(0.0, abs=0.03)
-
-
-# --- a goal switches torque on: who may have restarted without it gets none
 
 
 @pytest.mark.parametrize("under_way_rad", [0.1, 0.25])

@@ -17,8 +17,6 @@ pytestmark = pytest.mark.virtual_time
 
 __all__ = ["rig", "tail"]
 
-# --- S06 the device has no watchdog: what a driver leaves behind
-
 
 def test_S06_no_servo_has_a_watchdog_so_no_goal_is_farther_ahead_than_the_joint_gets_until_the_next(
     tail: TailRig,
@@ -44,18 +42,12 @@ def test_S06_no_set_point_is_farther_ahead_than_the_joint_gets_until_the_next(ta
     assert all(abs(goal_of(write) - measured_before(log, write)) <= lead_counts(0.5) for write in reported)
 
 
-# --- S07, S08 stop
-
-
 def test_S08_a_stop_of_a_relaxed_joint_sends_it_no_goal(tail: TailRig) -> None:
     """Some say that a goal switches the torque of these servos on."""
     robot = tail.attach()
     robot.motor("tail.root").stop()
     robot.group("tail").stop()
     assert not tail.moves()
-
-
-# --- S11 locks
 
 
 def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: TailRig) -> None:
@@ -73,9 +65,6 @@ def test_S11_the_bus_thread_itself_leads_on_only_under_the_live_grant(tail: Tail
     mark = written_now()
     tail.wait_for("at_rest", 1)
     assert all(goal_of(entry) <= tail.truth().position_counts + 1 for entry in tail.goals(1, mark))
-
-
-# --- S18 attach moves and resets nothing
 
 
 def test_S18_attaching_to_enabled_servos_writes_nothing_either(rig: TailRig) -> None:

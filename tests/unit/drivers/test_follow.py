@@ -116,9 +116,6 @@ def test_its_progress_rises_to_the_whole(group: JointGroup) -> None:
     assert all(len(progress.errors_rad) == 2 for progress in heard)
 
 
-# --- what is refused
-
-
 def _trajectory(*rows: Row) -> Callable[[JointGroup], object]:
     return lambda group: group.follow(through(*rows))
 
@@ -192,9 +189,6 @@ def test_one_that_lasts_longer_than_its_call_may_is_refused(head: Rig, group: Jo
     with call(2.0), pytest.raises(InvalidArgument, match="deadline"):
         group.follow(SLOW)
     assert not head.moves()
-
-
-# --- what ends it
 
 
 def started(head: Rig, group: JointGroup, tolerances: Tolerances | None = None) -> Outcome:

@@ -68,9 +68,6 @@ def test_a_long_or_foreign_name_of_a_port_holder_is_shown_in_part(what: str) -> 
     lock.release()
 
 
-# --- a CAN adapter on a serial line
-
-
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
     """The end of the adapter, and the device."""

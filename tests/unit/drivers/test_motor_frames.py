@@ -88,9 +88,6 @@ def test_no_bytes_confuse_an_odrives_decoders(data: bytes) -> None:
             assert len(data) != 8
 
 
-# --- Damiao
-
-
 def test_driver_and_simulator_agree_on_models_registers_and_status() -> None:
     assert {name: tuple(ranges) for name, ranges in damiao.MODELS.items()} == {n: tuple(r) for n, r in MODELS.items()}
     assert {(r.name, r.value) for r in damiao.Register} <= {(r.name, r.value) for r in SimRegister}

@@ -13,9 +13,6 @@ pytestmark = pytest.mark.virtual_time
 __all__ = ["motor_rig", "wag"]
 
 
-# --- attaching and leaving
-
-
 def test_S19_shutdown_while_moving_stops_first_and_relaxes(wag: MotorRig) -> None:
     robot = wag.attach()
     root = robot.motor("tail.root")

@@ -187,9 +187,6 @@ def test_S22_within_a_piece_the_range_is_left_no_farther_than_braking_needs() ->
     assert 0.14 < refused.value.value <= 0.15 + 1e-9
 
 
-# --- rest and 0, to what a joint resolves
-
-
 @pytest.mark.parametrize("speed", [1e-12, -4e-7, 5e-5, 1e-3])
 def test_a_last_speed_that_no_joint_resolves_is_rest(speed: float) -> None:
     made = plan(rows((0.0, 0.0, 0.0), (1.0, 0.5, speed)))

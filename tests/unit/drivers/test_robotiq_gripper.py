@@ -125,9 +125,6 @@ def test_closing_the_driver_stops_moving_fingers(hand: HandRig) -> None:
     assert not hand.truth.moving
 
 
-# --- wrong files, wrong devices
-
-
 @pytest.mark.parametrize(
     ("before", "after", "problem"),
     [
@@ -179,9 +176,6 @@ def test_a_gripper_that_was_never_activated_does_not_move_and_says_what_to_do(ha
     with pytest.raises(DeviceFault, match=r"not activated; call activate\(\)"):
         gripper.close()
     assert not hand.writes()
-
-
-# --- numbers
 
 
 def test_the_register_tables_of_driver_and_simulator_agree() -> None:

@@ -20,9 +20,6 @@ __all__ = ["hand", "rig"]
 SLOW_M_S = 0.02
 
 
-# --- S01
-
-
 @pytest.mark.parametrize("command", ["activate", "clear_fault"])
 def test_S01_a_command_of_a_gripper_at_rest_that_expires_while_the_bus_is_held_up_is_never_written(
     hand: HandRig, gate: Gate, command: str
@@ -77,15 +74,9 @@ def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_st
     assert len(hand.moves(mark)) == len(moves)
 
 
-# --- S06: the device has no watchdog
-
-
 def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
     page = Path(__file__).parents[3].joinpath("docs", "drivers.md").read_text(encoding="utf-8")
     assert "no watchdog" in page[page.index("## Robotiq") :]
-
-
-# --- S07
 
 
 def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, gate: Gate) -> None:
@@ -102,9 +93,6 @@ def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, 
     first = instructions(hand.log, since=mark)[0]
     assert (first.name, first.moves) == ("read_write", False)
     assert not hand.truth.moving
-
-
-# --- S08
 
 
 def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -> None:
@@ -142,9 +130,6 @@ def test_S08_a_stop_of_a_silent_gripper_is_sent_without_a_reading_and_cannot_act
         gripper.stop()
     assert {entry.hex for entry in hand.writes(mark)} == {"00" * 6}
     assert hand.truth.width_m > 0.03
-
-
-# --- S11 and S08 through the middleware
 
 
 HAND_SERVICES = where(group="rosie.left.hand")

@@ -11,8 +11,6 @@ from trade_hil_sim import DynamixelBus
 
 pytestmark = pytest.mark.virtual_time
 
-# --- S18 attach moves and resets nothing
-
 
 def _enable(sim: DynamixelBus) -> None:
     sim.devices[0].write(64, b"\1", time.monotonic())
@@ -24,9 +22,6 @@ def test_S18_attaching_to_enabled_servos_writes_no_motion(rig: Rig) -> None:
     assert not rig.moves()
     assert robot.motor("neck.pan").state().enabled
     assert rig.truth(1).watchdog == 15
-
-
-# --- S19 leaving
 
 
 @pytest.mark.parametrize("noticed", [True, False], ids=["before", "during the shutdown"])

@@ -172,9 +172,6 @@ def test_the_example_is_seen_to_move_in_a_simulator_of_its_own() -> None:
         assert Pixels(before).where(LIMB, place) != Pixels(after).where(LIMB, place)
 
 
-# --- what goes wrong
-
-
 def test_a_camera_that_does_not_answer_is_silent_and_is_back_by_itself(stage: Stage, camera: Camera) -> None:
     stage.sims["eye"].do(Unplug())
     with pytest.raises(DeviceSilent, match=r"rosie\.eye did not answer on http://127"):
@@ -215,9 +212,6 @@ def test_a_frozen_camera_shows_an_old_picture(stage: Stage, robot: AttachedRobot
 def test_a_command_that_a_camera_does_not_have_is_refused(stage: Stage) -> None:
     with pytest.raises(SimulationError, match="camera eye has no such thing as Jam"):
         stage.sims["eye"].do(faults.Jam())
-
-
-# --- attaching
 
 
 def test_a_camera_of_another_size_than_the_file_says_is_refused(stage: Stage) -> None:

@@ -27,9 +27,6 @@ def elsewhere(rig: ArmRig) -> str:
     return f"{first}.{second}.{third * 256 + fourth}"
 
 
-# --- S19, S20
-
-
 def test_S19_shutdown_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> None:
     moving = rig.set_off()
     mark = written_now()
@@ -67,8 +64,6 @@ def test_S20_of_two_drivers_of_an_arm_at_rest_one_gets_control(rig: ArmRig) -> N
     assert not rig.moves(mark)
 
 
-# --- services of the controller
-
 BESIDE = {
     "dashboard": "dashboard server (port 29999)",
     "rtde": "RTDE (port 30004)",
@@ -105,9 +100,6 @@ def test_a_scan_of_a_controller_without_dashboard_names_it() -> None:
         pytest.raises(errors.ConfigurationError, match=r"no dashboard server \(port 29999\).*but it has RTDE"),
     ):
         identify(sim.port)
-
-
-# --- S22
 
 
 def _narrowed(rig: ArmRig, joint: int, high: float) -> None:
@@ -196,9 +188,6 @@ def test_S22_a_joint_that_is_measured_outside_its_range_is_stopped_by_the_bus_th
     assert isinstance(moving.wait().error, errors.LimitExceeded)
     wait_until(lambda: not rig.moving, "it is at rest")
     assert low - 0.4 < rig.base_rad < high + 0.4
-
-
-# --- S18
 
 
 def test_S18_attaching_uploads_and_moves_nothing(rig: ArmRig) -> None:

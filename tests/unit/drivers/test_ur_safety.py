@@ -26,9 +26,6 @@ pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platfo
 __all__ = ["arm_rig", "free_rig"]
 
 
-# --- S01, S04
-
-
 def test_S01_a_command_whose_time_has_passed_is_never_sent(rig: ArmRig) -> None:
     with call(0.2) as expires_ns:
         sleep_past(expires_ns)
@@ -59,9 +56,6 @@ def test_S04_a_set_point_that_is_not_renewed_ends_in_a_stop(rig: ArmRig) -> None
     mark = written_now()
     wait_until(lambda: rig.arm.state().measured_at > mark + 0.1, "time has passed")
     assert not rig.moves(mark)
-
-
-# --- S06
 
 
 class Driver:
@@ -136,9 +130,6 @@ def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_continue(
         assert "held up for 3600." in str(error)
     wait_until(lambda: answers(rig.arm, mark + 0.3), "time has passed")
     assert not rig.moves(mark)
-
-
-# --- S07, S08, S10
 
 
 def test_S07_a_stop_is_the_first_thing_the_controller_hears_however_many_wait(rig: ArmRig) -> None:
@@ -229,9 +220,6 @@ def test_S10_moves_are_asynchronous_so_that_a_stop_can_come_between(rig: ArmRig)
     rig.arm.move_line([*rig.arm.state().pose[:2], rig.arm.state().pose[2] + 0.02, *rig.arm.state().pose[3:]])
     assert len(instructions(rig.log, "move_j")) == len(instructions(rig.log, "move_l")) == 1
     assert not [entry for entry in rig.moves() if "until it ends" in entry.detail]
-
-
-# --- S08, S11 with containers
 
 
 @pytest.fixture

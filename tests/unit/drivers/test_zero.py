@@ -229,9 +229,6 @@ def saved(bench: Bench) -> list[str]:
         store.close()
 
 
-# --- without a last known angle
-
-
 def test_S23_an_angle_outside_the_range_that_a_turn_would_put_inside_is_refused_with_both(damiao: Bench) -> None:
     damiao.lose_power("turn")
     mark = written_now()
@@ -293,9 +290,6 @@ def test_S23_a_servo_does_not_take_the_key() -> None:
     assert text != HEAD
     with pytest.raises(ConfigurationError, match=r"\.zero.*servo knows its angle"):
         check(parse(text, "head.toml"))
-
-
-# --- what is known, without a device
 
 
 def joint_of(**keys: Any) -> Joint:
@@ -361,9 +355,6 @@ def test_S23_a_joint_turned_by_hand_while_it_is_watched_is_believed() -> None:
     for number in range(100):
         zero.measured(number / 20, 0.01)  # 5 rad/s
         assert not zero.doubt(number / 20)
-
-
-# --- servos know their angle within one turn
 
 
 @pytest.fixture

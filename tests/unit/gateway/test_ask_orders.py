@@ -26,9 +26,6 @@ def refused(talk: Talk, sentence: str) -> str:
     return str(error.value)
 
 
-# --- confirmation
-
-
 @pytest.mark.parametrize(
     ("sentence", "shall", "calls"),
     [
@@ -102,9 +99,6 @@ def test_a_service_that_a_phrase_calls_needs_a_confirmation_only_if_it_acts(worl
     assert world.calls == ["neck stops", "neck moves 0.5", "neck stops"]
 
 
-# --- names
-
-
 def test_a_name_that_is_unknown_lists_what_exists_and_nothing_is_done(world: World) -> None:
     talk = world.talk()
     assert "I know no container or host 'mars'; there is container base, container rover" in refused(
@@ -159,9 +153,6 @@ def test_a_stop_with_two_meanings_stops_both_and_needs_no_confirmation(world: Wo
     assert sorted(world.calls) == ["left stops", "right stops"]
 
 
-# --- rights
-
-
 def test_an_order_without_the_right_is_refused_by_the_policy_before_it_is_asked(world: World, tmp_path: Path) -> None:
     policy = tmp_path / "policy.toml"
     policy.write_text(POLICY)
@@ -204,9 +195,6 @@ def test_nothing_that_acts_is_done_where_only_questions_are_answered(world: Worl
     assert world.asker.locks() == []
 
 
-# --- providers
-
-
 def test_a_provider_is_created_moved_and_ended(world: World, tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('[name]\n"thinker" = "tests.unit.gateway.asked_system:Planner"\n')
     talk = world.talk(read_lexicon(tmp_path / "own.toml"))
@@ -232,9 +220,6 @@ def test_a_class_that_the_container_does_not_allow_is_not_created(world: World) 
     with pytest.raises(NotInstantiable):
         world.talk().say("create tests.unit.gateway.asked_system:Planner on base", confirmed=True)
     assert world.planners() == ["rover"]
-
-
-# --- locks
 
 
 def test_a_dialogue_keeps_a_lock_makes_its_calls_under_it_and_releases_it(world: World, tmp_path: Path) -> None:
@@ -313,9 +298,6 @@ def test_a_single_sentence_cannot_keep_a_lock_and_says_so(world: World) -> None:
     assert "a lock of rosie.head would end with this command, so it was not taken" in refused(talk, "lock the head")
     assert world.asker.locks() == []
     assert world.calls == []
-
-
-# --- stops
 
 
 def test_what_was_stopped_moves_again_only_after_a_yes(world: World) -> None:

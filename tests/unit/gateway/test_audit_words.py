@@ -133,9 +133,6 @@ def test_a_folder_without_records_is_no_empty_record(tmp_path: Path) -> None:
         assert "TRADE_AUDIT" in str(done.exception)
 
 
-# --- verify
-
-
 def test_a_record_that_is_whole_verifies(folder: Path) -> None:
     done = trade("audit", "verify", folder)
     assert done.exit_code == 0

@@ -165,9 +165,6 @@ def test_without_any_state_it_says_so(config: Path, out: Path, tmp_path: Path, m
     assert f"there is no state in {tmp_path}/none" in reported.stderr.replace("\n", "")
 
 
-# --- databases
-
-
 def rows(path: Path) -> list[int]:
     with contextlib.closing(sqlite3.connect(path)) as database:
         return [number for (number,) in database.execute("select number from kept order by number")]
@@ -221,9 +218,6 @@ def test_a_damaged_database_is_kept_as_it_is_and_said(config: Path, state: Path,
     assert "door.state.sqlite is damaged" in reported.stderr.replace("\n", " ")
     [entry] = [entry for entry in read_archive(out).files if entry.path.endswith("sqlite")]
     assert entry.sha256 == hashlib.sha256(database.read_bytes()).hexdigest()
-
-
-# --- what is refused
 
 
 def test_an_existing_backup_is_not_overwritten(config: Path, state: Path, out: Path) -> None:
@@ -311,8 +305,6 @@ def test_a_link_does_not_lead_it_out_of_its_folder(config: Path, state: Path, ou
     assert (elsewhere / "policy.toml").read_text() == "theirs"
     assert not (to / "policy.toml").is_symlink()
 
-
-# --- archives that were changed
 
 Members = list[tuple[tarfile.TarInfo, bytes]]
 

@@ -166,9 +166,6 @@ def test_a_tab_completes_a_service_in_a_terminal(head: Head, terminal: Terminal)
     assert head.moved == 0
 
 
-# --- exit codes and errors
-
-
 def run(*words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([TRADE, *words], capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
 

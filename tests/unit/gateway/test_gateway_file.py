@@ -359,9 +359,6 @@ def test_check_starts_nothing(file: Path) -> None:
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
 
 
-# --- what this host is like
-
-
 def has(monkeypatch: pytest.MonkeyPatch, **addresses: str) -> None:
     """This host has these interfaces alone, each with its addresses, separated by spaces."""
     known = {name: frozenset(each.split()) for name, each in addresses.items()}
@@ -448,9 +445,6 @@ def test_a_host_that_forwards_between_the_networks_is_reported(
     assert "packets between its networks (net.ipv4.conf.eth0.forwarding, net" in checked(file)
     shutil.rmtree(sysctls)
     assert checked(file) == ""
-
-
-# --- other systems
 
 
 @pytest.fixture

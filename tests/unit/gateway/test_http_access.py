@@ -29,9 +29,6 @@ def served(tmp_path: Path) -> Iterator[Opened]:
         yield made
 
 
-# --- under which name, by which page
-
-
 def test_strangers_take_a_bounded_number_of_descriptors(served: Opened) -> None:
     place, strangers = urlsplit(served.gateway.url), list[socket.socket]()
     try:
@@ -94,9 +91,6 @@ def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:
             assert anna.ask("GET", "/services", Origin="http://localhost:5174").status == 403
             with anna.socket(origin=page) as socket:
                 assert ask(socket, do="call", id=1, group="robot.a", name="move", args=[1.0])["result"] == 1.0
-
-
-# --- where it listens, and the tokens
 
 
 def test_S21_an_http_gateway_on_a_network_needs_encryption_and_a_policy(tmp_path: Path) -> None:
@@ -163,9 +157,6 @@ def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: 
         add_token(path, "an na")
     with pytest.raises(ConfigurationError, match="trade http token"):
         Tokens(tmp_path / "missing.toml")
-
-
-# --- what is shown, and what paths lead to
 
 
 def test_no_token_is_in_a_log_or_an_answer(served: Opened, caplog: pytest.LogCaptureFixture) -> None:

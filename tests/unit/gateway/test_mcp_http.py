@@ -83,9 +83,6 @@ def test_without_the_setting_there_are_no_agents(tmp_path: Path) -> None:
             assert anna.ask("POST", "/mcp", rpc("initialize", **PEER)).status == 404
 
 
-# --- who is refused
-
-
 def test_an_unknown_token_or_another_clients_session_reaches_no_tool(served: Opened) -> None:
     stop = rpc("tools/call", 2, name="estop", arguments={})
     for token in ("", "wrong"):
@@ -145,9 +142,6 @@ def test_a_revoked_token_ends_the_agents_session_and_its_motion(served: Opened) 
             tasks.cancel_scope.cancel()
 
     run(moves)
-
-
-# --- who is gone
 
 
 async def _spin(served: Opened, agent: ClientSession, tasks: Any) -> None:
@@ -225,9 +219,6 @@ def test_fifty_idle_agents_keep_no_other_client_waiting_and_end(served: Opened) 
     wait_until(lambda: list(served.gateway._api.clients) == [], "all sessions have ended")
 
 
-# --- approvals
-
-
 def _approvals(by: Client, word: str, *args: Any) -> Any:
     return by.call(f"approvals.me.{word}", *args)
 
@@ -303,9 +294,6 @@ def test_a_marked_identity_makes_marked_calls_over_mcp_only(served: Opened) -> N
     assert bot.call("robot.a.where_is_it").body == {"result": 0.0}
     assert bot.call("robot.a.stop").status == 200
     assert served.client("chief").call("robot.a.move", 1.0).status == 200
-
-
-# --- pictures
 
 
 class Eye:

@@ -284,9 +284,6 @@ def test_an_expired_authority_issues_nothing(folder: Path, monkeypatch: pytest.M
     assert authority.issued() == []
 
 
-# --- the commands
-
-
 def said(*words: object) -> Result:
     return CliRunner().invoke(app, [*map(str, words)])
 

@@ -25,9 +25,6 @@ def played(*services: str, first: int = 1, **others: Any) -> list[Span]:
     return [span(first + index, service, **others) for index, service in enumerate(services)]
 
 
-# --- statistics
-
-
 def test_calls_and_errors_are_counted_by_service_and_times_ranked() -> None:
     spans = [span(number, "move", took_s=number / 1000) for number in range(1, 101)]
     spans += [span(200, "look", outcome="ValueError", caller="mind"), span(201, "look")]
@@ -47,9 +44,6 @@ def test_a_call_both_sides_noted_counts_once_as_it_was_served() -> None:
 def test_with_one_call_every_percentile_is_that_call() -> None:
     [only] = statistics([span(1, "move", took_s=0.125)])
     assert (only.p50_s, only.p99_s, only.max_s) == (0.125, 0.125, 0.125)
-
-
-# --- sequences
 
 
 def test_callers_do_not_mix_and_what_a_call_makes_is_a_sequence_of_its_own() -> None:

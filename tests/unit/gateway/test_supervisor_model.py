@@ -169,8 +169,6 @@ class Model(RuleBasedStateMachine):
             closing.join(PATIENCE_S)
             self.folder.cleanup()
 
-    # --- what the supervisor does its work with
-
     def _launched(self, child: Child, *_: object) -> Body:
         if self.no_processes:
             raise BlockingIOError("no process can be had")
@@ -188,8 +186,6 @@ class Model(RuleBasedStateMachine):
     def _asked(self, name: str) -> Question:
         self.questions.append(Question(self._body(name)))
         return self.questions[-1]
-
-    # --- what the model thinks
 
     def _settle(self) -> None:
         """Do whatever is to be done now."""
@@ -272,8 +268,6 @@ class Model(RuleBasedStateMachine):
             child.state = "waiting" if len(child.ends) <= RESTARTS else "given up"
             if child.state == "waiting":
                 child.until = self.now + min(30.0, 0.1 * 2 ** (len(child.ends) - 1))
-
-    # --- what happens
 
     def _named(self, data: st.DataObject, names: Iterable[str]) -> str:
         return data.draw(st.sampled_from(sorted(names)))
@@ -448,8 +442,6 @@ class Model(RuleBasedStateMachine):
     @rule()
     def processes_can_be_had_or_not(self) -> None:
         self.no_processes = not self.no_processes
-
-    # --- what must hold
 
     def _take_note(self) -> None:
         """The supervisor has done all that it does by itself."""

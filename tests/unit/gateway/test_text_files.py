@@ -119,9 +119,6 @@ def test_a_byte_order_mark_in_a_certificate_is_named(tmp_path: Path, name: str) 
         Certificate.read(folder)
 
 
-# --- written again
-
-
 def test_an_edited_policy_keeps_its_byte_order_mark_and_line_ends(tmp_path: Path) -> None:
     file = tmp_path / "policy.toml"
     file.write_bytes(codecs.BOM_UTF8 + b"a = 1\r\nb = 2\r\n")

@@ -61,9 +61,6 @@ def test_a_position_below_zero_has_its_sign_in_bit_15(clock: Any) -> None:
     assert Rig(clock, position_counts=-100).servo.read(POSITION, 2, clock()) == bytes((0x64, 0x80))
 
 
-# --- EEPROM
-
-
 def test_what_is_written_under_the_lock_lasts_until_power_off(rig: Rig) -> None:
     rig.write(21, 50)
     assert rig.read(21) == 50
@@ -98,9 +95,6 @@ def test_half_a_register_is_not_written(rig: Rig) -> None:
     rig.servo.write(GOAL, b"\0", rig.clock())
     assert rig.read(GOAL) == 2048
     assert rig.reported == ["refused"]
-
-
-# --- motion
 
 
 def test_it_goes_to_its_goal_at_its_speed_and_says_so_while_it_does(rig: Rig) -> None:
@@ -145,9 +139,6 @@ def test_torque_128_takes_where_it_is_for_the_centre(clock: Any) -> None:
     rig = Rig(clock, position_counts=2500)
     rig.write(TORQUE, 128)
     assert (rig.read(POSITION), rig.read(OFFSET), rig.read(TORQUE)) == (2048, 452, 0)
-
-
-# --- protection
 
 
 def strain(rig: Rig) -> None:

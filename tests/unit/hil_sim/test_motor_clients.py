@@ -25,9 +25,6 @@ def client(bus: OdriveBus | DamiaoBus) -> can.BusABC:
     return can.Bus(interface="socketcand", host=host, port=int(port), channel=channel, tcp_tune=True)
 
 
-# --- ODrive
-
-
 @pytest.fixture
 def odrive() -> Iterator[OdriveBus]:
     with OdriveBus([Axis(NODE, watchdog_s=None, t=time.monotonic())], paced=False) as bus:
@@ -108,9 +105,6 @@ def test_an_order_that_is_infinite_or_no_number_is_refused(odrive: OdriveBus, tu
         wait_until(lambda: bool(events(list(odrive.log.entries), "refused")), "it is refused")
     [truth] = odrive.state().devices
     assert truth.goal_counts == truth.position_counts
-
-
-# --- Damiao
 
 
 @pytest.fixture

@@ -73,9 +73,6 @@ def truth(line: RobotiqBus) -> sim.GripperTruth:
     return line.state().grippers[0]
 
 
-# --- pymodbus
-
-
 def test_pymodbus_activates_grips_and_releases(line: RobotiqBus, pymodbus: ModbusSerialClient) -> None:
     line.do(sim.Put(width_m=0.04))
     pymodbus.write_registers(COMMAND, [0x0100, 0, 0], device_id=9)
@@ -110,9 +107,6 @@ def test_pymodbus_hears_an_exception_of_a_gripper_that_has_them(make_line: Calla
         client.close()
 
 
-# --- minimalmodbus
-
-
 def test_minimalmodbus_activates_and_closes(line: RobotiqBus, minimal: minimalmodbus.Instrument) -> None:
     minimal.write_register(COMMAND, 0x0100, functioncode=6)
     wait_until(lambda: minimal.read_register(STATUS) == 0x3100)
@@ -135,9 +129,6 @@ def test_minimalmodbus_notices_a_bad_answer(
     with pytest.raises(minimalmodbus.InvalidResponseError):
         minimal.read_registers(STATUS, 3)
     assert len(minimal.read_registers(STATUS, 3)) == 3
-
-
-# --- bytes by hand
 
 
 def ask(port: serial.Serial, request: str, size: int) -> str:
@@ -187,9 +178,6 @@ def test_an_answer_takes_the_time_its_bytes_and_the_gap_before_it_take(make_line
     [went] = [entry for entry in line.log.entries if entry.kind == "sent"]
     characters = (went.t - came.t) * 9600 / 10
     assert characters > 8 + 3.5 + 11 - 0.5
-
-
-# --- log and orders
 
 
 def test_the_log_says_what_could_move_and_what_could_not(make_line: Callable[..., RobotiqBus]) -> None:

@@ -19,9 +19,6 @@ FROM = f'[[from_ros.action]]\naction = "/drive"\ntype = "{DRIVE}"\ngroups = ["ba
 GO = {"distance_m": 2.0, "mode": "slow"}
 
 
-# --- from ROS
-
-
 class RosBase:
     """A node of ROS that drives: at once, until it is canceled, or not at all."""
 
@@ -139,9 +136,6 @@ def test_an_action_that_no_node_serves_is_an_error_that_says_so(stand: Stand) ->
         drives(stand)(**GO)
 
 
-# --- to ROS
-
-
 class Driver:
     """Drives until the test lets it arrive."""
 
@@ -236,9 +230,6 @@ def test_an_action_without_a_field_for_a_parameter_is_not_mapped_and_the_reason_
 def test_a_result_field_that_the_type_does_not_have_is_an_error_of_the_file(stand: Stand) -> None:
     with pytest.raises(ConfigurationError, match="has no field 'reached_m'"):
         stand.up(TO + 'result = { reached_m = "driven_m" }\n')
-
-
-# --- grippers
 
 
 COMMAND, PARALLEL = "control_msgs/action/GripperCommand", "control_msgs/action/ParallelGripperCommand"

@@ -51,9 +51,6 @@ def neck(member: Member, memory: MemorySystem) -> Neck:
     return neck
 
 
-# --- by the caller
-
-
 def test_a_permitted_identity_calls_reads_and_stops(member: Member, neck: Neck) -> None:
     planner = member("planner")
     assert (find(planner, "move")(0.1), find(planner, "angle")(), find(planner, "stop")()) == (0.1, 0.5, None)
@@ -241,9 +238,6 @@ def test_every_function_of_the_middleware_is_in_the_table_of_what_they_need() ->
     assert set(FUNCTIONS) == {*marked_methods(OwnServices, ()), *marked_methods(EstopServices, ())}
 
 
-# --- by the provider, whatever the caller did
-
-
 @pytest.fixture
 def careless(memory: MemorySystem, neck: Neck) -> Container:
     """A container of ``dash`` that has no policy, and so checks no rule before it calls."""
@@ -362,9 +356,6 @@ def test_any_container_may_offer_only_built_in_functions_in_the_middleware_group
     assert not access.may_offer("thief", "trade", "system", ("trade",))
 
 
-# --- reload
-
-
 def test_a_reloaded_policy_counts_for_the_next_call_on_both_sides(
     member: Member, careless: Container, policy: Path
 ) -> None:
@@ -460,9 +451,6 @@ def test_a_waiting_client_gets_no_lock_that_it_may_no_longer_hold(
     assert drv.locks() == []
 
 
-# --- what a nested call may do
-
-
 class Waver:
     def __init__(self, home: Container) -> None:
         self._home = home
@@ -484,9 +472,6 @@ def test_a_nested_call_is_made_and_judged_as_the_container_that_makes_it(
     assert dash.call(where(name="wave")) == 0.3
     with pytest.raises(AccessDenied):
         find(dash, "move")(0.3)
-
-
-# --- what it costs
 
 
 def test_a_caller_and_a_service_are_decided_about_once(
@@ -526,9 +511,6 @@ def test_a_caller_asks_its_policy_once_a_service(
     for _ in range(20):
         move(0.1)
     assert asked.count("move") == 1
-
-
-# --- settings
 
 
 def test_a_policy_is_named_in_the_environment_and_read_at_the_start(policy: Path, tmp_path: Path) -> None:

@@ -350,9 +350,6 @@ def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Pat
     assert len(set(stops)) == MANY
 
 
-# --- whole containers, linked directly, each with rules of its own, pinned by their certificates
-
-
 class Neck:
     @service
     def move(self, angle_rad: float) -> float:

@@ -284,9 +284,6 @@ def test_hooks_and_tracing_leave_a_record_as_it_is(here: Container, there: Conta
     assert [one for one in reported(there, folder) if one[0] == "call"] == [("call", "rosie.arm.reach", "ok")] * 2
 
 
-# --- off
-
-
 def test_a_disabled_audit_record_adds_no_interceptor_and_no_file(
     here: Container, start_container: Start, tmp_path: Path
 ) -> None:

@@ -147,9 +147,6 @@ def test_the_hash_covers_every_field_and_the_row_before() -> None:
     assert len(hashes) == 2 + len(AuditRow.__struct_fields__)
 
 
-# --- dropping
-
-
 def test_rows_beyond_the_most_go_by_whole_pieces_and_the_rest_still_verifies(path: Path, store: AuditStore) -> None:
     keep = Keep(days=1, rows=9, least=0, piece=5)
     assert store.drop(keep, row("", at_ns=2)) == 10
@@ -203,9 +200,6 @@ def test_a_dropped_row_that_no_other_row_names_is_reported_as_unverifiable(path:
     both = verdict(path, {7: bytes(32), 12: hashes[12]})
     assert (both.problem, both.untold, both.proven) == ("", (7,), 12)
     assert verdict(path, {7: hashes[7], 12: bytes(32)}).broken_at == 12
-
-
-# --- several at it
 
 
 def test_two_that_write_to_one_file_keep_one_chain(path: Path, store: AuditStore) -> None:

@@ -120,9 +120,6 @@ def test_a_full_audit_queue_blocks_no_caller_and_the_lost_records_are_counted(
     assert verdict(path).problem == ""
 
 
-# --- bad days
-
-
 @pytest.mark.parametrize("trouble", ["database or disk is full", "attempt to write a readonly database"])
 def test_what_cannot_be_written_waits_until_it_can_and_that_is_said_once(
     trouble: str,
@@ -299,9 +296,6 @@ def test_an_audit_folder_that_cannot_be_created_blocks_no_caller(
     assert "1 records" in caplog.text
 
 
-# --- clocks
-
-
 def test_a_clock_that_is_set_is_written_down(write: Write, path: Path, eventually: Eventually) -> None:
     times = [10**18, 0]
     writer = write(clocks=lambda: (times[0], times[1]))
@@ -340,9 +334,6 @@ def test_a_clock_that_jumped_far_drops_nothing_for_its_age(
     writer.close()
     assert (verdict(path).first > 1) is dropped
     assert verdict(path).problem == ""
-
-
-# --- its end
 
 
 @pytest.mark.realtime

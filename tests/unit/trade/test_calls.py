@@ -260,9 +260,6 @@ def test_a_failing_receiver_of_an_answer_disturbs_no_other(
     assert "the callback of an answer failed" in caplog.text
 
 
-# --- the clock of another container
-
-
 def test_an_unknown_clock_gives_no_expiry() -> None:
     peer = Peer(OTHER)
     assert not peer.clock_known

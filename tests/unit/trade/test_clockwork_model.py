@@ -163,9 +163,6 @@ TestModel = Model.TestCase
 TestModel.settings = hypothesis.settings(max_examples=30, stateful_step_count=30, deadline=None)
 
 
-# --- a process that can have no more threads, for a while
-
-
 def _refuse(monkeypatch: pytest.MonkeyPatch) -> None:
     start = threading.Thread.start
 

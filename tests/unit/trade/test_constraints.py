@@ -100,8 +100,6 @@ def test_a_constraint_matches_what_it_says(constraint: Constraint, candidate: Ca
     assert constraint.matches(candidate) is matches
 
 
-# --- any combination means the same as evaluating it term by term
-
 _dotted = st.sampled_from(["a", "b", "a.b", "a.b.c", "ab"])
 _patterns = st.sampled_from(["*", "a*", "?"])
 _TYPES: list[Any] = [int, float, str, bool, None, list[int], list[float], int | None, dict[str, int]]

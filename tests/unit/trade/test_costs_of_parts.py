@@ -121,9 +121,6 @@ def known(here: Container, there: Container, group: str = "robot", name: str = "
     return handle
 
 
-# --- calls
-
-
 def test_calls_and_started_calls_are_two_messages(here: Container, there: Container, heard: Heard) -> None:
     move = known(here, there)
     with heard.exactly(put=2 * TIMES):
@@ -207,9 +204,6 @@ def test_a_local_call_does_not_enter_the_kernel(tmp_path: Path) -> None:
     assert len(calls) <= 100, calls  # to wait its turn among threads, and for memory; not one for each of 2,000 calls
 
 
-# --- notifications, streams, hooks
-
-
 def test_a_notification_is_one_call_and_nothing_while_it_waits(
     here: Container, there: Container, system: MemorySystem, heard: Heard
 ) -> None:
@@ -284,9 +278,6 @@ def test_a_hook_of_the_same_container_takes_no_message_and_another_containers_on
     assert len(seen) == TIMES
 
 
-# --- locks
-
-
 @pytest.mark.parametrize("services", [1, 10])
 @pytest.mark.parametrize("containers", [1, 3])
 def test_a_lock_is_two_calls_to_each_container_however_many_services_it_has(
@@ -314,9 +305,6 @@ def test_a_renewal_is_one_call_to_each_container_however_many_locks(
         wait_until(lambda: heard.kinds[Kind.PUT] == 1, "it has been answered")
     for lock in locks:
         lock.release()
-
-
-# --- looking up, joining
 
 
 def test_find_takes_the_same_steps_among_ten_services_and_among_two_thousand(here: Container) -> None:
@@ -377,9 +365,6 @@ def test_a_container_takes_no_more_threads_however_many_others_there_are(system:
         system.container(f"c{number}")
     system.settle()
     assert threads() == 8 * each <= 8 * 9
-
-
-# --- the audit record
 
 
 def test_an_audit_record_sends_nothing_and_is_written_many_rows_at_a_time(

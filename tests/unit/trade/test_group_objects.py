@@ -221,9 +221,6 @@ def test_a_group_cannot_be_changed(me: Container, offer: Offer) -> None:
         me.robot("rosie").head = 3
 
 
-# --- by class
-
-
 def test_a_class_finds_its_provider(me: Container, offer: Offer) -> None:
     head = Head()
     offer(head, "rosie.head")

@@ -214,9 +214,6 @@ def run_all(threads: Sequence[threading.Thread]) -> None:
         thread.join(60)
 
 
-# --- what goes where
-
-
 def test_a_call_that_is_waited_for_takes_the_local_path(there: Container, add: Handle) -> None:
     local, other = taken(there)
     assert [add(value) for value in range(20)] == list(range(1, 21))
@@ -546,9 +543,6 @@ def test_a_caller_waits_for_none_of_the_serial_calls_behind_its_own(
     second.join(20)
 
 
-# --- the same outcome of each error on either path
-
-
 @pytest.fixture(params=["local path", "transport"])
 def robot(
     request: pytest.FixtureRequest, start_container: Any, arm: Arm, monkeypatch: pytest.MonkeyPatch
@@ -728,9 +722,6 @@ def test_a_frozen_callee_ends_the_wait_and_runs_the_call_once_at_most(
     assert count() <= 6
 
 
-# --- when a connection breaks
-
-
 def test_a_call_whose_connection_breaks_ends_on_the_transport_and_runs_once(
     here: Container, there: Container, add: Handle, gate: Gate
 ) -> None:
@@ -842,9 +833,6 @@ def test_a_lost_container_closes_its_connections(here: Container, there: Contain
     there.close()
     wait_until(lambda: not here._parts.local_path.slots, "they are closed")  # type: ignore[union-attr]
     assert not list((runtime_folder() / here.settings.system).glob(f".calls-*-{there.address.epoch}"))
-
-
-# --- bad input
 
 
 def dropped(container: Container) -> int:
@@ -1243,8 +1231,6 @@ def test_a_fork_takes_nothing_from_the_parent(
     assert program.heard() == "[1, 2, 3]"
 
 
-# --- when a caller ends
-
 _CALLER = """
 container = Container(Settings.read(container="caller"))
 add = container.find(where(name="add", local=False), wait_s=20).with_(deadline_s=20)
@@ -1316,9 +1302,6 @@ def test_a_caller_whose_process_cannot_be_watched_ends_with_its_link(
     caller.process.kill()
     wait_until(lambda: ended)
     assert ended == [address]
-
-
-# --- who calls
 
 
 @pytest.fixture

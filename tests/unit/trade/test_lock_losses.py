@@ -13,8 +13,6 @@ from trade._resources.resource import Latch
 
 pytestmark = pytest.mark.virtual_time
 
-# --- S12 and S14: loss
-
 
 class Losses:
     def __init__(self) -> None:
@@ -202,9 +200,6 @@ def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: R
     robot["a"].hold.set()
     assert run.exception(20) is not None
     assert robot["a"].written == []
-
-
-# --- notifications of its owner
 
 
 def test_each_refusal_is_an_error_of_its_own(robot: Robot) -> None:

@@ -165,9 +165,6 @@ def test_the_locks_around_a_task_are_forgotten_even_if_giving_back_is_cancelled(
     asyncio.run(main())
 
 
-# --- S15: inheritance
-
-
 class Relay:
     """A provider that uses the joint on behalf of its callers."""
 
@@ -240,9 +237,6 @@ def test_S15_a_thread_that_a_provider_leaves_running_has_no_permit_any_more() ->
             linger()
             with pytest.raises(errors.LockedByOther):
                 joint.later()
-
-
-# --- taking turns
 
 
 def test_request_release_reaches_the_owner(robot: Robot) -> None:
@@ -337,9 +331,6 @@ def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot)
             robot.find("a", whose=robot.other)(0.2)
 
 
-# --- inside a call
-
-
 class _Walker:
     """A service that takes locks, or looks for services, as far as its caller's deadline lets it."""
 
@@ -392,9 +383,6 @@ def test_a_service_that_waits_in_vain_fails_before_the_deadline_of_its_call(
         walker("walk_what_is_not_there")()
     with pytest.raises(errors.NoSuchService, match="not_there"):
         walker("look_for")("not_there")
-
-
-# --- S16 and S17: what is locked
 
 
 class _Eye:

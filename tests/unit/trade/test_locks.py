@@ -24,9 +24,6 @@ def table() -> Iterator[Table]:
     made.close()
 
 
-# --- turns
-
-
 def test_waiting_clients_are_served_in_order_of_arrival(table: Table) -> None:
     token = table.take("ab")
     waiting = [table.ask(names, f"s{index}") for index, names in enumerate(["a", "ab", "b", "a"])]
@@ -94,9 +91,6 @@ def test_since_is_the_time_of_the_grant_not_of_the_request(table: Table, monkeyp
     assert [info.holder.since for info in table.table.infos()] == [2000.0]
 
 
-# --- leases
-
-
 @pytest.mark.parametrize("use", ["renew", "call", "gate"])
 def test_S12_what_outlived_its_lease_is_over_even_before_any_check(table: Table, use: str) -> None:
     """A provider that was frozen wakes: the first access must not find a lock that holds."""
@@ -161,9 +155,6 @@ def test_only_its_owner_renews_and_releases(table: Table) -> None:
     assert table.table.renew([token.number], "stranger") == []
     assert not table.table.release(token.number, "stranger")
     assert table.table.release(token.number, "tester")
-
-
-# --- loss
 
 
 def test_S14_what_moves_under_a_lost_lock_stops_before_it_is_given_on(table: Table) -> None:
@@ -306,9 +297,6 @@ def test_why_grants_ended_is_known_of_the_last_few_and_never_of_more(table: Tabl
         table.table.release(numbers[-1], "tester")
     assert table.table.over(numbers[-1]) == "it was given back"
     assert table.table.over(numbers[0]) == "it ended long ago"
-
-
-# --- emptying
 
 
 def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(table: Table) -> None:

@@ -329,9 +329,6 @@ def test_terminating_twice_is_like_terminating_once(maker: Container) -> None:
     wait_until(lambda: not maker.healthy())
 
 
-# --- who may
-
-
 @pytest.fixture
 def governed(memory: MemorySystem, maker: Container, asker: Container, tmp_path: Path) -> Path:
     policy = tmp_path / "policy.toml"
@@ -420,9 +417,6 @@ def test_a_container_offers_what_it_makes_by_its_own_rights(
     with pytest.raises(errors.AccessDenied, match="maker may not register Lamp in hall"):
         ask(asker, "instantiate", "workshop:Lamp", (), ["hall"])
     assert events == ["closed"]
-
-
-# --- settings
 
 
 def test_the_environment_names_what_may_be_made() -> None:

@@ -17,8 +17,6 @@ from trade.testing import MemorySystem, memory_system
 
 pytestmark = pytest.mark.virtual_time
 
-# --- deaths, at every message
-
 
 class Death:
     """Kills a container at one message of many: before it is sent, or when it has just arrived."""
@@ -146,9 +144,6 @@ def test_callers_that_wait_are_all_freed_when_their_callee_dies(gate: Any) -> No
 def test_a_fault_of_a_container_that_was_never_started_is_an_error() -> None:
     with memory_system() as system, pytest.raises(LookupError, match="no container 'ghost' was started"):
         system.kill("ghost")
-
-
-# --- storms
 
 
 class Storm:

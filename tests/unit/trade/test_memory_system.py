@@ -26,9 +26,6 @@ pytestmark = pytest.mark.virtual_time
 Eventually = Callable[[Callable[[], bool]], bool]
 
 
-# --- what it is
-
-
 def test_containers_find_and_call_each_other() -> None:
     with memory_system() as system:
         system.container("b").register(Lamp(), "robot")
@@ -97,9 +94,6 @@ def test_the_page_on_testing_does_what_it_says(monkeypatch: pytest.MonkeyPatch) 
     assert len(tests) == 11
     for test in tests:
         test()
-
-
-# --- how many messages things take
 
 
 def test_a_call_takes_two_messages_after_the_first() -> None:
@@ -173,9 +167,6 @@ def _sends_one(system: MemorySystem, action: Callable[[], None]) -> bool:
     before = system.sent()
     action()
     return system.sent() > before
-
-
-# --- partitions
 
 
 def test_after_a_partition_each_side_knows_only_itself_and_then_everything_again(
@@ -257,9 +248,6 @@ def test_a_partition_of_two_leaves_calls_of_a_third_alone(pair: Pair) -> None:
         system.partition(caller, callee)
         system.advance(2)
         assert found(third)(0.3) == 0.3
-
-
-# --- messages that get lost
 
 
 def losing(*payloads_of: str) -> Callable[[InFlightMessage], bool]:

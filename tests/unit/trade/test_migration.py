@@ -151,9 +151,6 @@ def test_a_call_that_runs_ends_first(scene: Scene) -> None:
     assert f"restore {3 + len(others)}" in scene.module.events
 
 
-# --- the least busy
-
-
 @pytest.mark.parametrize(
     "busy",
     [
@@ -182,9 +179,6 @@ def test_a_container_that_does_not_report_its_load_comes_last(scene: Scene, monk
     scene.memory.lose(lambda one: one.source == "old" and one.key.split("/")[3:4] in (["new-1"], ["new-3"]))
     [count, _] = scene.asker.migrate(scene.counter()[0], to="new-*")
     assert count.container == "new-2"
-
-
-# --- hooks and notifications
 
 
 class Ear:
@@ -221,9 +215,6 @@ def test_notifications_by_constraint_call_it_where_it_is_and_those_by_handle_say
     scene.asker.once(count)
     wait_until(lambda: shown() == 4)
     wait_until(lambda: "has moved to container new" in caplog.text)
-
-
-# --- state alone
 
 
 def test_state_is_saved_and_restored_where_it_is(scene: Scene) -> None:

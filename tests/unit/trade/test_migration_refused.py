@@ -33,9 +33,6 @@ def continues(scene: Scene, count: Handle) -> bool:
     return count() == 4
 
 
-# --- locked, moving, stopped
-
-
 def test_what_is_locked_stays_also_if_who_asks_has_the_lock(scene: Scene) -> None:
     count, _ = scene.counter()
     with scene.asker.lock([count], purpose="mine"):
@@ -143,9 +140,6 @@ def test_it_is_moved_by_one_at_a_time(scene: Scene) -> None:
     assert count.container == "old"
 
 
-# --- hardware
-
-
 def test_hardware_is_pinned_to_its_host(scene: Scene) -> None:
     error = refused(scene, scene.offer(scene.module.Bolted())["turn"])
     assert isinstance(error, errors.ConfigurationError)
@@ -200,9 +194,6 @@ def test_S18_a_provider_that_starts_a_motion_past_all_permits_is_closed(scene: S
     assert isinstance(error, errors.CannotMigrate)
     assert "a motion that has not ended" in str(error)
     assert scene.module.events == ["made", "close"]
-
-
-# --- where it is to go
 
 
 @pytest.mark.parametrize("to", ["nowhere", "old", "none-*"])
@@ -274,9 +265,6 @@ def test_a_full_container_says_so(scene: Scene) -> None:
     assert moved() == 4
 
 
-# --- state
-
-
 @pytest.mark.parametrize("method", ["save", "restore"])
 def test_a_providers_exception_is_reported_and_changes_nothing(scene: Scene, method: str) -> None:
     count, _ = scene.counter()
@@ -312,9 +300,6 @@ def test_state_that_cannot_be_sent_stays_with_its_provider(scene: Scene) -> None
     with pytest.raises(TypeError, match="cannot be sent"):
         scene.asker.migrate(count, to="new")
     assert count() == 1
-
-
-# --- who may
 
 
 def test_a_client_that_may_not_administer_the_group_is_refused(scene: Scene) -> None:
@@ -355,9 +340,6 @@ def test_both_sides_must_be_allowed_to_offer_it(scene: Scene, who: str, complain
             scene.asker.migrate(count, to="new")
         else:
             prepare(scene)
-
-
-# --- tickets
 
 
 def ask(scene: Scene, name: str) -> Handle:

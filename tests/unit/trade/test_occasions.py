@@ -56,9 +56,6 @@ def handle(there: Container, here: Container, dock: Dock) -> Callable[[str], Han
     return lambda name: here.find(where(name=name, group="base"), wait_s=20)
 
 
-# --- occasions
-
-
 def test_once_makes_the_call_without_waiting_for_it(
     here: Container, dock: Dock, handle: Callable[[str], Handle]
 ) -> None:
@@ -143,9 +140,6 @@ def test_a_slow_call_holds_up_no_other(here: Container) -> None:
     go_on.put(None)
 
 
-# --- what is called
-
-
 def test_the_only_service_that_fits_may_be_called(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
     handle("go")
     here.once(where(name="go", group="base"))
@@ -167,9 +161,6 @@ def test_a_service_may_get_notifications_about_others_with_arguments_of_its_own(
     here.register(Dock(), "base")
     assert tell.alive
     assert Listener.heard.get(timeout=20) == ("base.go", "hello")
-
-
-# --- conditions
 
 
 def test_if_is_evaluated_at_that_moment(here: Container, dock: Dock, handle: Callable[[str], Handle]) -> None:
@@ -230,9 +221,6 @@ def test_after_counts_from_when_its_condition_holds(
     began, dock.low = time.monotonic(), True
     dock.next()
     assert time.monotonic() - began >= 0.2
-
-
-# --- bad days
 
 
 @pytest.mark.parametrize(
@@ -346,9 +334,6 @@ def test_it_may_cancel_itself(here: Container) -> None:
     time.sleep(3 * SOON_S)
     assert fired == [1]
     assert noted.info().state == "cancelled"
-
-
-# --- from anywhere
 
 
 def test_all_are_listed_everywhere_and_cancelled_from_anywhere(

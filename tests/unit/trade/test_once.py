@@ -133,9 +133,6 @@ def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None
     assert here._parts.dispatcher._deduplicator._calls == {}
 
 
-# --- the bounds
-
-
 def begun(once: CallDeduplicator, one: Call) -> ActiveCall:
     ongoing = ActiveCall("me", one, None)
     assert once.begin(one, ongoing) is ongoing
@@ -188,9 +185,6 @@ def test_large_answers_are_dropped_first_but_not_the_record_that_they_were_given
     assert last is not None
     assert last.answer is not None
     assert last.answer[0] == Status.OK
-
-
-# --- the caller's side
 
 
 @pytest.mark.usefixtures("no_local_path")

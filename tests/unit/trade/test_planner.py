@@ -182,9 +182,6 @@ def test_a_service_that_is_not_healthy_is_not_planned_with(
     assert said(planner.search("see(mug)")) == ["rosie.second.look(mug)"]
 
 
-# --- what happens meanwhile
-
-
 def test_a_service_that_goes_is_replaced_by_another_and_what_was_achieved_stays(
     memory: MemorySystem, planner: Planner, robot: Robot
 ) -> None:
@@ -251,9 +248,6 @@ def test_a_call_that_may_have_run_is_not_repeated(memory: MemorySystem, planner:
     with pytest.raises(errors.OutcomeUnknown):
         planner.achieve("done")
     assert robot.calls == ["go"]
-
-
-# --- a system that grows: the camera is not linked to the planner, but can be discovered
 
 
 def apart(start_container: Any, name: str) -> Container:

@@ -151,8 +151,6 @@ def test_a_policy_that_is_not_there_is_refused(tmp_path: Path) -> None:
         read_policy(tmp_path / "none.toml")
 
 
-# --- against an evaluator that looks at every rule every time
-
 NAMES = st.sampled_from(["a", "ab", "b", "ba", "c"])
 PATTERNS = st.sampled_from(["a", "ab", "a*", "*", "?b", "c"])
 GROUPS = st.sampled_from(["x", "x.y", "x.y.z", "xy", "w", "_"])

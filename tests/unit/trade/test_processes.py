@@ -22,9 +22,6 @@ class Lamp:
         return 0.5
 
 
-# --- closing
-
-
 def test_closing_is_idempotent(here: Container) -> None:
     here.close()
     here.close()
@@ -122,9 +119,6 @@ def test_a_container_that_cannot_start_leaves_nothing(system: str, monkeypatch: 
         assert [info.name for info in following.containers()] == ["next"]
 
 
-# --- the default container
-
-
 def test_the_default_container_starts_itself_and_restarts_after_close(system: str) -> None:
     trade.register(Lamp(), "hall")
     first = trade.container()
@@ -185,9 +179,6 @@ def test_two_programs_have_containers_of_different_names(start_program: Any) -> 
 def test_importing_starts_nothing(start_program: Any) -> None:
     program = start_program("import threading; say(threading.active_count(), trade._container.default._default)")
     assert program.heard() == "1 None"
-
-
-# --- ending
 
 
 BUSY = """
@@ -292,8 +283,6 @@ def test_an_interrupt_ends_waiting_for_a_started_call_and_for_a_service(
         assert program.heard() == "interrupted"
     assert program.ends() == 0
 
-
-# --- forking
 
 FORKING = """
 import os, threading

@@ -103,9 +103,6 @@ def test_a_deregistered_provider_never_comes_back_in_that_boot(registry: Registr
     assert reported.changes == [(["go"], [], []), ([], ["go"], [])]
 
 
-# --- what was missed
-
-
 def left_open(registry: Registry) -> bool:
     return registry.left_open(OTHER)
 
@@ -236,9 +233,6 @@ def test_whatever_is_lost_the_answer_that_closes_everything_is_true(data: st.Dat
     assert not left_open(registry)
     known = {record.key.provider: record.name for record in registry.select(where())}
     assert known == {name: entry.services[0].name for name, entry in truth.items()}
-
-
-# --- changes
 
 
 def test_a_new_revision_lists_what_came_what_went_and_what_stayed(registry: Registry, reported: Reports) -> None:

@@ -23,9 +23,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules_module, "LOOK_S", SOON_S)
 
 
-# --- occasions
-
-
 @pytest.mark.parametrize("kind", ["joined", "left"])
 def test_a_rule_fires_with_what_joins_or_leaves(there: Container, desk: Desk, engine: Engine, kind: str) -> None:
     engine(f'[rule.r]\nwhen = {{ {kind} = {{ name = "switch" }} }}\n{TELL}')
@@ -158,9 +155,6 @@ def test_a_condition_that_cannot_be_evaluated_does_not_hold_and_is_reported_once
     assert caplog.text.count(said) == 1
 
 
-# --- steps
-
-
 def test_after_a_step_that_fails_only_those_are_done_that_always_are(desk: Desk, engine: Engine) -> None:
     engine("""
         [rule.r]
@@ -200,9 +194,6 @@ def test_the_service_that_changed_is_called_itself(there: Container, engine: Eng
     assert oven.switched.wait(20)
 
 
-# --- reports
-
-
 def test_every_firing_is_audited_in_a_file_and_as_a_service(there: Container, desk: Desk, engine: Engine) -> None:
     engine(f'[rule.r]\nwhen = {{ joined = {{ name = "switch" }} }}\n{TELL}')
     there.register(Lamp(), "hall")
@@ -224,9 +215,6 @@ def test_an_audit_file_that_cannot_be_written_ends_nothing(
     engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{NOTE}")
     assert [engine.next().ok, engine.next().ok] == [True, True]
     assert "cannot be written" in caplog.text
-
-
-# --- dry run
 
 
 def test_a_dry_run_says_on_each_occasion_what_it_would_call_and_calls_nothing(
@@ -288,9 +276,6 @@ def test_a_dry_run_says_which_rules_would_fire_now(here: Container, desk: Desk, 
     assert desk.heard.empty()
 
 
-# --- rights
-
-
 def test_a_rule_does_what_its_container_may_at_each_call(start_container: Any, engine: Engine, tmp_path: Path) -> None:
     policy = tmp_path / "policy.toml"
     text = """
@@ -325,9 +310,6 @@ def test_rules_are_offered_only_by_who_may(start_container: Any, tmp_path: Path)
     with pytest.raises(AccessDenied, match="ruler may not register"):
         Rules(ruler, file)
     assert ruler.notifications() == []
-
-
-# --- being changed
 
 
 def test_a_changed_file_begins_new_rules_ends_old_ones_and_leaves_the_others_alone(desk: Desk, engine: Engine) -> None:

@@ -21,9 +21,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules_module, "LOOK_S", SOON_S)
 
 
-# --- circles
-
-
 class Toggle:
     """Offers a lamp and withdraws it again, on request."""
 
@@ -131,9 +128,6 @@ def test_many_services_that_leave_together_are_no_circle(there: Container, desk:
         there.deregister(lamp)
     assert {desk.next()[0] for _ in lamps} == {f"room{number}.switch" for number in range(20)}
     assert running.rules()[0].state == "standing"
-
-
-# --- what may have led to what
 
 
 def fire(known: LoopDetector, mark: Mark, since_ns: int = 0, ended_ns: int | None = 0) -> int:

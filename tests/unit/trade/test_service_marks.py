@@ -172,9 +172,6 @@ def test_a_service_may_have_the_longest_class_name(here: Container, there: Conta
     assert here.find(where(name="brightness"))() == 0.5
 
 
-# --- refused
-
-
 class MissesImplementation:
     pass
 

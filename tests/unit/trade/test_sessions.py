@@ -165,9 +165,6 @@ def test_no_session_of_a_closed_container(robot: Robot) -> None:
         robot.other.open_session("page")
 
 
-# --- beside sessions: what is withdrawn or cannot be stopped
-
-
 @pytest.mark.parametrize("how", ["own", "from elsewhere"])
 def test_what_moves_is_stopped_before_its_services_are_withdrawn(robot: Robot, how: str) -> None:
     joint, home = robot.joints["a"], robot.system.container("a")

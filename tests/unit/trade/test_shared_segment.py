@@ -249,9 +249,6 @@ def test_descriptors_and_mappings_are_released(here: Container, there: Container
     wait_until(lambda: shared() == 0, "the memory is gone")
 
 
-# --- where it is not possible
-
-
 @pytest.fixture(params=["no memory here", "no memory there", "an older callee"])
 def without(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Something that keeps two containers from sharing memory."""
@@ -321,9 +318,6 @@ def test_no_descriptor_left_means_the_socket(
     monkeypatch.setattr(os, "memfd_create", none_left)
     assert len(echo(bytes(_BIG))) == _BIG
     assert put == []
-
-
-# --- bad input
 
 
 def _pipe() -> int:

@@ -126,9 +126,6 @@ def two() -> Iterator[Two]:
         border.close()
 
 
-# --- what crosses
-
-
 def test_what_is_exported_is_found_as_it_is_at_home_and_nothing_else_is(two: Two) -> None:
     labels = {handle.label for handle in two.anna.services(~where(group="trade"))}
     assert labels == {handle.label for handle in two.planner.services(where(group="rosie"))}
@@ -219,9 +216,6 @@ def test_another_list_withdraws_what_it_has_not_and_disturbs_nothing_else(two: T
         assert two.brain.cancelled.wait(20)
 
 
-# --- sessions, stops
-
-
 def test_S03_what_a_foreign_client_moves_stops_with_that_client_alone(two: Two) -> None:
     tail = Joint("tail")
     two.robot.register(tail, "rosie.tail")
@@ -277,9 +271,6 @@ def test_S08_a_clients_own_stop_does_not_latch_and_a_foreign_one_does(two: Two) 
     two.planner.find(where(name="stop", group="rosie.head"))()
     with pytest.raises(errors.Stopped, match="planner"):
         go(1.0)
-
-
-# --- locks
 
 
 def test_a_lock_in_another_system_is_a_lock_at_home_under_the_clients_name(two: Two) -> None:
@@ -377,9 +368,6 @@ def test_software_and_what_reads_are_locked_at_home_too(two: Two) -> None:
     assert long.alive
 
 
-# --- e-stops
-
-
 def test_S09_an_e_stop_holds_on_both_sides_and_is_cleared_on_each(two: Two) -> None:
     two.find("go_on")(1.0)
     report = two.bob.estop("smoke")
@@ -418,9 +406,6 @@ def test_S09_one_that_is_open_when_the_border_opens_crosses_too(two: Two) -> Non
     report = two.planner.estop("fire")
     with Border(two.ours, two.theirs, exported=["rosie"]):
         wait_until(lambda: [one.id for one in two.anna.estops()] == [report.id], "it crossed")
-
-
-# --- both ways
 
 
 def test_what_is_shared_is_not_shared_back_nor_further(two: Two) -> None:

@@ -73,9 +73,6 @@ def link(asking: Container, container: str, to: str) -> LinkInfo | None:
     return next((one for one in info.links if one.to == to), None)
 
 
-# --- links
-
-
 @pytest.mark.real_clock
 def test_a_link_says_to_whom_it_leads_since_when_and_how_many_calls_were_answered(
     here: Container, there: Container
@@ -113,9 +110,6 @@ def test_a_link_that_is_cut_disappears_and_others_are_notified_of_its_end(
     program.kill()
     wait_until(lambda: link(here, "here", "far") is None, "the link is not listed any more")
     assert diary.next() == ("unlinked", "far")
-
-
-# --- endpoints, switches, certificates
 
 
 @pytest.mark.real_clock
@@ -164,9 +158,6 @@ def test_a_certificate_is_reported_with_its_end_and_without_its_key(
 def test_a_certificate_that_ends_soon_is_an_event(start_container: Callable[..., Container], tmp_path: Path) -> None:
     arm = start_container("arm", tls=Papers(tmp_path / "pki").of("arm", lasts=timedelta(hours=12)))
     assert [(one.kind, one.about) for one in asked(arm, "state_events", "arm")] == [("certificate_ends", "arm")]
-
-
-# --- containers, listeners, hooks, rules
 
 
 def test_containers_that_join_and_leave_are_events(memory: MemorySystem, diary: Diary) -> None:
@@ -219,9 +210,6 @@ def test_what_a_rule_did_is_an_event(here: Container, desk: Desk, engine: Engine
     engine(f"[rule.hello]\nwhen = {{ every_s = 0.02 }}\n{NOTE}\n")
     assert desk.next() == "x"
     assert diary.next() == ("rule_fired", "hello")
-
-
-# --- calls that deviate
 
 
 def test_P43_a_deviation_from_learned_sequences_is_a_service_and_a_notification(
@@ -278,9 +266,6 @@ def test_calls_that_deviate_are_not_mixed_between_callers_nor_with_the_calls_ins
     base.call("kitchen.burn")
     assert diary.next() == ("call_deviated", "kitchen.burn")
     assert diary.empty
-
-
-# --- occasions
 
 
 def test_an_occasion_without_or_with_an_unknown_event_is_refused(memory: MemorySystem, diary: Diary) -> None:

@@ -17,8 +17,6 @@ from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone, SessionEnded, SourceLost
 from trade.testing import MemorySystem
 
-# --- errors and ends
-
 
 def test_an_error_of_the_service_is_raised_and_the_stream_continues(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=10_000) as stream:
@@ -154,9 +152,6 @@ def test_a_listener_whose_container_ends_is_forgotten(start_container: Any, even
     assert eventually(is_left_alone)
 
 
-# --- ways to take them
-
-
 def test_samples_are_passed_on_to_a_service(two: Two, eventually: Any) -> None:
     display = Display()
     two.there.register(display, "screen")
@@ -204,9 +199,6 @@ def test_waiting_in_asyncio_may_be_given_up_without_losing_a_sample(two: Two) ->
             return (await stream.anext()).value
 
     assert asyncio.run(listen()) == 50
-
-
-# --- what is refused
 
 
 @pytest.mark.parametrize(
@@ -288,8 +280,6 @@ def test_a_listener_that_loses_the_right_gets_no_more_samples(start_container: A
                 stream.next(PATIENCE_S)
 
 
-# --- other processes
-
 SOURCE = """
 class Battery:
     asked = 0
@@ -315,9 +305,6 @@ def test_a_source_that_is_killed_is_lost(start_container: Any, start_program: An
         with pytest.raises(SourceLost):
             while True:
                 stream.next(PATIENCE_S)
-
-
-# --- the source alone
 
 
 def test_a_listener_that_does_not_renew_is_dropped(here: Container) -> None:

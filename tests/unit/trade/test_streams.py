@@ -18,8 +18,6 @@ from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time
 
-# --- what it costs
-
 
 def test_samples_come_in_order_with_the_time_they_were_taken_at(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ, keep=1000) as stream:
@@ -74,9 +72,6 @@ def test_a_listener_that_wants_fewer_samples_gets_fewer(two: Two) -> None:
         first, *_, last = some(slow, 6)
     periods = (last.at_ns - first.at_ns) / 1e9 * FAST_HZ / 10
     assert periods >= 4.5  # five, of which the last may be half a one early
-
-
-# --- which samples
 
 
 @pytest.mark.parametrize(

@@ -176,9 +176,6 @@ def test_what_is_no_selection_is_refused_with_the_function_and_what_to_give(
     assert pan.moved == []
 
 
-# --- in a shell
-
-
 def test_a_handle_has_the_signature_and_the_docstring_of_its_service(me: Container, pan: Joint) -> None:
     move = me.find("rosie.neck.pan.move_to")
     assert str(inspect.signature(move)) == "(position_rad: 'float')"
@@ -191,9 +188,6 @@ def test_the_module_shows_its_public_names_and_its_version() -> None:
     assert trade.__version__ == metadata.version("trade-core")
     with pytest.raises(AttributeError, match="no attribute 'lck'"):
         _ = trade.lck  # type: ignore[attr-defined]
-
-
-# --- from asyncio
 
 
 def test_the_functions_for_asyncio_leave_the_event_loop_free(me: Container, pan: Joint) -> None:

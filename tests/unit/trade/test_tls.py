@@ -335,9 +335,6 @@ def test_the_command_line_lists_nothing_without_a_certificate_of_the_authority(
     assert [entry["identity"] for entry in json.loads(ended.stdout)] == (["arm"] if seen else [])
 
 
-# --- settings
-
-
 def read(**settings: Any) -> Settings:
     return Settings.read(environment={}, **settings)
 

@@ -105,9 +105,6 @@ def _served(container: Container, handle: Handle) -> LocalService:
     return service
 
 
-# --- what it costs
-
-
 def test_untraced_services_are_not_wrapped_and_nothing_is_recorded(here: Container, there: Container, arm: Arm) -> None:
     reach = _served(there, here.find(where(name="reach"), wait_s=20))
     here.call(where(name="reach"), 0.1)
@@ -166,9 +163,6 @@ def test_events_of_one_call_are_bounded(here: Container) -> None:
     here.set_tracing(True)
     assert here.call(where(name="talk")) == 100
     assert len(here.spans()[0].events) == 100
-
-
-# --- what is noted
 
 
 def test_a_call_is_traced_by_caller_and_callee(here: Container, there: Container, arm: Arm) -> None:
@@ -247,9 +241,6 @@ def test_what_is_secret_is_in_no_trace(here: Container, there: Container, arm: A
     assert "swordfish" not in str(trace)
 
 
-# --- the tree
-
-
 def test_the_tree_has_lock_nested_call_hook_event_and_log_line(
     here: Container, there: Container, arm: Arm, start_container: Any
 ) -> None:
@@ -326,8 +317,6 @@ def test_a_container_may_be_traced_from_its_start(start_container: Any) -> None:
     born.call(where(name="reach"), 0.1)
     assert [span.service for span in born.spans()] == ["rosie.arm.reach"]
 
-
-# --- who may
 
 POLICY = policy_text(
     "dash=viewer drv=driver chief=tracer",

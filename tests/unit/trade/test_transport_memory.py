@@ -43,9 +43,6 @@ class TestMemoryLosses(LossConformance):
             yield Severable(one, other, sever, network.heal)
 
 
-# --- patterns
-
-
 _chunk = st.sampled_from(["a", "b", "ab", "*", "**", "@v", "@w"])
 
 
@@ -53,9 +50,6 @@ _chunk = st.sampled_from(["a", "b", "ab", "*", "**", "@v", "@w"])
 def test_patterns_mean_what_they_mean_to_zenoh(one: list[str], other: list[str]) -> None:
     first, second = (zenoh.KeyExpr.autocanonize("/".join(chunks)) for chunks in (one, other))
     assert meet(str(first), str(second)) == first.intersects(second)
-
-
-# --- time
 
 
 def test_time_does_not_pass_until_it_is_moved() -> None:
@@ -81,9 +75,6 @@ def test_what_happens_may_put_off_more_for_the_same_advance() -> None:
     clock.at(10, lambda: clock.at(20, lambda: happened.append(clock.monotonic_ns())))
     clock.advance(1)
     assert happened == [20]
-
-
-# --- delays
 
 
 class Room:
@@ -197,9 +188,6 @@ def test_a_test_may_drive_the_time_of_other_threads(room: Room) -> None:
         room.network.traffic.drive(lambda: False, limit_s=0)
 
 
-# --- partitions
-
-
 def test_a_cut_within_the_lease_only_delays(room: Room) -> None:
     room.cut()
     room.say(*"abc")
@@ -284,9 +272,6 @@ def test_a_message_may_be_lost_while_its_ends_stay_linked(room: Room) -> None:
     assert heard(room.signs) == []
 
 
-# --- kills
-
-
 def test_signs_of_the_killed_fall_at_once_and_what_it_sent_is_lost(room: Room) -> None:
     announcements = room.other.announcements("shop/**")
     room.one.announce("shop/bread", b"fresh")
@@ -317,9 +302,6 @@ def test_a_transport_that_closes_while_it_is_cut_off_is_lost_with_its_lease(room
     room.network.clock.advance(2)
     room.network.heal()
     assert heard(room.signs) == [None]
-
-
-# --- taps
 
 
 def test_a_tap_sees_each_message_before_it_is_sent_and_after_it_arrived(room: Room) -> None:

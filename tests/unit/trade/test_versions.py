@@ -153,9 +153,6 @@ def move(container: Container, group: str = "one") -> str:
     return container.call(where(name="move", group=group))
 
 
-# --- what an operator sees
-
-
 def test_a_container_of_another_version_is_shown_with_it_and_offers_nothing(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -199,8 +196,6 @@ def test_a_container_that_answered_in_another_version_is_not_asked_again(
     memory.settle()
     assert other.asked == asked
 
-
-# --- orders to stop
 
 ORDERS: Final[dict[str, tuple[Any, ...]]] = {
     "as they are now": (["abc", "tester/stranger/e1", "smoke", 1.5], []),
@@ -265,9 +260,6 @@ def test_what_is_no_order_in_any_version_stops_nothing(
     assert move(one) == "moved"
 
 
-# --- reports
-
-
 def test_S09_a_report_names_containers_of_another_version_that_confirmed(
     memory: MemorySystem, stranger: Strangers
 ) -> None:
@@ -309,9 +301,6 @@ def test_a_clearing_names_containers_of_another_version_that_still_have_it_open(
     assert [estop.id for estop in caller.estops()] == [report.id]
     other.tell()
     assert eventually(lambda: caller.estops() == [])
-
-
-# --- reports of open ones
 
 
 def test_S09_a_joining_container_takes_over_what_containers_of_another_version_have_open(

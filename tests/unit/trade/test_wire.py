@@ -61,8 +61,6 @@ class Echo:
         self.runs += 1
 
 
-# --- decoding
-
 _plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(),
     lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.text(max_size=8), inner, max_size=5),
@@ -144,9 +142,6 @@ def test_a_reply_of_an_unknown_status_is_malformed(status: int) -> None:
         decode_reply(encode_message(Reply(PROTOCOL, 7, status, 1, EMPTY)))
 
 
-# --- keys
-
-
 @given(st.text(max_size=100))
 def test_any_text_can_be_made_a_chunk_of_a_key(text: str) -> None:
     assert is_chunk(as_chunk(text))
@@ -165,9 +160,6 @@ def test_each_identity_is_a_chunk_of_its_own() -> None:
     assert reply_key("arm", "me", "laptop", "0") == "reply/arm/me/laptop/0"
     assert registry_key("rosie", callee, "Arm-1") == "registry/rosie/arm/driver/e1/Arm-1"
     assert alive_key(callee) == "alive/arm/driver/e1"
-
-
-# --- calls from somewhere strange
 
 
 @pytest.fixture
@@ -345,8 +337,6 @@ def test_malformed_messages_are_logged_once_and_counted(
     assert f"protocol version {FUTURE}" in record.message
     assert "further ones are counted, not logged" in record.message
 
-
-# --- registry entries from somewhere strange
 
 BAD_ENTRIES = {
     "garbage": (registry_key("robot", FORGED, "P-1"), b"garbage"),

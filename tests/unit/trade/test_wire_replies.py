@@ -14,8 +14,6 @@ from trade._protocol.messages import PROTOCOL, Reply, ServiceInfo, Status, encod
 from trade._protocol.schema import schema_message
 from trade.errors import InvalidResult, RemoteError
 
-# --- replies from somewhere strange
-
 
 @pytest.fixture
 def callee(here: Container, open_raw: Any) -> FakeCallee:

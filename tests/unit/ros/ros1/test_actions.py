@@ -36,9 +36,6 @@ def pursue(graph: Ros1, goal: int, heard: list[int] | None = None) -> Pursuit:
     return graph.pursue("/move", TEST, {"goal": goal}, feedback)
 
 
-# --- theirs
-
-
 def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -> None:
     server(stand)
     heard: list[int] = []
@@ -161,9 +158,6 @@ def test_calls_in_progress_are_canceled_when_we_close(graph: Ros1, stand: Stand)
     assert goal.wait(0).how is Ended.CANCELED
     with pytest.raises(RosUnreachable):
         client.pursue({"goal": 1}, None)
-
-
-# --- ours
 
 
 def client(stand: Stand, goal: int, name: str = "planner") -> Peer:

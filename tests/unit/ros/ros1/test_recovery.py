@@ -34,9 +34,6 @@ def answers(graph: Ros1) -> bool:
         return False
 
 
-# --- nodes
-
-
 def test_a_node_that_is_killed_is_reported_gone_and_back(graph: Ros1, stand: Stand) -> None:
     watch = Watch(graph)
     peer = stand.peer("arm")
@@ -78,9 +75,6 @@ def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros
         peer.do("send", "/state", {"data": life})
         wait_until(lambda life=life: life in heard, f"life {life} is heard")
         peer.end(signal.SIGKILL)
-
-
-# --- the master
 
 
 def open_all(graph: Ros1) -> list[str]:
@@ -149,9 +143,6 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
     assert peer.wait_for("heard")["data"] == "early"
     wait_until(lambda: not graph.healthy, "it is found")
     wait_until(lambda: answers(graph), "its service is found")
-
-
-# --- our node
 
 
 def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open(graph: Ros1, stand: Stand) -> None:

@@ -32,8 +32,6 @@ from trade_gateway.ros.ros2._names import Kind
 
 pytestmark = pytest.mark.realtime
 
-# --- our server, and a client of keys and bytes
-
 
 def test_a_goal_is_sent_heard_of_and_answered_in_the_bytes_of_ros(graph: Ros2, raw: zenoh.Session) -> None:
     doing, feedback = Doing(), []
@@ -170,9 +168,6 @@ def test_the_status_of_goals_is_published(graph: Ros2, raw: zenoh.Session) -> No
         wait_until(lambda: reported and reported[-1][32] == 4, "its success is published")
     assert reported[-1][:24] == CDR + b"\1\0\0\0" + ID
     assert {each[32] for each in reported} <= {1, 2, 4}
-
-
-# --- ours with ours
 
 
 def test_a_goal_is_pursued_to_its_end(graph: Ros2, other: Ros2) -> None:

@@ -45,9 +45,6 @@ hashes = st.binary(min_size=32, max_size=32).map(lambda digest: f"RIHS01_{digest
 sessions = st.integers(1, 2**128 - 1).map("{:x}".format)
 
 
-# --- the examples of ros2/rmw_zenoh, docs/design.md
-
-
 @pytest.mark.parametrize(
     ("domain_id", "name", "type_name", "type_hash", "key"),
     [
@@ -111,9 +108,6 @@ def test_tokens_are_written_as_in_the_design_document() -> None:
 def test_gids_are_those_that_rmw_zenoh_makes(of: str, expected: str) -> None:
     """Captured from its own function by the test suite of a client for microcontrollers (RaftROS)."""
     assert gid(of).hex() == expected
-
-
-# --- other hands
 
 
 @given(st.integers(0, 232), names, types, hashes)

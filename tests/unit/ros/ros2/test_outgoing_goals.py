@@ -15,8 +15,6 @@ from trade_gateway.ros.ros2 import Ros2
 
 pytestmark = pytest.mark.realtime
 
-# --- our client, and a server of keys and bytes
-
 
 class RawServer:
     """A server of an action; its answers are set by the test."""
