@@ -26,8 +26,6 @@ from trade_drivers.plugins._driver import AttachedBus, Driver, SenseDriver, load
 from trade_drivers.plugins._validate import check
 from trade_drivers.robotfile import Group, Robot
 
-__all__ = ["AttachedRobot", "attach"]
-
 _log = logging.getLogger("trade")
 _FAULTS: Final = "faults"
 

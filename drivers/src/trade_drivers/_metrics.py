@@ -9,8 +9,6 @@ from trade_drivers.interfaces._motion import Motor, MotorState
 from trade_drivers.plugins._driver import AttachedBus
 from trade_drivers.robotfile import Robot
 
-__all__ = ["measures_of"]
-
 
 def measures_of(robot: Robot, buses: Mapping[str, AttachedBus], providers: Mapping[str, object]) -> Iterator[Measure]:
     """Yields all metrics of a robot."""

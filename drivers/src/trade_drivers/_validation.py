@@ -6,8 +6,6 @@ from typing import Final
 
 from trade.errors import ConfigurationError, InvalidArgument, LimitExceeded
 
-__all__ = ["LONGEST_VALID_S", "finite", "not_installed", "one_each", "valid", "within"]
-
 LONGEST_VALID_S: Final = 1.0
 """The longest validity of a set-point."""
 

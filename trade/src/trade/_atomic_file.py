@@ -4,8 +4,6 @@ import os
 import secrets
 from pathlib import Path
 
-__all__ = ["claim", "fresh_beside", "replace"]
-
 
 def claim(path: Path, text: bytes) -> None:
     """Creates a file for this user only. Raises FileExistsError."""

@@ -6,8 +6,6 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-__all__ = ["Measure"]
-
 BOUNDS_S: Final = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 """Upper bounds of the histogram's buckets; the last bucket has none."""
 _BOUNDS_NS: Final = tuple(int(bound * 1e9) for bound in BOUNDS_S)

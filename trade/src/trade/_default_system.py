@@ -12,8 +12,6 @@ from typing import Final
 
 from trade._protocol.keys import as_chunk
 
-__all__ = ["account_home", "account_name", "default_system", "earlier_folders", "is_of_user", "take_over"]
-
 _MACHINE_IDS: Final = (Path("/etc/machine-id"), Path("/var/lib/dbus/machine-id"))
 _MACHINE_ID: Final = re.compile(r"[0-9a-f]{32}")
 _NO_MACHINE: Final = "local"

@@ -22,8 +22,6 @@ from trade._security.policy import EVERYTHING
 from trade._transport.endpoints import Endpoint, dialled_from_here
 from trade.errors import ConfigurationError
 
-__all__ = ["Settings"]
-
 _logger = logging.getLogger("trade")
 _VARIABLES: Final = (
     "TRADE_SYSTEM",

@@ -5,8 +5,6 @@ import difflib
 from pathlib import Path
 from typing import Final
 
-__all__ = ["as_before", "as_text", "read_text"]
-
 _OTHERS: Final = {
     codecs.BOM_UTF32_LE: "UTF-32",
     codecs.BOM_UTF32_BE: "UTF-32",

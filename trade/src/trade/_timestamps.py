@@ -3,8 +3,6 @@
 import time
 from typing import Final
 
-__all__ = ["clock", "day_and_clock"]
-
 _NONE: Final = "?"
 
 

@@ -8,8 +8,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["read_toml_text"]
-
 
 def read_toml_text(text: str) -> dict[str, Any]:
     """The tables of a TOML text.

@@ -10,8 +10,6 @@ from typing import Final
 from trade.errors import ConfigurationError
 from trade.keeping import Database
 
-__all__ = ["AngleStore", "Span"]
-
 Span = tuple[float, float]
 """Where a joint is, in rad; its two ends differ while it moves."""
 

@@ -3,8 +3,6 @@
 from collections.abc import Callable, Iterator
 from typing import Final
 
-__all__ = ["ATTEMPTS", "attempts"]
-
 ATTEMPTS: Final = 3
 
 

@@ -8,8 +8,6 @@ from msgspec import Struct
 from trade import service
 from trade_drivers.faults._health import HEALTHY
 
-__all__ = ["CanBusState", "CanMonitor", "ErrorWord"]
-
 ErrorWord = Literal["error-active", "error-warning", "error-passive", "bus-off"]
 
 

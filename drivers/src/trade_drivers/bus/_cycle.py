@@ -15,8 +15,6 @@ from trade_drivers.bus._attempts import ATTEMPTS
 from trade_drivers.bus._jobs import Device, Work
 from trade_drivers.robotfile import Bus
 
-__all__ = ["HALT_NS", "PROBE_NS", "BusCycle", "BusDevice", "StopTicket", "silences"]
-
 silences: Final = logging.getLogger("trade.silences")
 """The logger for devices that do not answer; a program that reports faults itself raises its level."""
 PROBE_NS: Final = 500_000_000

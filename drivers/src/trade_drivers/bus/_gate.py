@@ -11,8 +11,6 @@ from trade_drivers.bus._jobs import DeviceT_co, Work
 if TYPE_CHECKING:
     from trade_drivers.bus._cycle import BusCycle
 
-__all__ = ["Command", "Terms", "admitted", "at_once", "expiry", "span"]
-
 _Cycle_co = TypeVar("_Cycle_co", bound="BusCycle[Any]", covariant=True)
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000

@@ -8,8 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-__all__ = ["holders"]
-
 _PROCESSES: Final = Path("/proc")
 _TERMINALS: Final = "/dev/pts/"
 _MASTERS: Final = ("/dev/ptmx", "/dev/pts/ptmx")

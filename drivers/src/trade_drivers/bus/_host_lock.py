@@ -11,8 +11,6 @@ from typing import Final
 
 from trade_drivers.bus._holders import holders
 
-__all__ = ["HostLock", "Taken"]
-
 _log = logging.getLogger("trade")
 _SOCKETS: Final = Path("/proc/net/unix")
 _LONGEST: Final = 50

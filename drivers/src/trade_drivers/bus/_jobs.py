@@ -8,23 +8,6 @@ from typing import ClassVar, Final, Generic, Protocol, TypeVar
 from trade import current_call
 from trade.errors import BusGone, DeviceFault, SendQueueFull, TradeError
 
-__all__ = [
-    "SHARED",
-    "TAKEN",
-    "BadAnswer",
-    "Device",
-    "Gate",
-    "NoAnswer",
-    "PortFull",
-    "PortLost",
-    "PortOpening",
-    "Refused",
-    "Steps",
-    "WireError",
-    "Work",
-    "losing",
-]
-
 Steps = Generator[None, None, None]
 """A generator that yields after each exchange, so that stops and cycles run in between."""
 

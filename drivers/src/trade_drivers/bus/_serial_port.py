@@ -20,8 +20,6 @@ from trade.errors import ConfigurationError, TradeError
 from trade_drivers.bus._holders import holders
 from trade_drivers.bus._jobs import SHARED, TAKEN, Gate, PortLost
 
-__all__ = ["ANSWER_MARGIN_S", "DRAIN_S", "LONGEST_WAIT_S", "SerialLine", "SerialWire"]
-
 ANSWER_MARGIN_S: Final = 0.034
 """Timeout beyond the transmission time: twice the default 16 ms latency of an FTDI adapter, and 2 ms."""
 LONGEST_WAIT_S: Final = 0.048

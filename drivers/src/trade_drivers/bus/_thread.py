@@ -16,8 +16,6 @@ from trade_drivers.bus._jobs import Device, PortFull, PortLost, PortOpening, Wir
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
 
-__all__ = ["BusThread", "Port", "opening", "start_thread"]
-
 _log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1
 _REOPEN_MOST_S: Final = 1.0

@@ -16,8 +16,6 @@ from trade._services.decorator import effect_of
 from trade.errors import ConfigurationError, DeadlineExceeded, DeviceError, InvalidArgument
 from trade_drivers.clibrary._marshalling import Passing, is_never_negative, plan
 
-__all__ = ["CFunctionFailed", "CLibrary"]
-
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 _AGAIN_S: Final = 0.005

@@ -9,8 +9,6 @@ from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Passing", "is_never_negative", "plan"]
-
 _NONE: Final = type(None)
 _FLOATS: Final = ("float", "double", "long double")
 _TEXTS: Final = ("char *", "char const *")

@@ -9,8 +9,6 @@ from trade_drivers.bus.can._port import CanPort
 from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.commissioning._commissioner import Bench, Found
 
-__all__ = ["CanBench"]
-
 _LISTEN_S: Final = 1.0
 """How long to listen for other drivers, and for devices that report by themselves."""
 

@@ -13,8 +13,6 @@ from msgspec import Struct
 from trade.errors import ConfigurationError
 from trade_drivers.bus._jobs import PortLost, WireError
 
-__all__ = ["Bench", "Commissioner", "Found", "scan"]
-
 _ATTEMPTS: Final = 3
 
 

@@ -15,8 +15,6 @@ from trade_drivers.interfaces._arm import Arm, ArmState
 from trade_drivers.interfaces._motion import Gripper, Motor
 from trade_drivers.interfaces._sensing import Sensor
 
-__all__ = ["FaultPoller"]
-
 _EVERY_S: Final = 0.04
 _KEPT: Final = 50
 """Number of measurements kept for each device: two seconds of them."""

@@ -15,8 +15,6 @@ from trade_drivers.faults._record import Fault, FaultInfo, Moment, info_of, samp
 from trade_drivers.faults._store import FaultStore, Kept, Key
 from trade_drivers.faults._trouble import Found
 
-__all__ = ["FaultLog"]
-
 _MOST: Final = 200
 """How many kinds of fault are kept; ended and acknowledged ones are dropped first, oldest first."""
 _SAVE_EVERY_S: Final = 1.0

@@ -6,8 +6,6 @@ from typing import Any, Final, cast
 
 from msgspec import Struct, structs
 
-__all__ = ["Fault", "FaultInfo", "FaultSample", "Moment", "info_of", "kind_of", "parts_of", "samples_of", "when"]
-
 _NUMBER: Final = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 _SEVERAL: Final = re.compile(r"((?:hardware error|error|status): )(.+)")
 """How drivers list the error bits that a device reports, one word for each."""

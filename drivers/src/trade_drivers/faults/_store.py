@@ -11,8 +11,6 @@ import msgspec
 from trade.keeping import Database
 from trade_drivers.faults._record import Fault
 
-__all__ = ["FaultStore", "Kept", "Key"]
-
 Key = tuple[str, str]
 """Device and kind."""
 Kept = tuple[int, Fault]

@@ -6,8 +6,6 @@ from typing import Final, Literal, NamedTuple
 from trade.errors import BusGone, DeviceError, DeviceFault
 from trade_drivers.faults._record import kind_of, parts_of
 
-__all__ = ["BUS_GONE", "SILENT", "Found", "Tell", "Trouble", "found_in"]
-
 SILENT: Final = "silent"
 BUS_GONE: Final = "bus gone"
 Respect = Literal["fault", "link"]

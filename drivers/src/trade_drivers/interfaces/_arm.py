@@ -10,8 +10,6 @@ from trade_drivers.interfaces._motion import Lockable, Speed, Valid
 from trade_drivers.interfaces._trajectory import Trajectory, planned
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances
 
-__all__ = ["Arm", "ArmLimits", "ArmState", "Safety"]
-
 Safety = Literal["normal", "reduced", "protective stop", "recovery", "safeguard stop", "emergency stop", "fault"]
 
 

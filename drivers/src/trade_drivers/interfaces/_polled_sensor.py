@@ -9,8 +9,6 @@ from typing import Final, Literal, NamedTuple, TypeVar
 from trade.errors import BusGone, ConfigurationError, DeviceAbsent, DeviceSilent
 from trade_drivers.interfaces._sensing import Reading, Sensor, SensorInfo
 
-__all__ = ["Measured", "PolledSensor"]
-
 _log = logging.getLogger("trade")
 
 _REOPEN_FIRST_S: Final = 0.1

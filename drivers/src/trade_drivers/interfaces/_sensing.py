@@ -7,8 +7,6 @@ from msgspec import Struct
 
 from trade import service
 
-__all__ = ["UNITS", "Camera", "CameraInfo", "Image", "ImageFormat", "Reading", "Sensor", "SensorInfo"]
-
 ImageFormat = Literal["jpeg", "png", "rgb8", "mono8"]
 """A complete file, or raw pixels row by row from the upper left, of three bytes (red, green, blue) or one."""
 

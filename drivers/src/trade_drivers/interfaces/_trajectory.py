@@ -13,8 +13,6 @@ from trade_drivers.motion._plan import Course, JointLimits, Plan, Tolerances, Tr
 from trade_drivers.motion._ramps import Passage
 from trade_drivers.motion._spline import Curve, Piece, cubic
 
-__all__ = ["Trajectory", "TrajectoryPoint", "checked", "planned"]
-
 _ROUNDING = 1e-6
 _AT_ONCE_S = 1e-3
 """A first time below this is rounding of 0."""

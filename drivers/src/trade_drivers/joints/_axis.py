@@ -18,8 +18,6 @@ from trade_drivers.robotfile import Joint
 if TYPE_CHECKING:
     from trade_drivers.joints._motion import Motion
 
-__all__ = ["Axis", "AxisT", "Goal", "Grain", "Sample", "Scale"]
-
 AxisT = TypeVar("AxisT", bound="Axis")
 """The axis type of one vendor."""
 

@@ -13,8 +13,6 @@ from trade_drivers.joints._jobs import Leave
 from trade_drivers.joints._motion import Motion
 from trade_drivers.robotfile import Bus
 
-__all__ = ["Exchange"]
-
 
 class Exchange(BusCycle[AxisT]):
     """The exchange with the joints of one bus. Any thread may also call ``stop``."""

@@ -9,8 +9,6 @@ from trade_drivers.joints._axis import Axis, AxisT
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Bus
 
-__all__ = ["Unfit", "check_joints", "check_least", "check_rate"]
-
 _BRAKING_S: Final = 1.5
 
 

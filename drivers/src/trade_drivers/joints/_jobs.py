@@ -12,8 +12,6 @@ from trade_drivers.joints._axis import AxisT
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["Enable", "Halt", "Leave", "Manner", "Relax"]
-
 
 class Manner(Enum):
     """The kind of a motion's commands, for devices with a mode for each."""

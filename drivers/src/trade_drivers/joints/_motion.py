@@ -15,8 +15,6 @@ from trade_drivers.joints._profile import Leg, together
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["Motion", "Move"]
-
 _SETTLING_S: Final = 0.15
 _STUCK_S: Final = 0.5
 _MOST_PER_CYCLE_S: Final = 0.1

@@ -19,9 +19,6 @@ from trade_drivers.joints._trajectory_run import Follow
 from trade_drivers.motion._plan import Plan
 from trade_drivers.plugins._driver import ThreadedBus
 
-__all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
-
-
 _Exchange = TypeVar("_Exchange", bound=Exchange[Any])
 
 

@@ -17,8 +17,6 @@ from trade_drivers.interfaces._trajectory import checked
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances, Track
 from trade_drivers.motion._spline import Way, there_together
 
-__all__ = ["AcrossGroup"]
-
 _Result = TypeVar("_Result")
 _LEAST_RAD_S: Final = 1e-3
 _TOLERANCES: Final = Tolerances(start_rad=0.3, path_rad=0.3, goal_rad=0.035, goal_time_s=1.0)

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 from trade_drivers.joints._axis import Grain
 
-__all__ = ["Leg", "Profile", "together"]
-
 
 class Leg(NamedTuple):
     """One joint's distance, with its maximum speed and acceleration."""

@@ -3,8 +3,6 @@
 from math import copysign, sqrt
 from typing import Final
 
-__all__ = ["Ramp", "towards"]
-
 _SLACK: Final = 1.02
 """Reserve for rounding to whole counts in plans that use all of a joint's acceleration."""
 

@@ -12,8 +12,6 @@ from trade_drivers.joints._motion import Motion
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["SetPoint"]
-
 
 class SetPoint(Motion[AxisT]):
     """Goals in counts and the speed to reach them; the service returns as soon as they are sent.

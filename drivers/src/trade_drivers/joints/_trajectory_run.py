@@ -14,8 +14,6 @@ from trade_drivers.motion._plan import Plan
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["Follow"]
-
 _VALID_NS: Final = 200_000_000
 """The validity of a sent goal, as for a set-point; the trajectory ends if no goal is sent for longer."""
 _NO_DEADLINE_NS: Final = 2**63

@@ -9,8 +9,6 @@ from trade_drivers.joints._axis import AxisT
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["next_measurement", "until"]
-
 _CHANGE_NS: Final = 600_000_000
 """The time allowed for a device's change of state."""
 _WAIT_S: Final = 0.001

@@ -7,8 +7,6 @@ from typing import Final
 from trade_drivers.bus._angle_store import Span
 from trade_drivers.robotfile import Joint
 
-__all__ = ["Zero"]
-
 _SLACK_RAD: Final = 0.05
 """How far a joint without power may sag unnoticed, if its encoder loses its zero altogether."""
 _FASTEST_RAD_S: Final = 30.0

@@ -9,8 +9,6 @@ from msgspec import Struct
 from trade import progress
 from trade_drivers.motion._spline import Curve
 
-__all__ = ["Course", "FollowProgress", "JointLimits", "Plan", "Tolerances", "Track"]
-
 
 class JointLimits(Struct, frozen=True, kw_only=True):
     """The limits for commands to a joint, from the robot file."""

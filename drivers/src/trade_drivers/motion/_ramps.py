@@ -5,8 +5,6 @@ from typing import Final, NamedTuple
 
 from trade_drivers.motion._spline import Piece
 
-__all__ = ["Passage"]
-
 _OFF_RAD: Final = 1e-6
 """The deviation from a point that counts as rounding: no joint resolves it."""
 _OFF_RAD_S: Final = 2e-6

@@ -6,8 +6,6 @@ from itertools import pairwise
 from math import copysign, sqrt
 from typing import Final, NamedTuple
 
-__all__ = ["Curve", "Piece", "Way", "cubic", "there_together"]
-
 
 class Piece(NamedTuple):
     """The cubic piece between two points, with a constant jerk."""

@@ -22,8 +22,6 @@ from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["AnyDriver", "AttachedBus", "Driver", "SenseDriver", "ThreadedBus", "drivers", "load_driver"]
-
 _GROUP = "trade.drivers"
 
 

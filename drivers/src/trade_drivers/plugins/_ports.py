@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Bus, CanBus, Robot, UrBus
 
-__all__ = ["SeenPorts", "check_ports"]
-
 _SOCKETCAND_PORT: Final = "29536"
 
 

@@ -8,8 +8,6 @@ from trade_drivers.plugins._driver import AnyDriver, Driver, SenseDriver, load_d
 from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["check", "own_clocks", "refusals"]
-
 
 def check(robot: Robot, ports: Mapping[str, str] | None = None) -> None:
     """Has the drivers of a robot check its file, without access to any device.

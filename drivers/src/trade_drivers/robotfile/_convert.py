@@ -10,8 +10,6 @@ from msgspec import Struct
 
 from trade.errors import ConfigurationError
 
-__all__ = ["explain", "record_of", "wrong"]
-
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")

@@ -7,8 +7,6 @@ from trade._text_file import read_text
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Robot, parse
 
-__all__ = ["load"]
-
 
 def load(path: str | PathLike[str]) -> Robot:
     """Reads and checks a robot file.

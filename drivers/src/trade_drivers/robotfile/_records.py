@@ -8,8 +8,6 @@ from msgspec import Meta, Struct
 
 from trade_drivers.robotfile._convert import record_of
 
-__all__ = ["Arm", "Camera", "Coupled", "Drill", "Gripper", "Group", "Positive", "Sensor", "arm_problem"]
-
 Positive = Annotated[float, Meta(gt=0)]
 Angles = Annotated[list[float], Meta(min_length=6, max_length=6)]
 

@@ -7,8 +7,6 @@ from msgspec.structs import replace
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Robot
 
-__all__ = ["without"]
-
 
 def without(robot: Robot, names: Iterable[str]) -> tuple[Robot, list[str]]:
     """Returns the robot as if some of its buses, cameras or sensors were not in its file.

@@ -12,8 +12,6 @@ from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, refused, until
 
-__all__ = ["ArmContract"]
-
 _NEAR_M: Final = 0.002
 _LINE_M: Final = 0.02
 

@@ -14,8 +14,6 @@ from trade.testing import memory_system
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.motion._plan import JointLimits
 
-__all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "at_once", "refused", "streamed", "until"]
-
 REACH_RAD: Final = 0.12
 """The maximum distance of a joint from its initial position."""
 SPEED_RAD_S: Final = 0.2

@@ -7,8 +7,6 @@ from typing import Final
 from trade_drivers.interfaces._sensing import Camera
 from trade_drivers.testing._asking import at_once, streamed
 
-__all__ = ["CameraContract"]
-
 _BEGINS: Final = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
 _BYTES_PER_PIXEL: Final = {"rgb8": 3, "mono8": 1}
 

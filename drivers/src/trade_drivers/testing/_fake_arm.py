@@ -14,8 +14,6 @@ from trade_drivers.motion._plan import JointLimits, Plan
 from trade_drivers.testing._fake_device import FakeActuator, end_of, report_whole
 from trade_drivers.testing._fake_joints import checked_speed, start_rad
 
-__all__ = ["FakeArm"]
-
 _JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _COORDINATES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = (0.4, 0.0, 0.4, 0.0, math.pi, 0.0)

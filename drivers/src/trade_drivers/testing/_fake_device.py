@@ -11,8 +11,6 @@ from trade.errors import DeviceFault, DeviceSilent, MotionStopped, ToleranceExce
 from trade_drivers.interfaces._motion import Lockable
 from trade_drivers.motion._plan import Plan
 
-__all__ = ["FakeActuator", "FakeDevice", "end_of", "report_whole"]
-
 _BUS: Final = "memory"
 _SILENT_S: Final = 1.0
 _LOOK_S: Final = 0.005

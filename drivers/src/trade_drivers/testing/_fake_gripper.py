@@ -8,8 +8,6 @@ from trade_drivers._validation import finite, within
 from trade_drivers.interfaces._motion import FingerSpeed, Force, Gripper, GripperLimits, GripperState, Width
 from trade_drivers.testing._fake_device import FakeActuator
 
-__all__ = ["FakeGripper"]
-
 _WIDEST_M: Final = 0.085
 _SPEEDS_M_S: Final = (0.02, 0.15)
 _FORCES_N: Final = (20.0, 235.0)

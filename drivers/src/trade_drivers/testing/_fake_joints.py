@@ -10,8 +10,6 @@ from trade_drivers.interfaces._motion import JointGroup, Motor, MotorState, Posi
 from trade_drivers.motion._plan import JointLimits, Plan
 from trade_drivers.testing._fake_device import FakeActuator, end_of, report_whole
 
-__all__ = ["FakeJointGroup", "FakeMotor", "checked_speed", "start_rad"]
-
 _RANGE_RAD: Final = 2.6
 _SPEED_RAD_S: Final = 6.0
 _LEAST_RAD_S: Final = 1e-4

@@ -10,8 +10,6 @@ from trade_drivers._validation import finite
 from trade_drivers.interfaces._sensing import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
 from trade_drivers.testing._fake_device import FakeDevice
 
-__all__ = ["FakeCamera", "FakeSensor"]
-
 _STEP: Final = 8
 """The brightness between two pixels side by side."""
 _BYTES_PER_PIXEL: Final = 3

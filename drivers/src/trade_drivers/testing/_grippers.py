@@ -8,8 +8,6 @@ from trade.errors import InvalidArgument, LimitExceeded, MotionStopped
 from trade_drivers.interfaces._motion import Gripper
 from trade_drivers.testing._asking import Caller, refused, until
 
-__all__ = ["GripperContract"]
-
 _NEAR_M = 0.002
 
 

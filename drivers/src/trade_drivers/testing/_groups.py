@@ -14,8 +14,6 @@ from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.motion._plan import Tolerances
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, ahead, refused, until
 
-__all__ = ["JointGroupContract"]
-
 
 class JointGroupContract:
     """Subclass it with a fixture ``group``: attached, relaxed, at rest, within its limits and free to move a little.

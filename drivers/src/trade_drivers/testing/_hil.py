@@ -20,8 +20,6 @@ from trade_drivers.robotfile import Robot
 from trade_drivers.robotfile._load import load
 from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
 
-__all__ = ["main"]
-
 _SUITE: Final = Path(__file__).with_name("_suite.py")
 _KINDS: Final[Mapping[str, type[object]]] = {
     "motor": Motor,

@@ -10,8 +10,6 @@ from trade.testing import memory_system
 from trade_drivers.interfaces._motion import Motor
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, ahead, refused, until
 
-__all__ = ["MotorContract"]
-
 
 class MotorContract:
     """Subclass it with a fixture ``motor``: attached, relaxed, at rest, within its limits and free to move a little.

@@ -7,8 +7,6 @@ import math
 from trade_drivers.interfaces._sensing import UNITS, Reading, Sensor, SensorInfo
 from trade_drivers.testing._asking import at_once, streamed, until
 
-__all__ = ["SensorContract"]
-
 
 class SensorContract:
     """Subclass it with a fixture ``sensor``: attached, with a value within its range. Nothing moves."""

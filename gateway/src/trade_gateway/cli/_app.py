@@ -15,8 +15,6 @@ from trade_gateway.cli._output import NOT_FOUND, is_providers, say_error
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.process._parent_watch import end_with_stdin
 
-__all__ = ["build", "main"]
-
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
 _ROBOTS: Final = "Robots, containers and networks"

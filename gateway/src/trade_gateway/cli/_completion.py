@@ -14,8 +14,6 @@ import typer
 from trade import Container, Handle
 from trade_gateway.cli._system_choice import SystemChoice, visitor_of
 
-__all__ = ["containers", "groups", "hooks", "locked_groups", "notifications", "services"]
-
 Complete = Callable[[typer.Context, str], list[str]]
 _OWN: Final = "trade"
 """The group of the middleware's own services, which is offered only once its first letter is typed."""

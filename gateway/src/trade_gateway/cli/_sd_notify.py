@@ -11,8 +11,6 @@ from collections.abc import MutableMapping
 from types import TracebackType
 from typing import Final
 
-__all__ = ["Notifier"]
-
 _PATIENCE_S: Final = 1.0
 """How long a message may wait for its reader, in seconds."""
 

@@ -15,8 +15,6 @@ from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade_gateway.config._gateway_file import Plan
 
-__all__ = ["Named", "digest", "named_by"]
-
 _CERTIFICATE: Final = "cert.pem"
 
 

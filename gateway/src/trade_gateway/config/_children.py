@@ -9,8 +9,6 @@ from msgspec import Meta
 from trade_gateway.config._entry import Around, ContainerSpec, Entry
 from trade_gateway.config._tables import Tables, converted
 
-__all__ = ["Child", "Supervised", "read_children"]
-
 _LEASE_S: Final = 10.0
 _MISSES: Final = 4
 """How many health checks in a row may fail before a container counts as hung."""

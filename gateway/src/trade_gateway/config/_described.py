@@ -12,8 +12,6 @@ from msgspec import Struct
 from trade_gateway.config._entry import Entry
 from trade_gateway.config._gateway_file import Plan
 
-__all__ = ["ChildTables", "Difference", "absolute", "as_toml", "described", "differences", "paths_in"]
-
 _PATHS: Final = ("robot", "gateway", "rules", "ros", "tls", "policy", "audit", "folder")
 _INNER_PATHS: Final = {"http": ("tokens", "tls", "twin"), "record": ("folder",)}
 _COMMANDS: Final = (("program",), ("health", "command"))

@@ -7,20 +7,6 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from msgspec import Meta, Struct
 
-__all__ = [
-    "INSIDE",
-    "KINDS",
-    "LOCAL",
-    "ONLY_WITH",
-    "Around",
-    "ContainerSpec",
-    "Entry",
-    "HealthSpec",
-    "HttpSpec",
-    "ObjectSpec",
-    "RecordSpec",
-]
-
 LOCAL: Final = "local"
 KINDS: Final = ("robot", "gateway", "providers", "rules", "http", "ros", "record", "program")
 """The keys that set what a container runs; a table has one of them."""

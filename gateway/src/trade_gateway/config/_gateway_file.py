@@ -20,8 +20,6 @@ from trade_gateway.config._supervised_system import as_gateway
 from trade_gateway.config._tables import read_toml
 from trade_gateway.process._addresses import addresses
 
-__all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
-
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
 """Addresses that the transport cannot assign to an interface, so that it would apply no rule."""

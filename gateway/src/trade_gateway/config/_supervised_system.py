@@ -8,8 +8,6 @@ from trade.errors import ConfigurationError
 from trade_gateway.config._entry import LOCAL
 from trade_gateway.config._tables import at
 
-__all__ = ["as_gateway", "is_supervised"]
-
 _OF_GATEWAY = ("tls", "policy", "audit", "connect")
 """Keys of ``[system]`` that its supervisor takes, too."""
 

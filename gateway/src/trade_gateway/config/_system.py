@@ -17,8 +17,6 @@ from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._supervised_system import is_supervised
 from trade_gateway.config._tables import Tables, at, converted, line_of, read_toml
 
-__all__ = ["SystemPlan", "read_system_file"]
-
 _SET_BY_GATEWAY: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
 """Keys that a gateway file sets instead of the system file."""
 

@@ -33,8 +33,6 @@ from trade_gateway.config._entry import (
     RecordSpec,
 )
 
-__all__ = ["Tables", "at", "converted", "line_of", "read_toml"]
-
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")

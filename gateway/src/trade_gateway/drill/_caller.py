@@ -20,8 +20,6 @@ import trade
 from trade import Handle, where
 from trade.errors import DeviceError, TradeError
 
-__all__ = ["Order"]
-
 _FOUND_S: Final = 30.0
 _ENABLED_S: Final = 30.0
 """How long devices may take to become enabled, in seconds: after a bus was lost, they return one by one."""

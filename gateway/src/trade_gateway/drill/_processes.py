@@ -15,8 +15,6 @@ from typing import Any, Final
 from trade._remote.error_output import last_line
 from trade.errors import TradeError
 
-__all__ = ["Actor", "DrillFailed"]
-
 _END_S: Final = 20.0
 
 

@@ -6,8 +6,6 @@ from typing import Any, Final, Literal
 import msgspec
 from msgspec import Struct
 
-__all__ = ["Played", "Report", "Stop", "Verdict", "as_data", "page"]
-
 Verdict = Literal["ok", "too long", "moved again", "did not stop"]
 
 

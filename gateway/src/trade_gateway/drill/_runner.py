@@ -12,8 +12,6 @@ from trade_gateway.drill._scenes import Scene, limit_s
 from trade_gateway.drill._targets import Target
 from trade_gateway.drill._testbed import Stand
 
-__all__ = ["play"]
-
 _TRIES: Final = 3
 _BEGUN_S: Final = 20.0
 _ON_ITS_WAY_S: Final = 0.5

@@ -7,8 +7,6 @@ from msgspec import Struct
 from trade_drivers.robotfile import Drill
 from trade_gateway.drill._targets import Target
 
-__all__ = ["ALLOWANCE_S", "SCENES", "Failure", "Motion", "Scene", "limit_s"]
-
 ALLOWANCE_S: Final = 0.5
 """Extra time for a joint to rest beyond the rules' limits, for a busy computer, in seconds."""
 LEASE_S: Final = 2.0

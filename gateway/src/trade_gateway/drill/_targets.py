@@ -7,8 +7,6 @@ from msgspec import Struct
 from trade_drivers import Driver, load_driver
 from trade_drivers.robotfile import Arm, Bus, CanBus, Joint, Robot
 
-__all__ = ["LASTS_S", "Target", "targets_of"]
-
 LASTS_S = 20.0
 """How long a motion of a drill would last if nothing ended it, in seconds."""
 _STREAMS_S = 2.5

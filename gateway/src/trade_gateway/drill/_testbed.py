@@ -22,8 +22,6 @@ from trade_gateway.drill._processes import Actor, bare_environment
 from trade_gateway.drill._scenes import VALID_S, Scene
 from trade_gateway.drill._targets import Target
 
-__all__ = ["Judge", "Stand", "standing"]
-
 
 class _Event(msgspec.Struct, frozen=True):
     """The fields of a line of the byte log that a drill needs."""

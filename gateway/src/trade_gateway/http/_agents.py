@@ -31,8 +31,6 @@ from trade_gateway.http._session_timeouts import Leases
 from trade_gateway.language import read_lexicon
 from trade_gateway.mcp import Approvals, Tools, Twin, converse
 
-__all__ = ["Agents"]
-
 _logger = logging.getLogger("trade")
 
 _IDLE_S: Final = 600.0

@@ -9,8 +9,6 @@ from trade_gateway.language._questions import QUESTIONS
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request
 from trade_gateway.language._states import STATES
 
-__all__ = ["DIALOGUE", "REQUESTS"]
-
 
 def _in_dialogue(_asker: Asker, _gaps: Gaps) -> Answer:
     raise NotImplementedError  # the dialogue handles it before

@@ -19,8 +19,6 @@ from trade_gateway.language._model import Model
 from trade_gateway.language._orders import permitted
 from trade_gateway.language._requests import Ambiguous, Answer, Asker, Gaps, Plan, Unknown
 
-__all__ = ["Reply", "Talk"]
-
 _WAIT_S: Final = 1.0
 _CONFIRM_S: Final = 60.0
 """How long a yes counts, in seconds."""

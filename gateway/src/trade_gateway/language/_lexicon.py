@@ -17,8 +17,6 @@ from trade_gateway._usage import UsageError
 from trade_gateway.language._catalogue import DIALOGUE, REQUESTS
 from trade_gateway.language._requests import Gaps
 
-__all__ = ["NUMBERS", "Heard", "Lexicon", "NotUnderstood", "Phrase", "is_question", "read_lexicon"]
-
 _ATOM: Final = re.compile(r"\{(?P<gap>[a-z_]+)\}|(?P<mark>[()\[\]|])|(?P<word>[^\s{}()\[\]|]+)|(?P<space>\s+)")
 _MARKS: Final = {"(": "(?:", ")": ")", "[": "(?:", "]": ")?", "|": "|"}
 NUMBERS: Final = ("number", "other_number")

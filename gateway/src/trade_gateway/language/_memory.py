@@ -10,8 +10,6 @@ import msgspec
 from trade._atomic_file import replace
 from trade._protocol.messages import UNREADABLE
 
-__all__ = ["Memory"]
-
 _MOST_BYTES: Final = 16 << 20
 
 

@@ -20,8 +20,6 @@ from trade_gateway.language._catalogue import DIALOGUE
 from trade_gateway.language._lexicon import Heard, Lexicon, NotUnderstood, Phrase, is_question
 from trade_gateway.language._names import others
 
-__all__ = ["Model"]
-
 _LIMIT_S: Final = 30.0
 _LOOK_S: Final = 0.02
 _END_S: Final = 5.0

@@ -20,8 +20,6 @@ from trade_gateway.language._requests import (
     order,
 )
 
-__all__ = ["MOTION_ORDERS"]
-
 _LOCK_WAIT_S: Final = 5.0
 
 

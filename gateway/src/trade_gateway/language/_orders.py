@@ -18,8 +18,6 @@ from trade_gateway.language._requests import (
     order,
 )
 
-__all__ = ["ORDERS", "permitted"]
-
 _PORT: Final = 7450
 
 

@@ -11,8 +11,6 @@ from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.language._names import matching, names, one_of, others, resources, said
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
 
-__all__ = ["QUESTIONS"]
-
 _ARTICLES: Final = ("a", "an", "the", "my", "some")
 _ANYTHING: Final = ("anything", "something", "things", "objects", "it", "them")
 _LITTLE: Final = ("at", "for", "from", "in", "into", "of", "off", "on", "onto", "out", "to", "up", "with")

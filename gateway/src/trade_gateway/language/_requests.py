@@ -10,8 +10,6 @@ from msgspec import Struct
 from trade import Container, Lock
 from trade_gateway.language._memory import Memory
 
-__all__ = ["PURPOSE", "Ambiguous", "Answer", "Asker", "Gaps", "Plan", "Request", "Unknown", "done", "order"]
-
 PURPOSE: Final = "asked in a dialogue"
 """The reason that other clients see."""
 

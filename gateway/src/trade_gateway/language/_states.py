@@ -14,8 +14,6 @@ from trade.auditing import AuditRow, reading, records_in
 from trade_gateway.language._names import matching, others, place, resources, said
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
 
-__all__ = ["STATES"]
-
 _ROWS: Final = 5_000
 """How many of the last rows of an audit record are read."""
 _ANSWER_S: Final = 2.0

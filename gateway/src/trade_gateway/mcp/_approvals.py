@@ -19,8 +19,6 @@ from trade_gateway.clients import ClientAuthorizer
 from trade_gateway.clients._errors import NeedsApproval
 from trade_gateway.clients._schemas import APPROVALS
 
-__all__ = ["Approvals", "Request"]
-
 _MOST: Final = 16
 _MOST_TEXT: Final = 2_000
 """Greatest length of the arguments; a call that cannot be shown in full is refused."""

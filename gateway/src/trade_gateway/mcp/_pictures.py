@@ -15,8 +15,6 @@ from trade.errors import InvalidResult, NoSuchService, TooLarge, TradeError
 from trade_gateway.clients import Client, ClientApi
 from trade_gateway.clients import _schemas as messages
 
-__all__ = ["MOST_PICTURE_BYTES", "Pictures"]
-
 MOST_PICTURE_BYTES: Final = 4 << 20
 _SCHEME: Final = "trade"
 _NO_GROUP: Final = "_"

@@ -25,8 +25,6 @@ from trade_gateway.mcp._pictures import Pictures
 from trade_gateway.mcp._simulation_twin import Twin
 from trade_gateway.mcp._tools import TOOLS, Tools
 
-__all__ = ["converse", "serve"]
-
 Hears = MemoryObjectReceiveStream[SessionMessage | Exception]
 Says = MemoryObjectSendStream[SessionMessage]
 

@@ -20,8 +20,6 @@ from trade_gateway._usage import find
 from trade_gateway.clients._errors import NoTwin
 from trade_gateway.drill._processes import Actor, DrillFailed, bare_environment
 
-__all__ = ["Tried", "Twin"]
-
 _UP_S: Final = 60.0
 _SEEN_S: Final = 10.0
 _PLACED_WITHIN_S: Final = 60.0

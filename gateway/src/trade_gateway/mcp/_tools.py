@@ -19,8 +19,6 @@ from trade_gateway.language import Lexicon, Memory, Talk
 from trade_gateway.mcp._approvals import Approvals
 from trade_gateway.mcp._simulation_twin import Tried, Twin
 
-__all__ = ["TOOLS", "Tool", "Tools"]
-
 Progress = Callable[[Any], None]
 """Receives the progress of a call; on any thread."""
 _APPROVED_WITHIN_S: Final = 120.0

@@ -31,8 +31,6 @@ from trade._text_file import as_before, read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
-__all__ = ["Authority", "Issued", "NameRevoked", "NameTaken", "NoAuthority", "Purpose"]
-
 Purpose = Literal["container", "gateway"]
 
 _LASTS: Final = timedelta(days=7)

@@ -7,8 +7,6 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
-__all__ = ["addresses", "forwarding", "in_url", "is_loopback"]
-
 _SYSCTLS: Final = Path("/proc/sys/net")
 
 

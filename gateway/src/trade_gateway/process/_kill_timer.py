@@ -8,8 +8,6 @@ from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
-__all__ = ["KillTimer", "TimerLease", "uptime_s"]
-
 _AT: Final = 1
 """TIMER_ABSTIME of time.h."""
 

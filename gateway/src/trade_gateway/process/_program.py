@@ -20,8 +20,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-__all__ = ["Log", "order"]
-
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _KILL_EVERY_S: Final = 0.05
 _UNKILLABLE_S: Final = 5.0

@@ -12,8 +12,6 @@ import time
 from pathlib import Path
 from typing import Final
 
-__all__ = ["PRIORITY", "RealTime", "refusal"]
-
 PRIORITY: Final = 10
 """Below the kernel's own threads, which have 50."""
 _MOST_SHARE: Final = 0.8

@@ -8,29 +8,6 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, cast
 import msgspec
 from msgspec import Meta, Struct
 
-__all__ = [
-    "CALLS",
-    "FAULTS",
-    "LOCKS",
-    "Call",
-    "Channel",
-    "CompressedImage",
-    "Fault",
-    "FaultKind",
-    "JointStates",
-    "Lock",
-    "Locks",
-    "Message",
-    "RawImage",
-    "Time",
-    "camera_channel",
-    "encoded",
-    "group_of",
-    "joints_channel",
-    "picture",
-    "service_channel",
-]
-
 _JOINTS: Final = "/joints"
 Base64 = Annotated[str, Meta(extra_json_schema={"contentEncoding": "base64"})]
 FaultKind = Literal["health", "gone", "unreadable", "joint", "e-stop"]

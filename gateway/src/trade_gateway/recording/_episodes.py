@@ -12,8 +12,6 @@ from trade_gateway.recording._motion import gaps, motion_of
 from trade_gateway.recording._reader import Entry
 from trade_gateway.recording._sources import within
 
-__all__ = ["Episode", "Span", "episodes", "locked"]
-
 _decode: Final = msgspec.json.Decoder(Locks).decode
 _ROUNDING: Final = 1e-6
 

@@ -13,8 +13,6 @@ from trade_gateway.recording._channels import FAULTS, Fault, Message
 from trade_gateway.recording._file import Attachment
 from trade_gateway.recording._recorder import Ring
 
-__all__ = ["SavedAtFault"]
-
 _MS_NS: Final = 1_000_000
 HOLD_OFF_S: Final = 10.0
 """A fault within this time after a saved one belongs to the same event, in seconds."""

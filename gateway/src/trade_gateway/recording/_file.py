@@ -13,8 +13,6 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import Channel, Message
 
-__all__ = ["Attachment", "RecordingFile"]
-
 _CHUNK_BYTES: Final = 1 << 20
 _SEQUENCE: Final = (1 << 32) - 1
 

@@ -13,8 +13,6 @@ from typing import Any, Final
 from trade.errors import ConfigurationError
 from trade_gateway.recording._episodes import Episode
 
-__all__ = ["write"]
-
 _FILE: Final = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _FIRST: Final = _FILE.format(chunk_index=0, file_index=0)
 _WHERE: Final = ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index")

@@ -14,8 +14,6 @@ from trade.errors import ConfigurationError
 from trade_gateway.process._addresses import in_url
 from trade_gateway.recording._channels import FAULTS, LOCKS, Channel, Fault, FaultKind, Message
 
-__all__ = ["Live"]
-
 _OUTBOX: Final = 256
 """Most messages that wait for a slow viewer; beyond that the oldest are dropped."""
 _KEEP_NOTICES: Final = 100

@@ -14,20 +14,6 @@ from trade_drivers import JointLimits, Tolerances, Trajectory, TrajectoryPoint, 
 from trade_gateway.recording._channels import JointStates, group_of
 from trade_gateway.recording._reader import entries
 
-__all__ = [
-    "Deviation",
-    "Gap",
-    "Motion",
-    "Track",
-    "deviation",
-    "fitted",
-    "gaps",
-    "motion_of",
-    "motions",
-    "moving",
-    "trajectory",
-]
-
 _decode: Final = msgspec.json.Decoder(JointStates).decode
 _STEP_S: Final = 0.05
 """Time between points of a trajectory, in the recording's time, in seconds."""

@@ -25,8 +25,6 @@ from trade_gateway.recording._channels import (
 from trade_gateway.recording._sources import within
 from trade_gateway.recording._timeline import Timeline
 
-__all__ = ["Watch"]
-
 _EVERY_S: Final = 0.2
 _ASKED_S: Final = 1.0
 """How long to wait for a container's answer before continuing without it, in seconds."""

@@ -12,8 +12,6 @@ from zstandard import ZstdError
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Entry", "entries"]
-
 _BROKEN: Final = (McapError, struct.error, ValueError, ZstdError)
 """What the library raises at an incomplete end of a file."""
 

@@ -18,8 +18,6 @@ from trade_gateway.recording._poller import Watch
 from trade_gateway.recording._sources import Sources, Wanted
 from trade_gateway.recording._timeline import Timeline
 
-__all__ = ["Recorder", "Ring", "Sink", "about"]
-
 
 class Ring:
     """A ring buffer of the last seconds' messages. Used by one thread."""

@@ -20,8 +20,6 @@ from trade_gateway.recording._reader import Entry, entries
 from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._types import Message, Types
 
-__all__ = ["write"]
-
 _VERSION: Final = 9
 _JOINT_STATES: Final = "/joint_states"
 _CAMERAS: Final = "/cameras/"

@@ -22,8 +22,6 @@ from trade_gateway.recording._channels import (
 )
 from trade_gateway.recording._timeline import Timeline
 
-__all__ = ["Sources", "Wanted", "joint_states", "within"]
-
 _KEEP: Final = 500
 """Most samples of a stream that wait for a slow disk."""
 _LIMITS_S: Final = 2.0

@@ -4,8 +4,6 @@ import time
 from collections.abc import Hashable
 from typing import Final
 
-__all__ = ["Timeline"]
-
 _FIRST_NS: Final = 86_400 * 10**9
 """Where a recording begins whose wall clock says less, so that no time in its file is negative."""
 _STEP_NS: Final = 20_000_000

@@ -32,8 +32,6 @@ from trade_gateway.ros.to_ros._services import LocksToRos, ServicesToRos
 from trade_gateway.ros.to_ros._streams import JointStatesToRos, StreamsToRos, Topics
 from trade_gateway.ros.to_ros._trajectories import TrajectoriesToRos
 
-__all__ = ["GROUP", "Bridge", "Bridged"]
-
 _logger = logging.getLogger("trade")
 
 _LONGEST: Final = 400

@@ -11,8 +11,6 @@ from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._graph import Graph
 from trade_gateway.ros._types import Types, installed_definitions
 
-__all__ = ["join", "planned"]
-
 
 class _Side(NamedTuple):
     module: str

@@ -10,8 +10,6 @@ from trade import Handle
 from trade.errors import ConfigurationError
 from trade_gateway.ros._types import Field, Message, Types
 
-__all__ = ["RequestMapping", "ResponseMapping", "failure", "ros_path", "ros_stamp", "seconds"]
-
 _BARE: Final = "data"
 """Common names of the only field of a message."""
 _STAMPED: Final = "std_msgs/msg/Header"

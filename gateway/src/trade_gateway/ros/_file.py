@@ -13,27 +13,6 @@ from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway.ros._urdf import read_urdf
 
-__all__ = [
-    "ActionEntry",
-    "Command",
-    "FromAction",
-    "FromJoints",
-    "FromParameters",
-    "FromPublish",
-    "FromService",
-    "FromTopic",
-    "GripperEntry",
-    "JointStates",
-    "Link",
-    "LockService",
-    "RobotEntry",
-    "RosFile",
-    "ServiceEntry",
-    "StreamEntry",
-    "TrajectoryEntry",
-    "read_ros_file",
-]
-
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")

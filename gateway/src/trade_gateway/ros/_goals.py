@@ -12,23 +12,6 @@ from trade_gateway.ros._joints import JointNames
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.to_ros._served_goals import Unacceptable
 
-__all__ = [
-    "ACTION",
-    "AT_ONCE_S",
-    "GOAL_TOLERANCE_VIOLATED",
-    "INVALID_GOAL",
-    "INVALID_JOINTS",
-    "OLD_HEADER_TIMESTAMP",
-    "PATH_TOLERANCE_VIOLATED",
-    "SUCCESSFUL",
-    "code_of",
-    "goal_of",
-    "lasts_s",
-    "starts_late",
-    "tolerances_of",
-    "trajectory_of",
-]
-
 ACTION: Final = "control_msgs/action/FollowJointTrajectory"
 SUCCESSFUL: Final = 0
 INVALID_GOAL: Final = -1

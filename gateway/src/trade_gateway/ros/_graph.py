@@ -16,22 +16,6 @@ from typing import Any, Protocol
 from trade.errors import CallerError, CallError
 from trade_gateway.ros._types import Message, Types
 
-__all__ = [
-    "Answer",
-    "Closes",
-    "Ended",
-    "Goal",
-    "Graph",
-    "Heard",
-    "NodeListener",
-    "Outcome",
-    "Publisher",
-    "Pursuit",
-    "Refuse",
-    "RosRefused",
-    "RosUnreachable",
-]
-
 Heard = Callable[[Message, str], object]
 """Receives a message and the name of the node that sent it (``/teleop``; empty if ROS does not say)."""
 Answer = Callable[[Message, str, float], Message]

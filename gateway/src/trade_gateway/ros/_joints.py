@@ -8,8 +8,6 @@ import msgspec
 from trade import Container, Handle, where
 from trade.errors import ConfigurationError
 
-__all__ = ["LIMBS", "JointNames", "Measured", "beside", "joints_of", "limbs", "measured"]
-
 LIMBS: Final = where(kind="JointGroup") | where(kind="Arm") | where(kind="Motor") | where(kind="Gripper")
 _LIMITS_S: Final = 5.0
 

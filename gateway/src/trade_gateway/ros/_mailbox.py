@@ -7,8 +7,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
-__all__ = ["AtOnce", "Mailbox"]
-
 _T = TypeVar("_T")
 _END_S: Final = 2.0
 """How long closing waits for running callbacks; they may last longer."""

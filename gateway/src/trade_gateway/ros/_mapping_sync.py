@@ -11,8 +11,6 @@ from trade.errors import ConfigurationError
 from trade_gateway.ros._conversion import failure
 from trade_gateway.ros._graph import Closes
 
-__all__ = ["Following", "Mapping", "Place", "absent_name", "named_services", "of_name"]
-
 _logger = logging.getLogger("trade")
 
 _OWN: Final = "trade"

@@ -15,8 +15,6 @@ from trade.errors import Cancelled
 from trade_gateway.clients._clients import Client, Place, places
 from trade_gateway.ros._graph import Graph, RosUnreachable
 
-__all__ = ["UNKNOWN", "Guest", "NodeLocks", "Nodes"]
-
 
 class _HeldLock:
     def __init__(self, name: str) -> None:

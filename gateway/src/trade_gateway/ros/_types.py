@@ -20,8 +20,6 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from trade._text_file import read_text
 from trade.errors import ConfigurationError
 
-__all__ = ["Field", "Message", "Types", "installed_definitions"]
-
 Message = dict[str, Any]
 
 _SHIPPED: Final = Path(__file__).parent / "definitions"

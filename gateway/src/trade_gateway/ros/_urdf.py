@@ -10,8 +10,6 @@ from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Mimic", "Transform", "UrdfJoint", "read_urdf"]
-
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 """x, y, z, w."""

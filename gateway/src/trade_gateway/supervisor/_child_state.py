@@ -12,8 +12,6 @@ from trade_gateway.supervisor._objects import CreatedObjects
 from trade_gateway.supervisor._process import Process
 from trade_gateway.supervisor._restart_policy import Life, State
 
-__all__ = ["ChildInfo", "News", "Unit"]
-
 
 class ChildInfo(Struct, frozen=True):
     """The state of a child."""

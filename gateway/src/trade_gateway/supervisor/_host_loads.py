@@ -4,8 +4,6 @@ import math
 from collections.abc import Collection
 from typing import Final
 
-__all__ = ["HostLoads"]
-
 _FRESH_S: Final = 10.0
 """How long a measured load counts, in seconds."""
 _STEADY_S: Final = 5.0

@@ -14,8 +14,6 @@ from msgspec import Struct
 
 from trade_gateway.process._kill_timer import TimerLease
 
-__all__ = ["Arbiter", "Holder", "Lease", "waits_s"]
-
 DRIFT: Final = 0.025
 """Share of a lease; more than the difference of two clocks with an error of 1 % each."""
 MARGIN_S: Final = 1.0

@@ -21,8 +21,6 @@ from trade_gateway.supervisor._objects import GROUP
 from trade_gateway.supervisor._single_instance import is_free
 from trade_gateway.supervisor._store import StateStore
 
-__all__ = ["Asking", "Leased", "StandIn"]
-
 _KEEP_S: Final = 5.0
 """How long the arbiter may take to save states, in seconds."""
 _MOST_BYTES: Final = 16 * 1024 * 1024

@@ -12,8 +12,6 @@ from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.config._entry import ContainerSpec, ObjectSpec
 
-__all__ = ["GROUP", "CreatedObjects", "function_of", "furnish", "lacking", "make", "name_of", "save"]
-
 GROUP: Final = "trade"
 _LOOK_EVERY_S: Final = 0.02
 

@@ -21,8 +21,6 @@ from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.process._program import order
 from trade_gateway.supervisor._single_instance import alone
 
-__all__ = ["Process", "rss_mb"]
-
 _LONGEST: Final = 300
 """The longest quotation of its last line, in characters."""
 _MARK: Final = "SUPERVISED_PROGRAM"

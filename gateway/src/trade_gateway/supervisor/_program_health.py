@@ -14,8 +14,6 @@ from trade.errors import ConfigurationError
 from trade_gateway.config._children import Child
 from trade_gateway.supervisor._objects import GROUP, CreatedObjects
 
-__all__ = ["await_program", "epochs_of", "health_problem"]
-
 _LOOK_EVERY_S: Final = 0.05
 _RUNS_S: Final = 1.0
 """How long a program without a sign of life runs before it counts as up, in seconds."""

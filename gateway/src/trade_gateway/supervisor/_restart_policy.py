@@ -7,8 +7,6 @@ from typing import Final
 
 from trade_gateway.config._children import Supervised
 
-__all__ = ["GRACE_S", "Life", "State", "Transition"]
-
 START_S: Final = 60.0
 """How long a child may take to start, in seconds."""
 SAVE_S: Final = 6.0

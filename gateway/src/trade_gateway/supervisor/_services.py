@@ -9,8 +9,6 @@ from trade_gateway.supervisor._child_state import ChildInfo
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._supervisor import Supervisor
 
-__all__ = ["ChildServices"]
-
 
 class ChildServices:
     """Offers a supervisor's functions as services.

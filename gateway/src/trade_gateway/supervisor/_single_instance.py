@@ -10,8 +10,6 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
-__all__ = ["alone", "held_in", "is_free", "lock_of"]
-
 _FOLDER: Final = "locks"
 
 

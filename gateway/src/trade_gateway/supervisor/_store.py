@@ -10,8 +10,6 @@ import msgspec
 
 from trade.keeping import Database
 
-__all__ = ["StateStore"]
-
 _TABLE: Final = """
 create table if not exists state (
   container text not null, object text not null, saved_at real not null, blob blob not null,

@@ -31,8 +31,6 @@ from trade_gateway.supervisor._restart_policy import GRACE_S, SAVE_S, State, Tra
 from trade_gateway.supervisor._single_instance import lock_of
 from trade_gateway.supervisor._store import StateStore
 
-__all__ = ["Supervisor"]
-
 _ENDS_S: Final = GRACE_S + SAVE_S + 5.0
 """How long one child may take to end, in seconds."""
 

@@ -5,8 +5,6 @@ from typing import Protocol
 
 from ._frame import Frame
 
-__all__ = ["Adapter", "Client", "Tenant"]
-
 
 class Client(Protocol):
     """A client that reaches the bus through an adapter."""

@@ -23,8 +23,6 @@ from ._hub import Hub
 from ._interface import Interface
 from ._wire import Station, Wire
 
-__all__ = ["CanBus"]
-
 ANSWER_S: Final = 5.0
 """How long the bus's thread may take to carry out an order."""
 MOST_DATA: Final = 8

@@ -13,8 +13,6 @@ from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._frame import Frame
 
-__all__ = ["Device", "JointDevice", "Send"]
-
 Send = Callable[[Frame, float], None]
 """Sends a frame from the time given on."""
 

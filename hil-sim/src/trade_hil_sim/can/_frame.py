@@ -4,8 +4,6 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["Frame"]
-
 TAIL_BITS: Final = 13
 """CRC delimiter, acknowledge, end of frame, pause between frames (ISO 11898-1, 10.4): never stuffed."""
 CRC_BITS: Final = 15

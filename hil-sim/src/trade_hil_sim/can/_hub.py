@@ -13,8 +13,6 @@ from ._adapter import Tenant
 from ._frame import Frame
 from ._text import GREETING, OK, Reader, error_text, frame_text, parse_send, refusal
 
-__all__ = ["Hub", "HubClient"]
-
 LOOPBACK: Final = "127.0.0.1"
 SETTLE_S: Final = 0.05
 """A client expects the last word of the greeting alone in its segment: frames wait this long, or for its first."""

@@ -15,8 +15,6 @@ from trade_hil_sim.robot._bus_thread import ready
 from ._adapter import Tenant
 from ._frame import Frame
 
-__all__ = ["Interface"]
-
 LAYOUT: Final = struct.Struct("=IB3x8s")
 """``struct can_frame`` of linux/can.h."""
 EXTENDED: Final = 0x8000_0000

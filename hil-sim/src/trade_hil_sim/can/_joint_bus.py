@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import Bus, Joint
     from trade_drivers.robotfile import CanBus as CanRecord
 
-__all__ = ["JointBus"]
-
 
 class JointBus(CanBus):
     """Devices that each move one joint."""

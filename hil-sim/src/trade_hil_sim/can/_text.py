@@ -7,8 +7,6 @@ from trade_hil_sim.faults._commands import SimulationError
 
 from ._frame import Frame
 
-__all__ = ["GREETING", "OK", "Reader", "error_text", "frame_text", "parse_send", "refusal"]
-
 GREETING: Final = b"< hi >"
 OK: Final = b"< ok >"
 LONGEST: Final = 256

@@ -11,8 +11,6 @@ from typing import Final, NamedTuple, Protocol
 
 from ._frame import Frame
 
-__all__ = ["Referee", "Station", "Wire"]
-
 ERROR_BITS: Final = 20
 """Bit times of an error frame and the pause after it."""
 PER_ERROR: Final = 8

@@ -12,8 +12,6 @@ from ._drive import FIRMWARE, Drive
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus, Joint
 
-__all__ = ["Cia402Bus"]
-
 NODES: Final = 0x80
 FUNCTIONS: Final = {
     0x180: "tpdo1",

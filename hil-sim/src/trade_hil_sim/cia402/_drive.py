@@ -16,8 +16,6 @@ from ._node import Node
 from ._objects import OBJECTS, SUPPORTED_MODES, Object, pdo_objects
 from ._store import Abort, AbortCode, Store
 
-__all__ = ["Drive"]
-
 VOLTAGE_ON: Final = 1 << 4
 NO_QUICK_STOP: Final = 1 << 5
 REMOTE: Final = 1 << 9

@@ -8,8 +8,6 @@ from trade_hil_sim.mechanics._shaft import Shaft
 
 from ._store import Store
 
-__all__ = ["METHODS", "Homing"]
-
 METHODS: Final = frozenset({17, 18, 33, 34, 35, 37})
 """Negative and positive limit switch, index pulse in negative and positive direction, here (old and new number)."""
 SWITCHES: Final = {17: -200_000.0, 18: 200_000.0}

@@ -10,8 +10,6 @@ from trade_hil_sim.mechanics._shaft import Shaft
 from ._modes import Modes
 from ._store import Store
 
-__all__ = ["Command", "Emergencies", "Machine", "State", "command", "next_state"]
-
 
 class State(IntEnum):
     """States, as the bits of the statusword that distinguish them."""

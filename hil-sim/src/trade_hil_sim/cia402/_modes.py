@@ -10,8 +10,6 @@ from trade_hil_sim.mechanics._shaft import STILL, Shaft
 from ._homing import Homing
 from ._store import Store
 
-__all__ = ["MOTION", "Mode", "Modes"]
-
 NEW_SET_POINT: Final = 1 << 4
 AT_ONCE: Final = 1 << 5
 RELATIVE: Final = 1 << 6

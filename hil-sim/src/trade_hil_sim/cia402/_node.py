@@ -11,8 +11,6 @@ from ._pdo import Application, Pdos
 from ._sdo import SdoServer
 from ._store import Abort, AbortCode, Store
 
-__all__ = ["Node", "NodeState"]
-
 BOOT_S: Final = 0.05
 """From power or reset to the boot-up message."""
 HEARTBEAT_LOST: Final = 0x8130

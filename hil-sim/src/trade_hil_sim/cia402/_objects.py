@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["OBJECTS", "PDOS", "SUPPORTED_MODES", "Object", "pdo_objects"]
-
 SIZES: Final = {"u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "text": 0}
 I32: Final = 2**31
 PDOS: Final = 4

@@ -10,8 +10,6 @@ from trade_hil_sim.can import Frame
 from ._objects import DUMMIES, ENTRIES, PDOS, Object
 from ._store import Abort, AbortCode, Store
 
-__all__ = ["Application", "Pdos"]
-
 FIRST_OBJECT: Final = 0x1000
 """Lower indices are data types, which a map may name to skip bytes."""
 FIRST_SENT: Final = 0x1800

@@ -4,8 +4,6 @@ from typing import Final, Protocol
 
 from ._store import Abort, AbortCode
 
-__all__ = ["Dictionary", "SdoServer"]
-
 EXPEDITED: Final = 4
 """Up to this many bytes fit into the first frame."""
 SEGMENT: Final = 7

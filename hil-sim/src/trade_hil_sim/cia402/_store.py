@@ -6,8 +6,6 @@ from enum import IntEnum
 from ._objects import Object
 from ._units import unit_in_counts
 
-__all__ = ["Abort", "AbortCode", "Store"]
-
 
 class AbortCode(IntEnum):
     """Why an SDO transfer was refused (CiA 301, table 22)."""

@@ -10,8 +10,6 @@ from typing import Final
 
 from ._objects import OPTIONAL, Object
 
-__all__ = ["factor_objects", "unit_in_counts", "unit_objects"]
-
 MINUTE: Final = 0x47
 Pair = tuple[int, int]
 

@@ -14,8 +14,6 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.faults._methods import FaultMethods
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, GripperTruth
 
-__all__ = ["SimControl"]
-
 _Truth = TypeVar("_Truth", DeviceState, GripperTruth, ArmTruth)
 ANSWER_S: Final = 10.0
 """How long a simulator may take to carry out a command."""

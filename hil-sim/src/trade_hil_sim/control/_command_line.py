@@ -9,8 +9,6 @@ import msgspec
 from trade_hil_sim.control._server import State
 from trade_hil_sim.faults._commands import Command, SimulationError, kinds_of
 
-__all__ = ["command_of", "listing"]
-
 _KINDS: Final = {**kinds_of(Command), "state": State}
 
 

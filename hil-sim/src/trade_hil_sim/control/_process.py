@@ -20,8 +20,6 @@ from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.log._queries import read_log
 from trade_hil_sim.robot._bus_thread import ready
 
-__all__ = ["Ready", "SimProcess", "remove_leftovers"]
-
 _PREFIX: Final = "trade-sim-"
 _OWNER: Final = "_owner.pid"
 READY_S: Final = 30.0

@@ -22,8 +22,6 @@ from trade_hil_sim.mechanics._truth import BusState
 if TYPE_CHECKING:
     from trade_hil_sim.robot._robot import SimulatedBus
 
-__all__ = ["Answer", "ControlServer", "State"]
-
 LONGEST_LINE: Final = 65_536
 LONGEST_PATH: Final = 100
 """Unix socket paths end at 108 bytes on Linux and sooner elsewhere."""

@@ -13,8 +13,6 @@ from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.robot._robot import buses_of, read_robot
 
-__all__ = ["SimThreads"]
-
 
 class _DirectControl(SimControl):
     """A client that asks the server's object, without a socket."""

@@ -13,8 +13,6 @@ from ._table import MASTER, MODELS
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus, Joint
 
-__all__ = ["DamiaoBus"]
-
 
 class DamiaoBus(JointBus):
     """Damiao motors on one CAN bus; a client reaches them by the socketcand protocol, at `port`."""

@@ -13,8 +13,6 @@ from . import _table as table
 from ._protocol import Impedance, decode_mit, encode_feedback
 from ._table import MODELS, ORDERS, TARGETS, Mode, Register, Status
 
-__all__ = ["Motor"]
-
 QUICK: Final = 400.0
 """The most it accelerates, in rad/s^2: an assumption, as are the two below."""
 COAST: Final = 60.0

@@ -4,8 +4,6 @@ from typing import Final, NamedTuple
 
 from ._table import Ranges
 
-__all__ = ["Impedance", "decode_mit", "encode_feedback"]
-
 STIFFEST: Final = 500.0
 MOST_DAMPING: Final = 5.0
 

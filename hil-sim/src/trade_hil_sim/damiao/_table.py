@@ -3,8 +3,6 @@
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = ["MODELS", "Mode", "Ranges", "Register", "Status"]
-
 BROADCAST: Final = 0x7FF
 POSITION_VELOCITY, VELOCITY, FORCE_POSITION = 0x100, 0x200, 0x300
 MASTER: Final = 0x10

@@ -17,8 +17,6 @@ from ._table import BAUDS
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
 
-__all__ = ["DynamixelBus"]
-
 
 class DynamixelBus(ServoBus[Servo, Packet]):
     """Servos on one serial line; a client opens `port` as it would a real adapter.

@@ -11,8 +11,6 @@ from ._memory import Refusal
 from ._protocol import ErrorCode, Instruction, JoinedStatus, Packet, status
 from ._servo import Servo
 
-__all__ = ["Answer", "Dispatch"]
-
 JOINED: Final = frozenset({Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ})
 READING: Final = frozenset({Instruction.PING, Instruction.READ, Instruction.SYNC_READ, Instruction.BULK_READ}) | JOINED
 GROUP_READS: Final = frozenset({Instruction.SYNC_READ, Instruction.BULK_READ})

@@ -10,8 +10,6 @@ from trade_hil_sim.serial._registers import Memory
 from ._protocol import ErrorCode
 from ._table import EXTENDED_RANGE, RAM_BEGINS, Mode, Model, Register
 
-__all__ = ["GOALS", "MOTION", "WATCHDOG_EXPIRED", "ControlTable", "HardwareError", "Refusal", "check", "seed_goals"]
-
 GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_position"})
 MOTION: Final = GOALS | {"torque_enable"}
 """A write to any of these could start a motion, or switch off torque."""

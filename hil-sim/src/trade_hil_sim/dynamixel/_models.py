@@ -10,8 +10,6 @@ from typing import Final
 
 from ._table import Access, Indirect, Model, Register, gain, x_series
 
-__all__ = ["MODELS", "XL430_W250", "XM430_W350"]
-
 WRITE: Final = Access.WRITE
 SIX_MODES: Final = frozenset({0, 1, 3, 4, 5, 16})
 WITHOUT_CURRENT: Final = frozenset({1, 3, 4, 16})

@@ -11,19 +11,6 @@ from typing import Final
 from trade_hil_sim.serial import _packets as packets
 from trade_hil_sim.serial._packets import BROADCAST, Reading, Writing
 
-__all__ = [
-    "ErrorCode",
-    "Instruction",
-    "JoinedStatus",
-    "Packet",
-    "PacketReader",
-    "crc16",
-    "encode",
-    "status",
-    "stuff",
-    "unstuff",
-]
-
 HEADER: Final = b"\xff\xff\xfd\x00"
 RESYNC: Final = b"\xff\xff\xfd"
 STUFFED: Final = b"\xff\xff\xfd\xfd"

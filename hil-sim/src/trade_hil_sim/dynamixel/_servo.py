@@ -16,8 +16,6 @@ from ._protocol import ALERT, ErrorCode
 from ._shaft import Shaft
 from ._table import BAUDS, Mode, Model, Register
 
-__all__ = ["Servo"]
-
 WATCHDOG_UNIT_S: Final = 0.02
 TICKS: Final = 32_768
 CLEAR_MULTI_TURN: Final = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])

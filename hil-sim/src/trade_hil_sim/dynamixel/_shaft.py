@@ -9,8 +9,6 @@ from trade_hil_sim.serial._servo import CENTRE, COUNTS_PER_TURN, IN_POSITION_COU
 from ._memory import ControlTable
 from ._table import ACCELERATION_COUNTS_S2, VELOCITY_COUNTS_S, Mode
 
-__all__ = ["Shaft"]
-
 PWM_FULL: Final = 885
 
 

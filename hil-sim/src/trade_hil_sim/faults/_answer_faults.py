@@ -2,8 +2,6 @@
 
 from trade_hil_sim.faults._commands import AnswerFault, Mute, Piece
 
-__all__ = ["ActiveFaults"]
-
 
 class _Active:
     """A fault and how often it has matched."""

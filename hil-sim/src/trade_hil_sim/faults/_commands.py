@@ -12,40 +12,6 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-__all__ = [
-    "Absent",
-    "AnswerFault",
-    "BadCrc",
-    "BrownOut",
-    "BusOff",
-    "Command",
-    "Dribble",
-    "Duplicate",
-    "Echo",
-    "Emergency",
-    "Freeze",
-    "Garbage",
-    "HangUp",
-    "HardwareFault",
-    "Heal",
-    "Jam",
-    "Late",
-    "Local",
-    "Mute",
-    "Piece",
-    "Place",
-    "Put",
-    "Replug",
-    "SimulationError",
-    "Supply",
-    "Truncate",
-    "Unmute",
-    "Unplug",
-    "WrongModel",
-    "kinds_of",
-]
-
-
 Seconds = Annotated[float, Meta(ge=0, le=60)]
 Byte = Annotated[int, Meta(ge=0, le=255)]
 

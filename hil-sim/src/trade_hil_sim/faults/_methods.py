@@ -14,8 +14,6 @@ from trade_hil_sim.faults._commands import Command, kinds_of
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["FaultMethods"]
-
 Ids = Iterable[int] | None
 _P = ParamSpec("_P")
 _KINDS: Final = kinds_of(Command)

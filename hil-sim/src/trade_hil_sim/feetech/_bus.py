@@ -14,8 +14,6 @@ from ._table import BAUDS, STS3215
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
 
-__all__ = ["FeetechBus"]
-
 ALWAYS_ANSWERED: Final = frozenset({Instruction.PING, Instruction.READ, Instruction.SYNC_READ})
 
 

@@ -7,8 +7,6 @@ from trade_hil_sim.serial._registers import Memory
 
 from ._table import RAM_BEGINS, TABLE_ENDS, Model, Register
 
-__all__ = ["MemoryTable"]
-
 
 class MemoryTable(Memory[Register]):
     """The memory of one servo, at its factory defaults."""

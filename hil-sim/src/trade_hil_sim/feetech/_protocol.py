@@ -11,8 +11,6 @@ from typing import Final
 from trade_hil_sim.serial import _packets as packets
 from trade_hil_sim.serial._packets import BROADCAST, Reading, Writing
 
-__all__ = ["Instruction", "Packet", "PacketReader", "checksum", "encode", "status"]
-
 HEADER: Final = b"\xff\xff"
 LONGEST: Final = 250
 """The greatest valid LEN, an assumption; more is noise."""

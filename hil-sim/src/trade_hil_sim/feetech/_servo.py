@@ -13,8 +13,6 @@ from ._memory import MemoryTable
 from ._shaft import Shaft
 from ._table import BAUDS, STS3215, Model
 
-__all__ = ["MOTION", "Servo", "Status"]
-
 PROTECTION_UNIT_S: Final = 0.01
 TAKE_FOR_CENTRE: Final = 128
 MOTION: Final = frozenset({"torque_enable", "goal_position"})

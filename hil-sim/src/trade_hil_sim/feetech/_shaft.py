@@ -8,8 +8,6 @@ from trade_hil_sim.serial._servo import CENTRE, COUNTS_PER_TURN, QUICK_COUNTS_S2
 from ._memory import MemoryTable
 from ._table import ACCELERATION_STEPS_S2
 
-__all__ = ["Shaft"]
-
 FULL_LOAD: Final = 1000
 POSITION_MODE: Final = 0
 

@@ -11,8 +11,6 @@ from trade_hil_sim.serial import _registers as registers
 from trade_hil_sim.serial._registers import Access
 from trade_hil_sim.serial._servo import CENTRE
 
-__all__ = ["ACCELERATION_STEPS_S2", "BAUDS", "STS3215", "Model", "Register"]
-
 ACCELERATION_STEPS_S2: Final = 100
 EEPROM_BEGINS: Final = 5
 RAM_BEGINS: Final = 40

@@ -10,8 +10,6 @@ from typing import Literal
 
 import msgspec
 
-__all__ = ["ByteLog", "Direction", "Entry", "Kind"]
-
 Kind = Literal["received", "sent", "frame", "instruction", "event"]
 Direction = Literal["in", "out"]
 

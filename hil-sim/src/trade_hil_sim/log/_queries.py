@@ -12,8 +12,6 @@ from trade_hil_sim.log._byte_log import Direction, Entry, Kind
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Span", "events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
-
 WRITING: Final = frozenset(
     {
         *("write", "write_one", "read_write", "reg_write", "action", "sync_write", "bulk_write"),

@@ -14,8 +14,6 @@ from trade_hil_sim.mechanics._truth import DeviceState, GripperTruth
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
 
-__all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "start_rad", "unheard", "version_of"]
-
 Emit = Callable[[Entry], None]
 """Adds a line to the log; a bus fills in its name."""
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from math import copysign, sqrt
 
-__all__ = ["Course", "at_rest", "to_position", "to_speed"]
-
 
 @dataclass(frozen=True, slots=True)
 class Course:

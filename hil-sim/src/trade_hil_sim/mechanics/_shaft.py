@@ -5,8 +5,6 @@ from typing import Final
 
 from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
 
-__all__ = ["Shaft"]
-
 STILL: Final = 1e-6
 """Counts per second below which nothing moves."""
 

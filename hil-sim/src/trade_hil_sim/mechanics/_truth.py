@@ -2,8 +2,6 @@
 
 import msgspec
 
-__all__ = ["ArmTruth", "BusState", "DeviceState", "GripperTruth"]
-
 
 class DeviceState(msgspec.Struct, frozen=True, kw_only=True):
     """One simulated device."""

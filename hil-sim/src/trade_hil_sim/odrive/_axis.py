@@ -11,8 +11,6 @@ from trade_hil_sim.mechanics._device import Controller
 from ._motor import Motor
 from ._table import ANSWERS, ORDERS, Command, Errors, Result, State
 
-__all__ = ["Axis"]
-
 HEARTBEAT_S: Final = 0.1
 ESTIMATES_S: Final = 0.01
 VOLTS: Final = (12.0, 56.0)

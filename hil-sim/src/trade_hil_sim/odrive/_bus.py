@@ -13,8 +13,6 @@ from ._table import ANSWERS, Command
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus, Joint
 
-__all__ = ["OdriveBus"]
-
 LINES: Final = {"ODrive Pro": 4, "ODrive S1": 5, "ODrive Micro": 6}
 """Product lines by model."""
 _KNOWN: Final = {int(command): command for command in Command}

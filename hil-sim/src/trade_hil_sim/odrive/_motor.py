@@ -7,8 +7,6 @@ from trade_hil_sim.mechanics._shaft import Shaft
 
 from ._table import Command, Control, Input
 
-__all__ = ["Motor"]
-
 QUICK: Final = 200.0
 """The most the motor accelerates, in turns/s^2: an assumption."""
 COAST: Final = 20.0

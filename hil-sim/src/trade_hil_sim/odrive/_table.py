@@ -4,8 +4,6 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import Final
 
-__all__ = ["ANSWERS", "ORDERS", "Command", "Control", "Errors", "Input", "Result", "State"]
-
 
 class Command(IntEnum):
     """The low five bits of an identifier; the node is above."""

@@ -17,8 +17,6 @@ from trade_hil_sim.faults._commands import SimulationError
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["BusThread", "Mailbox", "listener", "ready"]
-
 _T = TypeVar("_T")
 _FEW: Final = 1024
 """``select`` supports only lower descriptors, but any timeout; ``poll`` rounds up to a millisecond."""

@@ -9,8 +9,6 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.robot._robot import SimulatedBus, bus_class
 
-__all__ = ["fresh_bus"]
-
 
 class _Factory(NamedTuple):
     baud: int

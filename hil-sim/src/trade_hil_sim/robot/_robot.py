@@ -10,16 +10,6 @@ from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.mechanics._truth import BusState
 
-__all__ = [
-    "SimulatedBus",
-    "SimulatedBusClass",
-    "SimulatedSenseClass",
-    "bus_class",
-    "buses_of",
-    "find_simulator",
-    "read_robot",
-]
-
 GROUP: Final = "trade.sims"
 """Entry points of this group are `SimulatedBusClass`es, or for cameras and sensors `SimulatedSenseClass`es; their names
 are those of the drivers that they replace."""

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import Gripper as GripperRecord
     from trade_drivers.robotfile import Joint, SerialBus
 
-__all__ = ["RobotiqBus"]
-
 MODEL: Final = "2F-85"
 _BAUDS: Final = (9600, 19_200, 38_400, 57_600, 115_200)
 _GAP_CHARACTERS: Final = 3.5

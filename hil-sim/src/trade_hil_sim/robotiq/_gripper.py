@@ -16,8 +16,6 @@ from trade_hil_sim.serial._device_bus import LineDevice
 
 from . import _table as table
 
-__all__ = ["Gripper", "Object"]
-
 CYCLE_S: Final = 0.005
 """The motion control applies requests at its next cycle; until then the status is the previous one."""
 ACTIVATION_COUNTS_S: Final = 320.0

@@ -9,21 +9,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-__all__ = [
-    "BROADCAST",
-    "GAP_S",
-    "MOST_REGISTERS",
-    "ExceptionCode",
-    "Function",
-    "Request",
-    "RequestReader",
-    "crc16",
-    "exception",
-    "frame",
-    "read_answer",
-    "write_answer",
-]
-
 BROADCAST: Final = 0
 MOST_REGISTERS: Final = 125
 GAP_S: Final = 0.00175

@@ -5,26 +5,6 @@ Source: Robotiq "2F-85 & 2F-140 Instruction Manual", chapter 4. Widths, speeds a
 
 from typing import Final
 
-__all__ = [
-    "ACTIVATE",
-    "AUTO_RELEASE",
-    "CLOSED_COUNTS",
-    "COMMAND",
-    "COMMUNICATION_FAULT",
-    "GO",
-    "HOT_FAULT",
-    "LOW_VOLTAGE_FAULT",
-    "MAJOR_FAULT",
-    "OPEN_COUNTS",
-    "REGISTERS",
-    "STATUS",
-    "STROKE_M",
-    "counts_of",
-    "force_of",
-    "speed_of",
-    "width_of",
-]
-
 COMMAND: Final = 0x03E8
 """Action request, position request, speed and force: three registers, high byte first."""
 STATUS: Final = 0x07D0

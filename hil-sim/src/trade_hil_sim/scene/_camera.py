@@ -20,8 +20,6 @@ from ._drawing import draw, png
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Camera, Sensor
 
-__all__ = ["SceneCamera"]
-
 _SIZE_PX: Final = (320, 240)
 _ANSWER_S: Final = 5.0
 _CLIENT_S: Final = 1.0

@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 
 from trade_hil_sim.mechanics._truth import BusState, GripperTruth
 
-__all__ = ["BACKGROUND", "LIMB", "OBJECT", "Colour", "Field", "draw", "fields", "png"]
-
 Colour = tuple[int, int, int]
 
 BACKGROUND: Final[Colour] = (24, 26, 30)

@@ -21,8 +21,6 @@ from trade_hil_sim.serial._line import SerialLine
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["DeviceLine", "LineDevice", "interleaved"]
-
 
 class LineDevice(DeviceModel):
     """A device on a serial line."""

@@ -14,8 +14,6 @@ from trade_hil_sim.log._byte_log import ByteLog, Entry, Kind
 from trade_hil_sim.robot._bus_thread import BusThread
 from trade_hil_sim.serial._pty import Terminal
 
-__all__ = ["Peer", "SerialLine"]
-
 BITS_PER_BYTE: Final = 10
 """8N1: start bit, eight data bits, stop bit."""
 SPIN_S: Final = 0.0002

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar, Final, Generic, NamedTuple, TypeVar
 
-__all__ = ["BROADCAST", "Packet", "PacketReader", "Reading", "Writing"]
-
 BROADCAST: Final = 254
 """The id of all devices."""
 

@@ -10,8 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-__all__ = ["Terminal"]
-
 TCGETS2: Final = 0x802C542A
 """Linux ioctl that reads baud rates outside the classic list (asm-generic/ioctls.h)."""
 SPEED_WORD: Final = 10

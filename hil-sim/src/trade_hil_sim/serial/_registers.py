@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
 
-__all__ = ["Access", "Memory", "Model", "Register"]
-
 
 class Access(Enum):
     """Who may change a register."""

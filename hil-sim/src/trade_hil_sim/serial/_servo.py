@@ -14,8 +14,6 @@ from trade_hil_sim.serial._registers import Memory, Register
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
 
-__all__ = ["CENTRE", "COUNTS_PER_TURN", "QUICK_COUNTS_S2", "RAD_PER_COUNT", "ServoModel", "ServoShaft"]
-
 COUNTS_PER_TURN: Final = 4096
 CENTRE: Final = 2048
 RAD_PER_COUNT: Final = tau / COUNTS_PER_TURN

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from trade_drivers.robotfile import Joint, SerialBus
 
-__all__ = ["ServoBus"]
-
 PAUSE_S: Final = 0.1
 """A packet whose next byte has not come after this long is discarded."""
 _Servo = TypeVar("_Servo", bound=ServoModel[Memory[Register], ServoShaft])

@@ -13,8 +13,6 @@ from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
 from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way
 from ._table import CB3, E_SERIES, MODELS, RobotMode, SafetyMode, Series
 
-__all__ = ["HOME", "JOINTS", "Arm"]
-
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 HOME: Final = (0.0, -pi / 2, pi / 2, -pi / 2, -pi / 2, 0.0)
 """The initial pose of a simulated arm: elbow up, tool pointing down."""

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import Arm as ArmRecord
     from trade_drivers.robotfile import Bus
 
-__all__ = ["UrBus"]
-
 ANSWER_S: Final = 10.0
 _ARM: Final = 0
 """The id of the arm in faults: it is the only one of its controller."""

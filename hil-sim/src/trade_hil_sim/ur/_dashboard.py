@@ -10,8 +10,6 @@ from ._arm import Arm
 from ._program import PAUSED, PLAYING, Program
 from ._table import SafetyMode
 
-__all__ = ["GREETING", "Dashboard", "lines_in"]
-
 GREETING: Final = "Connected: Universal Robots Dashboard Server"
 _STATES: Final = {PLAYING: "PLAYING", PAUSED: "PAUSED"}
 _NAME: Final = "wave.urp"

@@ -9,8 +9,6 @@ from typing import Final
 
 from ._table import Model
 
-__all__ = ["Matrix", "flange", "joints_for", "pose_between", "pose_of", "way_of"]
-
 Matrix = tuple[tuple[float, ...], ...]
 """A transformation in three rows: a rotation, and a position in the fourth column."""
 

@@ -10,8 +10,6 @@ from typing import Final
 
 from trade_hil_sim.mechanics._profile import to_position
 
-__all__ = ["MAX_SPEED_RAD_S", "Braking", "Free", "Held", "Motion", "Servo", "Speed", "Way"]
-
 MAX_SPEED_RAD_S: Final = 3.14159
 """The greatest speed of a joint."""
 _SERVO_ACCEL_RAD_S2: Final = 40.0

@@ -16,8 +16,6 @@ from ._arm import Arm
 from ._motions import Way
 from ._table import Command
 
-__all__ = ["PAUSED", "PLAYING", "STOPPED", "Program"]
-
 STOPPED: Final = 1
 PLAYING: Final = 2
 PAUSED: Final = 4

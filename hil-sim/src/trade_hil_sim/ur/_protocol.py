@@ -7,8 +7,6 @@ from typing import Final, NamedTuple
 
 from ._table import TYPES
 
-__all__ = ["LONGEST", "MOST_PAYLOAD", "Packet", "PacketType", "Recipe", "frames", "names_in"]
-
 _HEAD: Final = struct.Struct(">HB")
 LONGEST: Final = 65_535
 """The greatest length of a packet."""

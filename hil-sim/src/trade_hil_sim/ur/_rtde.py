@@ -8,8 +8,6 @@ from ._program import PLAYING, Program
 from ._protocol import MOST_PAYLOAD, Packet, PacketType, Recipe, Value, frames, names_in
 from ._table import INPUTS, OUTPUTS, RobotMode
 
-__all__ = ["Rtde", "RtdeSession", "measured"]
-
 _INT: Final = "input_int_register_"
 _DOUBLE: Final = "input_double_register_"
 _SLIDER_BIT: Final = 1

@@ -6,20 +6,6 @@ Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": field names an
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = [
-    "CB3",
-    "E_SERIES",
-    "INPUTS",
-    "MODELS",
-    "OUTPUTS",
-    "TYPES",
-    "Command",
-    "Model",
-    "RobotMode",
-    "SafetyMode",
-    "Series",
-]
-
 TYPES: Final = {
     "BOOL": "?",
     "UINT8": "B",

@@ -10,8 +10,6 @@ from typing import Final
 from trade_hil_sim.faults._commands import Piece
 from trade_hil_sim.robot._bus_thread import listener
 
-__all__ = ["MOST_HELD", "PORTS", "Client", "listeners"]
-
 PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
 """The same on every controller."""
 

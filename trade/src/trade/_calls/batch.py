@@ -8,8 +8,6 @@ from typing import Any, Final
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 
-__all__ = ["Outcome"]
-
 _MOST_AT_ONCE: Final = 256
 
 

@@ -13,8 +13,6 @@ from trade._protocol.messages import PROTOCOL
 from trade._registry.registry import ContainerState, Registry
 from trade.errors import AccessDenied, ContainerLost, ServiceGone
 
-__all__ = ["Everywhere"]
-
 _logger = logging.getLogger("trade")
 
 _KNOWN_WITHIN_S: Final = 1.0

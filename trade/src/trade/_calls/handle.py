@@ -19,8 +19,6 @@ from trade._protocol.schema import read_schema, schema_name
 from trade._registry.registry import Record
 from trade.errors import ConfigurationError
 
-__all__ = ["Bound", "Handle", "handle_of", "start_call"]
-
 if TYPE_CHECKING:
     from typing_extensions import ParamSpec as ParamSpecWithDefault  # every type checker has it
     from typing_extensions import TypeVar as TypeVarWithDefault

@@ -8,8 +8,6 @@ from trade._calls.handle import Handle
 from trade._registry.predicates import Predicate, parse_condition
 from trade.errors import ConfigurationError
 
-__all__ = ["domain_of", "pddl_domain"]
-
 _WORDS: Final[frozenset[str]] = frozenset(
     re.findall(
         r"\S+",

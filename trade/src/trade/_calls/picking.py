@@ -18,8 +18,6 @@ from trade._registry.registry import Record
 from trade._telemetry.load import busyness
 from trade.errors import ConfigurationError, TradeError, never_ran
 
-__all__ = ["Pick", "Picker", "narrowed", "required"]
-
 Pick = Literal["any", "local", "least_busy", "nearest"]
 """Which one of several services to use; see `Container.call`."""
 

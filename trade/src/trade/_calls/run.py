@@ -23,8 +23,6 @@ else:
 
     _Result = TypeVar("_Result")
 
-__all__ = ["Run"]
-
 _logger = logging.getLogger("trade")
 
 

@@ -20,8 +20,6 @@ from trade._transport.zenoh import ZenohTransport, configuration
 from trade._transport.zenoh_links import Links
 from trade.errors import ConfigurationError
 
-__all__ = ["join"]
-
 _logger = logging.getLogger("trade")
 _PORTS_TRIED: Final = 4
 

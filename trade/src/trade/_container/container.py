@@ -44,8 +44,6 @@ from trade._threads.event import Event
 from trade._transport.base import ChannelClosed, Transport
 from trade.errors import ConfigurationError
 
-__all__ = ["Container"]
-
 _STOPPING_S: Final = 2.0
 _COLUMNS: Final = {
     "CONTAINER": "name",

@@ -13,8 +13,6 @@ from trade._registry.registry import Record
 from trade._registry.suggestions import too_many_services
 from trade.errors import ConfigurationError, NoSuchService
 
-__all__ = ["GroupView"]
-
 _MOST_SHOWN = 12
 
 

@@ -11,8 +11,6 @@ from trade._security.policy_file import Seen
 from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
 
-__all__ = ["begin_watching", "different"]
-
 _logger = logging.getLogger("trade")
 _EVERY_NS: Final = 1_000_000_000
 _AGAIN_NS: Final = 10 * _EVERY_NS

@@ -15,8 +15,6 @@ from trade._registry.constraints import where
 from trade._registry.registry import Registry
 from trade.errors import NoContainerFound
 
-__all__ = ["Reachability", "beyond", "look_around"]
-
 _LOOK_S: Final = 0.02
 _ASK_S: Final = 0.5
 _OWN_PROVIDERS: Final = 2

@@ -12,8 +12,6 @@ from trade._context.sessions import client_of
 from trade._protocol.messages import Behalf, Token
 from trade.errors import Cancelled
 
-__all__ = ["CallContext", "current_call", "progress"]
-
 _MOST_EVENTS: Final = 100
 _ANSWER_S: Final = 0.3
 """The time reserved for making an answer and for its way back."""

@@ -9,8 +9,6 @@ from trade._protocol.keys import Address, as_chunk
 from trade._transport.base import Presence
 from trade.errors import SessionEnded
 
-__all__ = ["Session", "client_of", "foreign", "speaking"]
-
 _REMEMBERED: Final = 4096
 
 

@@ -15,8 +15,6 @@ from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import host_sockets, is_deaf, listen_on_host
 from trade.errors import ConfigurationError
 
-__all__ = ["Hub", "HubFile"]
-
 _MARK: Final = ".hub-"
 _NAME: Final = ".hub"
 

@@ -13,8 +13,6 @@ from trade._registry.registry import Record, Registry
 from trade._security.certificates import Certificate
 from trade._transport.zenoh_links import Link, Links
 
-__all__ = ["LinkInfo", "LinkTable", "NetworkInfo", "clock_of", "network"]
-
 Tell = Callable[[Literal["linked", "unlinked"], str, str, "Record | None"], None]
 """Takes the kind of an event, the container at the other end, its endpoint, and its service ``clock``."""
 

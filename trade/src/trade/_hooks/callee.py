@@ -6,8 +6,6 @@ from trade._calls.handle import Handle
 from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade._registry.registry import Record
 
-__all__ = ["Callee", "CalleeHost", "callee_of"]
-
 
 class CalleeHost(Protocol):
     """The functions of a container that a callee uses."""

@@ -19,8 +19,6 @@ from trade._services.local_service import LocalService
 from trade._threads.thread_pool import ThreadPool
 from trade.errors import CallRefused, ConfigurationError
 
-__all__ = ["Check", "Guard", "Guards"]
-
 LIMIT_S: Final = 1.0
 """How long a check may take by default."""
 _LONGEST_S: Final = 3600.0

@@ -7,8 +7,6 @@ import msgspec
 
 from trade._protocol.schema import type_text
 
-__all__ = ["Codec"]
-
 
 class Codec:
     """Encoding and decoding of values, with the container's conversion of handles."""

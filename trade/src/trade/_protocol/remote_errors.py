@@ -12,8 +12,6 @@ from trade._protocol.messages import ErrorInfo
 from trade._protocol.schema_types import imported, name_of
 from trade.errors import RemoteError, TradeError
 
-__all__ = ["pack_error", "passed_on", "unpack_error"]
-
 _MOST_TRACEBACK: Final = 16_000
 
 

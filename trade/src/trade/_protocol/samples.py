@@ -8,17 +8,6 @@ from msgspec import Meta, Raw, Struct
 from trade._protocol.keys import ServiceKey
 from trade._protocol.messages import MOST_BYTES, PROTOCOL, Malformed, OtherVersion, unread
 
-__all__ = [
-    "STEPS_HZ",
-    "STREAMS",
-    "Sample",
-    "StreamSample",
-    "decode_sample",
-    "rate_of",
-    "signs_of",
-    "stream_key",
-]
-
 STREAMS: Final = "stream/**"
 STEPS_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """A gateway that limits rates forwards streams at one of these, or more slowly than the first."""

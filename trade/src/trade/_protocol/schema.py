@@ -16,8 +16,6 @@ from trade._protocol.messages import NO_SCHEMA, encode_message
 from trade._protocol.schema_types import noted
 from trade.errors import ConfigurationError
 
-__all__ = ["NOT_FINITE", "limits_text", "problem_text", "value_at"]
-
 # The schemas came over the wire: they have no types.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 

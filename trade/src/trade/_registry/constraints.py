@@ -16,8 +16,6 @@ from trade._protocol.schema import fits, known_schema, read_json, read_types, re
 from trade._registry.predicates import fits_all, parse_predicates
 from trade.errors import ConfigurationError
 
-__all__ = ["Candidate", "Constraint", "where"]
-
 """The form of a group: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000
 _GLOB: Final = frozenset("*?[")

@@ -17,8 +17,6 @@ from trade._threads.condition import InterruptibleCondition
 from trade._threads.event import Event
 from trade.errors import ServiceGone
 
-__all__ = ["ContainerState", "Record", "Registry"]
-
 _KNOWN_WITHIN_S: Final = 1.0
 
 

@@ -1,7 +1,5 @@
 """Tracks the revisions of one container, in announcements and replies, to detect missed announcements."""
 
-__all__ = ["RevisionTracker"]
-
 
 class RevisionTracker:
     """Messages of a container come in two forms: single announcements, and replies with everything at once.

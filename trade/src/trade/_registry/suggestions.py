@@ -9,8 +9,6 @@ from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade.errors import NoSuchService, TooManyServices
 
-__all__ = ["asked_for", "no_such_service", "too_many_services"]
-
 _LIKE: Final = 0.7
 _NAME_LIKE: Final = 0.6
 _MOST: Final = 2

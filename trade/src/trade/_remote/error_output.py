@@ -2,8 +2,6 @@
 
 import msgspec
 
-__all__ = ["as_text", "last_line"]
-
 
 class _Error(msgspec.Struct):
     error: str

@@ -18,8 +18,6 @@ from trade._protocol.messages import Token
 from trade._timestamps import clock
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, SessionEnded, Stopped
 
-__all__ = ["Permit", "Resource", "permit"]
-
 _stop_numbers: Final = itertools.count(1).__next__
 _permit_ids: Final = itertools.count(-1, -1).__next__
 """Plain Python calls have no call id; their ids are negative."""

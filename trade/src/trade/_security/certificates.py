@@ -22,8 +22,6 @@ from typing import Any, Final, cast
 from trade._protocol.keys import is_chunk
 from trade.errors import ConfigurationError
 
-__all__ = ["Certificate", "authority", "common_name", "line_context", "transport_settings"]
-
 _CA: Final = "ca.pem"
 _CERTIFICATE: Final = "cert.pem"
 _KEY: Final = "key.pem"

@@ -6,8 +6,6 @@ from typing import Final, NamedTuple
 
 from msgspec import Struct
 
-__all__ = ["EVERYTHING", "VERBS", "Decision", "Policy", "Role"]
-
 VERBS: Final = ("call", "read", "register", "lock", "instrument", "administer")
 """The rights: call what actuates, call what reads, offer providers, lock, attach hooks, change the system."""
 

@@ -12,8 +12,6 @@ from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
-__all__ = ["Seen", "look_at", "policy_files", "read_policy"]
-
 Seen = tuple[tuple[int, int, int, int] | None, ...]
 """The state of files: inode, times of change of contents and of rights, and size of each; None: it does not exist."""
 

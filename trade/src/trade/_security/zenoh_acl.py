@@ -13,8 +13,6 @@ from trade._protocol.samples import STEPS_HZ, STREAMS
 from trade._security.network_crossings import Crossing
 from trade._security.policy import EVERYTHING, VERBS, Policy
 
-__all__ = ["acl"]
-
 _IN: Final = "ingress"
 _OUT: Final = "egress"
 _ALL_MESSAGES: Final = (

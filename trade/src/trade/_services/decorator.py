@@ -13,8 +13,6 @@ from trade._registry.constraints import checked_meta
 from trade._registry.predicates import parse_condition
 from trade.errors import ConfigurationError
 
-__all__ = ["Effect", "ServiceMark", "effect_of", "marked_methods", "service"]
-
 Effect = Literal["read", "note", "actuate", "stop"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])

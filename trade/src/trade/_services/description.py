@@ -17,8 +17,6 @@ from trade._services.decorator import ServiceMark
 from trade._services.secret import MASK, is_secret
 from trade.errors import ConfigurationError
 
-__all__ = ["describe", "described", "field_of"]
-
 
 def field_of(parameter: inspect.Parameter, kind: Any) -> Any:
     if parameter.default is inspect.Parameter.empty:

@@ -22,8 +22,6 @@ from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import DeadlineExceeded, TradeError
 
-__all__ = ["LocalService"]
-
 _COROUTINE: Final[type] = CoroutineType
 """The type that an ``async def`` returns; compared with every result, hence cheap."""
 

@@ -11,8 +11,6 @@ from trade._protocol.messages import UNREADABLE, ErrorInfo
 # Masked values have no types: they came over the wire.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 
-__all__ = ["MASK", "Secret", "is_secret"]
-
 MASK: Final = "***"
 _T = TypeVar("_T")
 _NOTE: Final = Meta(extra_json_schema={"writeOnly": True})

@@ -10,8 +10,6 @@ from typing import Final, TypeVar
 
 import msgspec
 
-__all__ = ["Database"]
-
 _WAIT_S: Final = 10.0
 """How long to wait for the disk."""
 _BESIDE: Final = ("", "-wal", "-shm")

@@ -17,8 +17,6 @@ from trade._protocol.samples import Sample, StreamSample, Value
 from trade._threads.condition import InterruptibleCondition
 from trade.errors import ConfigurationError, InvalidResult, SessionEnded
 
-__all__ = ["Stream"]
-
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 If = Callable[[Any], object]

@@ -15,8 +15,6 @@ from typing import Final, NamedTuple, Protocol
 
 from trade._transport.endpoints import Endpoint
 
-__all__ = ["Attempt", "Attempts", "Knock", "knock"]
-
 _LIMIT_S: Final = 1.5
 """A SYN that was lost is repeated after 1 s."""
 _MOST_KEPT: Final = 256

@@ -16,8 +16,6 @@ from typing import Final
 from trade._paths import runtime_folder, runtime_folders
 from trade.errors import ConfigurationError
 
-__all__ = ["dictionary_file", "keep_secret", "user_secret"]
-
 _FILE: Final = "@secret"
 """No system can have this name: the folders of systems are beside this file."""
 _USER: Final = "host"

@@ -6,9 +6,6 @@ from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "loopback_interface", "with_free_port"]
-
-
 _EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - wildcard address -> address to dial
 
 _PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws")

@@ -12,8 +12,6 @@ if sys.platform == "linux":
 else:
     fcntl = None
 
-__all__ = ["Own", "is_near", "own_addresses"]
-
 _DUMP_ADDRESSES: Final = 22
 _REQUEST_DUMP: Final = 0x301
 _NEW_ADDRESS: Final = 20

@@ -17,8 +17,6 @@ from typing import Final
 
 from trade._transport.interfaces import Own, own_addresses
 
-__all__ = ["GROUP", "PEER", "ROUTER", "Beacon", "hello", "read_hello", "scout"]
-
 _logger = logging.getLogger("trade")
 
 GROUP: Final = ("224.0.0.224", 7446)

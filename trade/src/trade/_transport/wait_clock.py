@@ -4,8 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 
-__all__ = ["WaitClock"]
-
 
 class WaitClock:
     """The computer's clocks, and the waits on a condition that last until a time of them."""

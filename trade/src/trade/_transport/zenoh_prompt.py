@@ -21,8 +21,6 @@ from typing import Any, Final
 from trade._transport.endpoints import loopback_interface
 from trade._transport.scouting import PEER, hello
 
-__all__ = ["Prompt"]
-
 _OPEN_FILES: Final = Path("/proc/self/fd")
 _HERE: Final = "127.0.0.1"
 _marks: Final = itertools.cycle(range(100, 250))

@@ -30,8 +30,6 @@ from trade._transport.base import ChannelClosed
 from trade.errors import ConfigurationError, TradeError
 from trade.sharing._guest_sessions import GuestSessions
 
-__all__ = ["SHARED_FROM", "Border"]
-
 _logger = logging.getLogger("trade")
 
 _PARTING_S: Final = 5.0

@@ -11,8 +11,6 @@ from typing import NamedTuple
 from trade._transport.base import Message, Transport
 from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
 
-__all__ = ["LossConformance", "Severable"]
-
 
 class Severable(NamedTuple):
     """Two transports and the link between them."""

@@ -13,8 +13,6 @@ from trade._settings import Settings
 from trade._transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
 from trade._transport.memory.node import Node
 
-__all__ = ["MemorySystem", "memory_system"]
-
 _TAKING_NOTE_S: Final = 10.0
 _LOOK_AGAIN_S: Final = 0.0005
 

@@ -13,8 +13,6 @@ from trade._transport.base import Channel, ChannelClosed, Message, Transport
 from trade.testing._ear import RecordingListener, listen, meet
 from trade.testing._standing import StandingConformance
 
-__all__ = ["TransportConformance"]
-
 _BIG_BYTES = 8 * 1024 * 1024
 
 

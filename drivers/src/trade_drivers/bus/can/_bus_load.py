@@ -2,8 +2,6 @@
 
 from typing import Final
 
-__all__ = ["LoadMeter", "frame_bits"]
-
 _WINDOW_NS: Final = 1_000_000_000
 
 

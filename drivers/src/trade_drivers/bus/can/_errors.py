@@ -8,8 +8,6 @@ from typing import Final
 
 from trade_drivers.bus._can_monitor import ErrorWord
 
-__all__ = ["ErrorState", "error_state", "unheard"]
-
 _CONTROLLER: Final = 0x004
 _NO_ACKNOWLEDGEMENT: Final = 0x020
 _BUS_OFF: Final = 0x040

@@ -6,8 +6,6 @@ from typing import Final
 
 from trade_drivers.bus.can._port import CanPort
 
-__all__ = ["Listeners"]
-
 _SLICE_S: Final = 0.004
 """The longest wait for a frame before stops are served."""
 

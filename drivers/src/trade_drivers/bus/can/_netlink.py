@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 
 from trade_drivers.bus.can._errors import ErrorState
 
-__all__ = ["Link", "look_at", "parse_link"]
-
 _HEADER: Final = struct.Struct("=IHHII")
 _LINK: Final = struct.Struct("=BxHiII")
 _ATTRIBUTE: Final = struct.Struct("=HH")

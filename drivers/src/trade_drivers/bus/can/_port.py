@@ -24,8 +24,6 @@ from trade_drivers.bus.can._socketcand import ServerBus
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["CanPort", "Frame", "split_port"]
-
 _log = logging.getLogger("trade")
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of each split frame
 _HELLO_S: Final = 1.0

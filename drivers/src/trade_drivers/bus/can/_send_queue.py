@@ -11,8 +11,6 @@ from trade_drivers.bus._jobs import PortFull
 from trade_drivers.bus.can._errors import ErrorState
 from trade_drivers.bus.can._netlink import look_at
 
-__all__ = ["LONGEST_S", "SendQueue", "is_full"]
-
 LONGEST_S: Final = 0.04
 """The longest wait for room. A bus thread has to be free for a stop within 50 ms (S07)."""
 _AGAIN_S: Final = 0.0002

@@ -6,8 +6,6 @@ Sources: ODrive documentation, "CANSimple protocol" (heartbeat); CiA 301 (error 
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-__all__ = ["Talk"]
-
 _BEAT: Final = 0x01
 """The low five bits of the identifier of an ODrive's heartbeat; the others are its node."""
 _BEAT_SIZE: Final = 8

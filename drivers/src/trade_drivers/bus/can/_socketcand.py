@@ -6,8 +6,6 @@ import can
 from can.interfaces.socketcand import SocketCanDaemonBus
 from can.interfaces.socketcand.socketcand import convert_can_message_to_ascii_message
 
-__all__ = ["ServerBus"]
-
 
 class ServerBus(SocketCanDaemonBus):
     """python-can's bus; each write wakes the server and is acknowledged, so several frames share one."""

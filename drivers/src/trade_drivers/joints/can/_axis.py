@@ -7,8 +7,6 @@ from typing import Final
 from trade_drivers.joints import Axis, Grain, Sample, Unfit
 from trade_drivers.robotfile import Joint
 
-__all__ = ["STILL_RAD_S", "Another", "MotorAxis", "check_zero_known", "grain_of"]
-
 STILL_RAD_S: Final = 0.01
 """The maximum speed at rest."""
 _LARGEST: Final = 2**31

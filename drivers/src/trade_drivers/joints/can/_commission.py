@@ -9,8 +9,6 @@ from trade_drivers.commissioning._commissioner import Bench, Commissioner
 if TYPE_CHECKING:
     from trade_drivers.commissioning._can_scan import CanBench
 
-__all__ = ["CanMotorCommissioner"]
-
 
 class CanMotorCommissioner(Commissioner):
     """Motors on a CAN bus, given as ``INTERFACE:CHANNEL``."""

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["MotorExchange", "asked"]
-
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25
 """Timeout of one answer: motors take a millisecond, but a busy host takes longer."""

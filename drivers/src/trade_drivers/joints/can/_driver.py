@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort, Talk
     from trade_drivers.joints.can._cycle import MotorExchange
 
-__all__ = ["AttachedMotors", "CanMotorDriver", "axes_of"]
-
 _PATIENCE_S: Final = 1.0
 """The time that a motor may need after power-on before it answers."""
 _FIRST_CYCLES: Final = 5

@@ -10,8 +10,6 @@ from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
-__all__ = ["as_set", "check_homing", "health_of", "tried", "written"]
-
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
 AnyExchange = ServoExchange[Any, Any]

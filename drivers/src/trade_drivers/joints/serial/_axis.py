@@ -10,8 +10,6 @@ from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Axis, Goal, Grain, Sample
 from trade_drivers.robotfile import Joint
 
-__all__ = ["Answer", "Health", "Register", "ServoAxis"]
-
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
 

@@ -12,8 +12,6 @@ from trade_drivers.joints.serial._axis import Register
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
 
-__all__ = ["ServoBench"]
-
 _LOOKS: Final = 3
 _SHARED: Final = (
     "the answer is garbled or arrives twice: two devices may share this id, or there is noise. Unplug all devices "

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.robotfile import SerialBus
 
-__all__ = ["ServoExchange"]
-
 _log = logging.getLogger("trade")
 _HEALTH_NS: Final = 500_000_000
 _CLEAN_NS: Final = 1_000_000_000

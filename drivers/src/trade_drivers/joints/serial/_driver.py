@@ -18,9 +18,6 @@ from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
 
-__all__ = ["ServoDriver"]
-
-
 _Servo = TypeVar("_Servo", bound=ServoAxis[Any])
 _Wire = TypeVar("_Wire", bound="ServoWire")
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.robotfile import SerialBus
 
-__all__ = ["Kept", "check_cycle", "check_own_range", "check_ranges", "first_look"]
-
 _Result = TypeVar("_Result")
 
 

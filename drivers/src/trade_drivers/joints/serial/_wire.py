@@ -10,8 +10,6 @@ from trade_drivers.bus._jobs import Gate, NoAnswer
 from trade_drivers.bus._serial_port import SerialWire
 from trade_drivers.joints.serial._axis import Answer
 
-__all__ = ["BROADCAST", "ServoWire"]
-
 BROADCAST: Final = 254
 _WHOLE_SECOND_ANSWER_S: Final = 0.005
 

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.cia402._cycle import DriveExchange
 
-__all__ = ["Admission"]
-
 _log = logging.getLogger("trade")
 _UNHEARD_NS: Final = 2_000_000_000
 """The wait for a drive's frames after set-up, before it is set up again."""

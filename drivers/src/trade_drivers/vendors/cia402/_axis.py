@@ -16,8 +16,6 @@ from trade_drivers.vendors.cia402._machine import State, state_of
 from trade_drivers.vendors.cia402._net import emergency_text
 from trade_drivers.vendors.cia402._stream import Following, Turning
 
-__all__ = ["DriveAxis", "Stage"]
-
 _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
 _STOPPED: Final = "network management has stopped it: it answers nothing until it is taken back"

@@ -7,8 +7,6 @@ from trade_drivers.joints.can._commission import CanMotorCommissioner
 if TYPE_CHECKING:
     from trade_drivers.commissioning._can_scan import CanBench
 
-__all__ = ["Cia402Commissioner"]
-
 
 class Cia402Commissioner(CanMotorCommissioner):
     """CiA 402 drives on a CAN bus, given as ``INTERFACE:CHANNEL``."""

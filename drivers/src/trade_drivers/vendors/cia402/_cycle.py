@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["DriveExchange"]
-
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
 _MEASURED: Final = (Stage.SET_UP, Stage.HERE)

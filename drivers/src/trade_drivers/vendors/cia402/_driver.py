@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from trade_drivers.vendors.cia402._axis import DriveAxis
     from trade_drivers.vendors.cia402._cycle import DriveExchange
 
-__all__ = ["Cia402Driver"]
-
 _FIRST_CYCLES: Final = 3
 """The number of measurements needed to detect motion."""
 

@@ -13,8 +13,6 @@ from trade_drivers.vendors.cia402._axis import DriveAxis
 if TYPE_CHECKING:
     from trade_drivers.vendors.cia402._cycle import DriveExchange
 
-__all__ = ["Homing"]
-
 _LONGEST_NS: Final = 30_000_000_000
 
 

@@ -19,8 +19,6 @@ from trade_drivers.vendors.cia402._units import check_units, read_optional
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["check_bus", "heartbeat_ms", "motion_every", "set_up"]
-
 _QUICK_STOP: Final = 3
 """Value of 6007h: quick stop after a lost heartbeat."""
 _BRAKE_AND_STAY: Final = 6

@@ -16,8 +16,6 @@ from trade_drivers.vendors.cia402._table import Entry
 if TYPE_CHECKING:
     from trade_drivers.vendors.cia402._cycle import DriveExchange
 
-__all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "write"]
-
 _WAIT_S: Final = 0.001
 _TAKEN_BACK_NS: Final = 5_000_000_000
 _AT_REST: Final = 2

@@ -3,8 +3,6 @@
 from enum import Enum
 from typing import Final
 
-__all__ = ["State", "command_towards_enabled", "state_of"]
-
 
 class State(Enum):
     """States of a drive, with mask and value of the statusword."""

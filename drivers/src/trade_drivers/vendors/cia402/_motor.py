@@ -10,8 +10,6 @@ from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.cia402._cycle import DriveExchange
 from trade_drivers.vendors.cia402._homing import Homing
 
-__all__ = ["Drive"]
-
 Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: the zero is here")]
 Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
 

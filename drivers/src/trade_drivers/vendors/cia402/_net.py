@@ -15,8 +15,6 @@ from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._sdo import Aborted, Transfer
 from trade_drivers.vendors.cia402._table import Entry
 
-__all__ = ["Answer", "Net", "NoAnswer", "Refused", "emergency_text"]
-
 _ATTEMPTS: Final = 3
 _ANSWER_S: Final = 0.25
 """Timeout of one answer: drives take milliseconds, a busy host takes longer, and nothing is blocked meanwhile."""

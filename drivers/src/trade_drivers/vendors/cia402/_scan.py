@@ -13,8 +13,6 @@ from trade_drivers.vendors.cia402._machine import state_of
 from trade_drivers.vendors.cia402._net import Answer, Net, NoAnswer, Refused
 from trade_drivers.vendors.cia402._units import read_scale
 
-__all__ = ["DriveBench"]
-
 _AT_ONCE: Final = 8
 """Number of simultaneous requests, as the queues of interfaces are short."""
 _SLICE_S: Final = 0.01

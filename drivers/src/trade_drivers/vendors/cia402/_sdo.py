@@ -4,8 +4,6 @@ import struct
 from collections.abc import Generator
 from typing import Final, NamedTuple
 
-__all__ = ["TIMED_OUT", "Aborted", "Request", "Transfer", "abort", "download", "upload"]
-
 _SIZE: Final = 8
 _EXPEDITED: Final = 4
 """Maximum size in the first frame; this driver writes nothing longer."""

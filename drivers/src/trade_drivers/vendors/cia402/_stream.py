@@ -5,8 +5,6 @@ from math import copysign, sqrt
 from trade_drivers.joints import Ramp, Sample, towards
 from trade_drivers.vendors.cia402 import _table as table
 
-__all__ = ["Following", "Turning", "interpolation_period"]
-
 
 class Following(Ramp):
     """Cyclic synchronous position: each position is reached one period after the SYNC that activates it."""

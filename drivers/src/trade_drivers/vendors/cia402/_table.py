@@ -12,8 +12,6 @@ from msgspec import Struct
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Talk
 
-__all__ = ["OUR_NODE", "Entry", "Pdo"]
-
 Kind = Literal["u1", "u2", "u4", "i1", "i2", "i4"]
 
 

@@ -15,8 +15,6 @@ from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.cia402._net import Answer, Net, Refused
 from trade_drivers.vendors.cia402._table import Entry
 
-__all__ = ["Scale", "check_units", "read_optional", "read_scale"]
-
 _SAME: Final = 1e-6
 _LARGEST: Final = 2**31 - 1
 _INCREMENT: Final = 0xB5

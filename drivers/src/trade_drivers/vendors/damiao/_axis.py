@@ -12,8 +12,6 @@ from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Status
 
-__all__ = ["COUNTS_PER_RAD", "DamiaoAxis"]
-
 COUNTS_PER_RAD: Final = (1 << 16) / tau
 """Counts per radian of the motor's shaft in this driver; frames contain radians."""
 _STILL_RAD_S: Final = 0.01

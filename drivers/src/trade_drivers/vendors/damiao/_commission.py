@@ -8,8 +8,6 @@ from trade_drivers.vendors.damiao._frames import MASTER
 if TYPE_CHECKING:
     from trade_drivers.commissioning._can_scan import CanBench
 
-__all__ = ["DamiaoCommissioner"]
-
 
 class DamiaoCommissioner(CanMotorCommissioner):
     """Damiao motors; factory default: id 1, and no answer id of their own."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["DamiaoExchange"]
-
 _LAG: Final = 5
 """Cycles by which a motor may lag behind its set-point."""
 

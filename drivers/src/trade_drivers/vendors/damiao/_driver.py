@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 
-__all__ = ["DamiaoDriver"]
-
 
 class DamiaoDriver(CanMotorDriver[DamiaoAxis, "DamiaoExchange"]):
     """Damiao motors on a CAN bus."""

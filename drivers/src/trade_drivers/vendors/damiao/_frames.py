@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Talk
 
-__all__ = ["MODELS", "Feedback", "Ranges", "Register", "Status"]
-
 BROADCAST: Final = 0x7FF
 """The identifier of register requests; the data contains the motor."""
 POSITION_VELOCITY: Final = 0x100

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 
-__all__ = ["check_bus", "check_ranges", "look_over", "register", "set_register"]
-
 _WITHIN: Final = 0.98
 """The share of a motor's position range that a joint may use, as positions at its two ends look alike."""
 

@@ -13,8 +13,6 @@ from trade_drivers.vendors.damiao._inspect import check_ranges, register, set_re
 if TYPE_CHECKING:
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
 
-__all__ = ["enabling", "leaving", "relaxing"]
-
 _WAIT_S: Final = 0.001
 
 

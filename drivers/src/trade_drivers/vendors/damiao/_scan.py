@@ -11,8 +11,6 @@ from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._frames import MASTER, MODELS, Feedback, Ranges, Register, Status
 
-__all__ = ["DamiaoBench"]
-
 _ANSWER_S: Final = 0.05
 _WHOLE_SECOND_ANSWER_S: Final = 0.005
 _ATTEMPTS: Final = 3

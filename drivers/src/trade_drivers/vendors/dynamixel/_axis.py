@@ -9,8 +9,6 @@ from trade_drivers.joints.serial import Health, ServoAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
 
-__all__ = ["CYCLIC", "GRAIN", "SLOW", "DynamixelAxis", "DynamixelHealth"]
-
 CYCLIC: Final = (table.PRESENT_LOAD.address, table.PRESENT_POSITION.end - table.PRESENT_LOAD.address)
 """Address and size of the block read from each joint in each cycle: effort, velocity, position."""
 SLOW: Final = (table.TORQUE_ENABLE.address, table.TEMPERATURE.end - table.TORQUE_ENABLE.address)

@@ -10,8 +10,6 @@ from trade_drivers.vendors.dynamixel._axis import GRAIN
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._wire import Wire  # noqa: F401 - a parameter of the base class
 
-__all__ = ["DynamixelCommissioner"]
-
 
 class DynamixelCommissioner(Commissioner):
     """X-series servos; they leave the factory with id 1 at 57600 baud."""

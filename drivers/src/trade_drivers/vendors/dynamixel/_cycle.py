@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.dynamixel._wire import Wire
 
-__all__ = ["DynamixelExchange"]
-
 _SIZES: Final = tuple(
     register.end - CYCLIC[0]
     for register in (table.PRESENT_POSITION, table.VELOCITY_TRAJECTORY, table.POSITION_TRAJECTORY)

@@ -16,8 +16,6 @@ from trade_drivers.vendors.dynamixel._inspect import check_bus, look_over
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._wire import Wire
 
-__all__ = ["DynamixelDriver"]
-
 _log = logging.getLogger("trade")
 _SLOW_ANSWER_S: Final = 100e-6
 

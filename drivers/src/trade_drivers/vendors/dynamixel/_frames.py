@@ -6,8 +6,6 @@ Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0": ``FF FF FD 00 | ID | LEN16 |
 from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["Corrupt", "crc16", "take_status"]
-
 HEADER: Final = b"\xff\xff\xfd"
 STUFFED: Final = b"\xff\xff\xfd\xfd"
 STATUS: Final = 0x55

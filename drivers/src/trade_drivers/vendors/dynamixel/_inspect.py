@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.dynamixel._wire import Wire
 
-__all__ = ["check_bus", "check_settings", "look_over"]
-
 _KEPT: Final = Kept((7, 8), table.name_of, table.firmware)
 _OTHER_THAN_REVERSED: Final = 0xFE
 _SHADOWS: Final = 252

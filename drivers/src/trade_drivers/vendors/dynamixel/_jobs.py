@@ -12,8 +12,6 @@ from trade_drivers.vendors.dynamixel._axis import DynamixelAxis, DynamixelHealth
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
 
-__all__ = ["enabling", "goal_block", "leaving", "relaxing"]
-
 _BOOT_NS: Final = 2_000_000_000
 """The time allowed for a servo to restart and to be accepted again."""
 _WAIT_S: Final = 0.001

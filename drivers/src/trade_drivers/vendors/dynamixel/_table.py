@@ -11,18 +11,6 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-__all__ = [
-    "BY_MODEL_NAME",
-    "BY_MODEL_NUMBER",
-    "HARDWARE_ERRORS",
-    "STATUS_ERRORS",
-    "Access",
-    "Model",
-    "Register",
-    "firmware",
-    "name_of",
-]
-
 RAD_PER_COUNT: Final = tau / 4096
 RAD_S_PER_COUNT: Final = 0.229 * tau / 60
 RAD_S2_PER_COUNT: Final = 214.577 * tau / 3600

@@ -20,8 +20,6 @@ from trade_drivers.joints.serial._wire import BROADCAST, ServoWire
 from trade_drivers.vendors.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
 from trade_drivers.vendors.dynamixel._table import BAUD_CODES, STATUS_ERRORS
 
-__all__ = ["Wire"]
-
 _ALERT: Final = 0x80
 _PING_ALL: Final = b"\xff\xff\xfd\x00\xfe\x03\x00\x01"
 _EACH_S: Final = 0.003

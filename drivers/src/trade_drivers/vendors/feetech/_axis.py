@@ -9,8 +9,6 @@ from trade_drivers.joints.serial import Health, ServoAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.feetech import _table as table
 
-__all__ = ["CYCLIC", "GRAIN", "SLOW", "FeetechAxis", "FeetechHealth"]
-
 CYCLIC: Final = (table.PRESENT_POSITION.address, table.PRESENT_LOAD.end - table.PRESENT_POSITION.address)
 """Address and size of the block read from each joint in each cycle: position, speed, load."""
 SLOW: Final = (table.TORQUE.address, table.MOVING.end - table.TORQUE.address)

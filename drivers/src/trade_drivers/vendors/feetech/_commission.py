@@ -10,8 +10,6 @@ from trade_drivers.vendors.feetech._axis import GRAIN
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire  # noqa: F401 - a parameter of the base class
 
-__all__ = ["FeetechCommissioner"]
-
 _OPEN, _SHUT = 0, 1
 
 

@@ -18,8 +18,6 @@ from trade_drivers.vendors.feetech._inspect import check_settings
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire  # noqa: F401 - a parameter of the base class
 
-__all__ = ["FeetechExchange"]
-
 _SIZES: Final = tuple(register.end - CYCLIC[0] for register in (table.PRESENT_LOAD, table.TEMPERATURE, table.STATUS))
 
 

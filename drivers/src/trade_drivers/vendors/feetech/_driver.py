@@ -15,8 +15,6 @@ from trade_drivers.vendors.feetech._inspect import check_bus, look_over
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire
 
-__all__ = ["FeetechDriver"]
-
 
 class FeetechDriver(ServoDriver[FeetechAxis, "Wire"]):
     """STS servos in position control on a serial bus."""

@@ -8,8 +8,6 @@ parameters may contain the bytes of a header.
 from collections.abc import Container
 from typing import Final, NamedTuple
 
-__all__ = ["Corrupt", "Instruction", "Status", "checksum", "packet", "take_status"]
-
 HEADER: Final = b"\xff\xff"
 OVERHEAD: Final = 6
 """Bytes of a packet without parameters."""

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.robotfile import Robot, SerialBus
 
-__all__ = ["check_bus", "check_settings", "look_over"]
-
 _KEPT: Final = Kept((5, 6), table.name_of, table.firmware)
 _MOST_SPEED_COUNTS: Final = ((1 << 15) - 1) // table.STEPS_PER_SPEED
 

@@ -10,8 +10,6 @@ from trade_drivers.vendors.feetech._axis import FeetechAxis
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._cycle import FeetechExchange
 
-__all__ = ["GOAL_BLOCK", "enabling", "goal_block", "leaving", "relaxing"]
-
 GOAL_BLOCK: Final = (table.ACCELERATION.address, table.GOAL_SPEED.end - table.ACCELERATION.address)
 """Address and size of a command to move: a goal always with its speed."""
 

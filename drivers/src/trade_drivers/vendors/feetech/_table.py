@@ -10,8 +10,6 @@ from typing import Final
 
 from msgspec import Struct
 
-__all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "STATUS_BITS", "Access", "Model", "Register", "firmware", "name_of"]
-
 RAD_PER_COUNT: Final = tau / 4096
 STEPS_PER_SPEED: Final = 10
 """Steps/s in one count of speed; slower motion looks like rest."""

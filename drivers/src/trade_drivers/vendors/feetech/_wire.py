@@ -8,8 +8,6 @@ from trade_drivers.joints.serial._wire import BROADCAST, ServoWire
 from trade_drivers.vendors.feetech._frames import OVERHEAD, Corrupt, Instruction, Status, packet, take_status
 from trade_drivers.vendors.feetech._table import BAUD_CODES, MODEL_NUMBER
 
-__all__ = ["Wire"]
-
 
 class Wire(ServoWire):
     """One serial port and the packets on it."""

@@ -10,8 +10,6 @@ from trade_drivers.joints.can import MotorAxis, grain_of
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
 
-__all__ = ["COUNTS_PER_TURN", "MODELS", "Model", "OdriveAxis"]
-
 COUNTS_PER_TURN: Final = 1 << 16
 """Counts per turn of the motor in this driver, finer than any encoder; frames contain turns."""
 

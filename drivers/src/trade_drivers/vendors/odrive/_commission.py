@@ -8,8 +8,6 @@ from trade_drivers.vendors.odrive._frames import NODES
 if TYPE_CHECKING:
     from trade_drivers.commissioning._can_scan import CanBench
 
-__all__ = ["OdriveCommissioner"]
-
 
 class OdriveCommissioner(CanMotorCommissioner):
     """ODrives; one without a node number is shown with the number 63."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["OdriveExchange"]
-
 _log = logging.getLogger("trade")
 _HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)
 _BEATS_MISSED_NS: Final = 500_000_000

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
     from trade_drivers.vendors.odrive._cycle import OdriveExchange
 
-__all__ = ["OdriveDriver"]
-
 
 class OdriveDriver(CanMotorDriver[OdriveAxis, "OdriveExchange"]):
     """ODrives with firmware 0.6 on a CAN bus."""

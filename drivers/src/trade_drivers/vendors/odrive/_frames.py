@@ -12,20 +12,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Talk
 
-__all__ = [
-    "Command",
-    "Control",
-    "Errors",
-    "Health",
-    "Heartbeat",
-    "Input",
-    "Result",
-    "State",
-    "Version",
-    "frame_id",
-    "two_floats",
-]
-
 NODES: Final = 63
 """The value for a missing node number; valid ones are lower."""
 _TWO: Final = struct.Struct("<ff")

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.odrive._cycle import OdriveExchange
 
-__all__ = ["check_bus", "look_over"]
-
 _FIRMWARE: Final = (0, 6)
 _LONGEST_S: Final = 0.5
 _BEATS_HZ: Final = 10

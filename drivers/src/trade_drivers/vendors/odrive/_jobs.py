@@ -13,8 +13,6 @@ from trade_drivers.vendors.odrive._frames import Command, Control, Errors, Input
 if TYPE_CHECKING:
     from trade_drivers.vendors.odrive._cycle import OdriveExchange
 
-__all__ = ["enabling", "relaxing"]
-
 _SLACK_NS: Final = 250_000_000
 """The delay allowed for the report that the watchdog expired: a heartbeat, and a busy host."""
 _AT_REST: Final = 2

@@ -9,8 +9,6 @@ from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.odrive._axis import MODELS
 from trade_drivers.vendors.odrive._frames import NODES, Command, Heartbeat, State, Version, frame_id, orders
 
-__all__ = ["OdriveBench"]
-
 _ANSWER_S: Final = 0.25
 _ATTEMPTS: Final = 3
 

@@ -10,8 +10,6 @@ from trade_drivers.vendors.robotiq import _table as table
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
 
-__all__ = ["RobotiqCommissioner"]
-
 
 class RobotiqCommissioner(Commissioner):
     """2F-85 grippers; they leave the factory with id 9 at 115200 baud."""

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.robotiq._wire import Wire
 
-__all__ = ["Exchange"]
-
 _log = logging.getLogger("trade")
 _TAKEN_NS: Final = 15_000_000
 """The time after a write in which the status may be outdated, as the device updates it 200 times a second."""

@@ -21,8 +21,6 @@ from trade_drivers.vendors.robotiq._gripper_state import Hand
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
 
-__all__ = ["RobotiqDriver"]
-
 _BITS_A_READ: Final = (8 + 11) * 10 + 35
 """Request, answer, and the gap of three and a half characters before it."""
 

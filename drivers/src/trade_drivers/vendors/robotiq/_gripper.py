@@ -11,8 +11,6 @@ from trade_drivers.vendors.robotiq._cycle import Exchange
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._jobs import Activate, ClearFault, GripperCommand, Move
 
-__all__ = ["RobotiqGripper"]
-
 
 class RobotiqGripper(Gripper):
     """One gripper of a bus."""

@@ -14,8 +14,6 @@ from trade_drivers.vendors.robotiq._table import Contact, Status
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._jobs import Motion
 
-__all__ = ["Hand"]
-
 _HELD: Final[dict[int, Literal["outside", "inside"]]] = {Contact.CLOSING: "outside", Contact.OPENING: "inside"}
 _HELD_COUNTS: Final = 1
 _REMEDY: Final = "remove the cause, then call activate(): it moves the fingers all the way, and what they hold falls"

@@ -14,8 +14,6 @@ from trade_drivers.vendors.robotiq._table import Contact, Status
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._cycle import Exchange
 
-__all__ = ["Activate", "ClearFault", "GripperCommand", "Motion", "Move"]
-
 _RESET_NS: Final = 1_000_000_000
 _TAKEN_NS: Final = 500_000_000
 _STUCK_S: Final = 0.5

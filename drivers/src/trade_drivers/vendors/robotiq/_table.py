@@ -8,8 +8,6 @@ from typing import Final
 
 from msgspec import Struct
 
-__all__ = ["BY_MODEL_NAME", "Contact", "Model", "Status", "command", "fault_text"]
-
 COMMAND: Final = 0x03E8
 """First of three registers to write: action request, position request, speed and force."""
 STATUS: Final = 0x07D0

@@ -19,8 +19,6 @@ from trade_drivers.bus._jobs import Gate, NoAnswer, Refused
 from trade_drivers.bus._serial_port import DRAIN_S, LONGEST_WAIT_S, SerialLine, SerialWire
 from trade_drivers.vendors.robotiq import _table as table
 
-__all__ = ["Wire"]
-
 _READ_WRITE: Final = 23
 _EXCEPTION: Final = 0x80
 _OVERHEAD: Final = 5

@@ -14,8 +14,6 @@ from trade_drivers.plugins._driver import SenseDriver
 from trade_drivers.vendors.snapshot._http import Place, ask, place_of
 from trade_drivers.vendors.snapshot._picture import Picture, picture
 
-__all__ = ["SnapshotDriver"]
-
 _OK: Final = 200
 _REMEDY: Final = "ask again, or look at the camera's own page"
 

@@ -5,8 +5,6 @@ import time
 from typing import Final, NamedTuple
 from urllib.parse import urlsplit
 
-__all__ = ["Answer", "Place", "ask", "parse_answer", "place_of"]
-
 _MOST_BYTES: Final = 32 * 2**20
 _CHUNK: Final = 65_536
 _END: Final = b"\r\n\r\n"

@@ -2,8 +2,6 @@
 
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["Picture", "picture"]
-
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_END: Final = b"IEND\xaeB`\x82"
 _JPEG: Final = b"\xff\xd8\xff"

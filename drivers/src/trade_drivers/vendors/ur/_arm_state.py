@@ -13,8 +13,6 @@ from trade_drivers.vendors.ur._messages import Sample
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import Motion
 
-__all__ = ["JOINTS", "ArmStatus"]
-
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 IDLE: Final = 5
 """``robot_mode`` of an arm that is powered, with its brakes on."""

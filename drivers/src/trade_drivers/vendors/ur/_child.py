@@ -7,8 +7,6 @@ from typing import Final, Literal
 
 from trade_drivers.vendors.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Pulse, Report, Sample, pair
 
-__all__ = ["Child"]
-
 _END_S: Final = 5.0
 
 

@@ -2,8 +2,6 @@
 
 from typing import Final
 
-__all__ = ["Age"]
-
 _DRIFT: Final = 0.001
 """The maximum rate difference of the clocks that does not make measurements appear older."""
 

@@ -18,8 +18,6 @@ from trade_drivers.vendors.ur._messages import Beat, Done, Gone, Halt, Order, Sc
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import ArmCommand, Motion
 
-__all__ = ["Exchange"]
-
 _log = logging.getLogger("trade")
 _BEAT_NS: Final = 20_000_000
 _STOPPED_NS: Final = 200_000_000

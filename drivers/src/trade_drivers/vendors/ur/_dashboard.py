@@ -7,8 +7,6 @@ import time
 from contextlib import suppress
 from typing import Final
 
-__all__ = ["SERVICES", "DashboardError", "ask", "commanded", "lacking", "probe", "remedy", "tell"]
-
 _PORT: Final = 29999
 _RTDE: Final = 30004
 _SCRIPT: Final = 30003

@@ -22,8 +22,6 @@ from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded
 from trade_drivers.vendors.ur._link import Link
 from trade_drivers.vendors.ur._ur_arm import UrArm
 
-__all__ = ["UrDriver"]
-
 _CYCLES_HZ: Final = {
     "UR3": 125.0,
     "UR5": 125.0,

@@ -7,8 +7,6 @@ from trade.errors import ConfigurationError
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask, probe
 
-__all__ = ["identify"]
-
 _ASK_S: Final = 2.0
 _VERSION: Final = re.compile(r"(\d+)\.\d+(?:\.\d+)*")
 _E_SERIES: Final = 5

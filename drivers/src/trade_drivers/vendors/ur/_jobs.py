@@ -15,8 +15,6 @@ from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._cycle import Exchange
 
-__all__ = ["ArmCommand", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion", "Move", "Scaling", "SetPoint"]
-
 _NEAR: Final = 0.01
 """Distance in rad or m within which a move has arrived."""
 _OUTSIDE_RAD: Final = 0.02

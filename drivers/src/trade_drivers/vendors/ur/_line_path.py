@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from math import atan2, ceil, cos, dist, hypot, sin
 from typing import Final
 
-__all__ = ["poses_on"]
-
 _EVERY_M: Final = 0.05
 _EVERY_RAD: Final = 0.2
 

@@ -8,8 +8,6 @@ from trade_drivers.bus._jobs import PortLost, PortOpening
 from trade_drivers.vendors.ur._child import Child
 from trade_drivers.vendors.ur._messages import Gone
 
-__all__ = ["Link"]
-
 _FIRST_S: Final = 10.0
 """Startup time of a reading process, which imports the library on a possibly busy machine."""
 _LOOK_S: Final = 0.01

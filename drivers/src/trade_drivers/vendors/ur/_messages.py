@@ -7,28 +7,6 @@ from typing import Final, Generic, TypeVar
 import msgspec
 from msgspec import Struct
 
-__all__ = [
-    "Beat",
-    "Channel",
-    "Done",
-    "Failed",
-    "Free",
-    "Gone",
-    "Halt",
-    "Hello",
-    "MoveJoints",
-    "MoveLine",
-    "Order",
-    "Pulse",
-    "Report",
-    "Sample",
-    "Scale",
-    "Servo",
-    "Solve",
-    "Take",
-    "pair",
-]
-
 _LONGEST: Final = 4096
 Message = TypeVar("Message")
 

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from math import copysign, sqrt
 
-__all__ = ["SetpointFilter"]
-
 
 class SetpointFilter:
     """Generates the set-points of several joints, cycle by cycle.

@@ -25,8 +25,6 @@ from trade_drivers.vendors.ur._jobs import (
     SetPoint,
 )
 
-__all__ = ["UrArm"]
-
 _POSE: Final = ("x", "y", "z", "rx", "ry", "rz")
 _STOP_S: Final = 0.2
 _ASK_S: Final = 1.0

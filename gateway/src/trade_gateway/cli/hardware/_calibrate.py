@@ -27,8 +27,6 @@ from trade_gateway.cli.hardware._lerobot import imported, read_calibration
 if TYPE_CHECKING:
     import tomlkit
 
-__all__ = ["Sweep", "calibrate", "homed", "measured", "with_values"]
-
 _MARGIN_RAD: Final = 0.02
 """How far inside the measured ends the range lies: a mechanical stop yields a little."""
 _LEAST_RAD: Final = 0.1

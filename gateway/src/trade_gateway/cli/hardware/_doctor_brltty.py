@@ -12,8 +12,6 @@ from typing import Final, NamedTuple
 
 from trade_gateway.cli.hardware._doctor_host import Finding
 
-__all__ = ["brltty"]
-
 _DEVICES: Final = Path("/sys/bus/usb/devices")
 _RULES: Final = tuple(Path(folder, "udev/rules.d") for folder in ("/etc", "/run", "/usr/local/lib", "/usr/lib", "/lib"))
 """Where udev finds rules (man 7 udev): a file replaces those of the same name in later folders."""

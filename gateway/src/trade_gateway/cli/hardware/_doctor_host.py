@@ -17,19 +17,6 @@ from trade._discovery.hub_file import HubFile
 from trade_drivers import AnyDriver, load_driver
 from trade_gateway.process._real_time import PRIORITY, refusal
 
-__all__ = [
-    "Finding",
-    "certificate",
-    "clock",
-    "in_sight",
-    "latencies",
-    "libraries",
-    "multicast",
-    "ports",
-    "real_time",
-    "waits",
-]
-
 _LATENCIES: Final = Path("/sys/bus/usb-serial/devices")
 _LATEST_MS: Final = 2
 _CLOCK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")

@@ -29,8 +29,6 @@ from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "numbered", "refused", "shared", "unmeasured", "unwatched"]
-
 _LOOKS: Final = 10
 """How often each device is asked: a bad line loses some answers."""
 _PATIENCE_S: Final = 3.0

@@ -12,8 +12,6 @@ from trade._text_file import read_text
 from trade.errors import ConfigurationError
 from trade_drivers import Joint, Robot, SerialBus
 
-__all__ = ["Calibrated", "imported", "read_calibration"]
-
 _DRIVERS: Final = {"dynamixel": 1_044_479, "feetech": 2047}
 """The drivers whose servos LeRobot calibrates, and the largest homing offset of these, in counts."""
 _TURN: Final = 4096

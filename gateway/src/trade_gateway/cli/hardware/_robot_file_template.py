@@ -9,8 +9,6 @@ import msgspec
 from trade.errors import ConfigurationError
 from trade_drivers import Found, parse
 
-__all__ = ["UNMEASURED_RAD", "first_file"]
-
 UNMEASURED_RAD: Final = 0.1
 """The placeholder range of a joint that was not measured, to both sides of zero."""
 

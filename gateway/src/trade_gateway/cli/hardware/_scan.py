@@ -18,8 +18,6 @@ from trade_gateway.cli._options import CONNECTION, OUTPUT, SELECT, Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.hardware._robot_file_template import first_file
 
-__all__ = ["scan", "serial_ports", "set_baud", "set_id"]
-
 _PORTS: Final = ("/dev/serial/by-id/*", "/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 _CAN: Final = re.compile(r"[a-z0-9_]+:.+")
 """The name of a python-can bus: ``socketcan:can0``."""

@@ -25,8 +25,6 @@ from msgspec import Meta, Struct
 from trade._atomic_file import fresh_beside
 from trade.errors import ConfigurationError
 
-__all__ = ["CONFIG", "SQLITE_BESIDE", "STATE", "Entry", "Manifest", "Source", "read_archive", "unpack", "write_archive"]
-
 CONFIG: Final = "config"
 STATE: Final = "state"
 SQLITE_BESIDE: Final = ("-wal", "-shm", "-journal")

@@ -12,8 +12,6 @@ from trade._text_file import read_text
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 
-__all__ = ["Named", "named_files"]
-
 _CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
 _LOCAL: Final = "local"
 _Table = TypeVar("_Table", bound=Struct)

@@ -11,8 +11,6 @@ from msgspec import Struct
 from trade_drivers import CanBus, Robot, SerialBus
 from trade_gateway.process._real_time import PRIORITY
 
-__all__ = ["UDEV_RULES", "Needs", "hidden_in", "needs_of", "program_folders", "unit_text"]
-
 _COMES_AND_GOES: Final = re.compile(r"/dev/(serial/|tty(USB|ACM)\d)")
 _HIDDEN: Final = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108 - what the unit hides
 _STATE: Final = Path("/var/lib/trade")

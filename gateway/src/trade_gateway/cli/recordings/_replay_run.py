@@ -17,8 +17,6 @@ from trade_gateway.recording._channels import JointStates
 from trade_gateway.recording._motion import Motion, deviation, fitted, motion_of, motions, moving
 from trade_gateway.recording._sources import joint_states
 
-__all__ = ["Replayed", "Robot", "chosen", "not_at_start"]
-
 _LIMBS: Final = where(kind="JointGroup") | where(kind="Arm")
 _FIND_S: Final = 5.0
 _START_RAD_S: Final = 0.3

@@ -13,8 +13,6 @@ from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.supervisor._objects import GROUP
 
-__all__ = ["Snapshot", "compared", "snapshot", "write"]
-
 
 class Snapshot(NamedTuple):
     """A system file from what runs."""

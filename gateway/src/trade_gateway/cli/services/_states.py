@@ -12,8 +12,6 @@ from trade._timestamps import clock
 from trade.errors import AccessDenied
 from trade_gateway.cli._output import Output, complain
 
-__all__ = ["State", "say_state"]
-
 Row = tuple[str, ...]
 
 

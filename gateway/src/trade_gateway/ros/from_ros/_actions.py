@@ -9,8 +9,6 @@ from trade_gateway.ros.from_ros._providers import Method, Records, plain, provid
 from trade_gateway.ros.from_ros._sent_goals import SentGoals
 from trade_gateway.ros.from_ros._services import Offered
 
-__all__ = ["action_from_ros"]
-
 _NO_PARAMETERS: Final[frozenset[str]] = frozenset()
 
 

@@ -18,8 +18,6 @@ from trade_gateway.ros._types import Message
 from trade_gateway.ros.from_ros._sent_goals import SentGoals
 from trade_gateway.ros.from_ros._services import Offered
 
-__all__ = ["RosJoint", "RosJoints", "joints_from_ros"]
-
 _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 _PEAK: Final = 1.5
 """Ratio of the peak to the mean speed of a cubic curve from rest to rest."""

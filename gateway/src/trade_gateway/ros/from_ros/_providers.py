@@ -10,8 +10,6 @@ from trade import Resource, service
 from trade.errors import ConfigurationError
 from trade_gateway.ros._types import Field, Message, Types
 
-__all__ = ["Method", "Records", "plain", "provider"]
-
 _STAMP: Final = "std_msgs/msg/Header"
 _OCTETS: Final = ("uint8", "byte", "octet", "char")
 

@@ -9,8 +9,6 @@ from trade.errors import DeviceFault, MotionStopped
 from trade_gateway.ros._graph import Ended, Graph, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
 
-__all__ = ["TEXTS", "SentGoals"]
-
 _STOPPED_WITHIN_S: Final = 1.8
 """Within the time that the end of a session allows (S05)."""
 _LONGEST_S: Final = 3600.0

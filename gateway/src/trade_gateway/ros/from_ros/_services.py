@@ -12,8 +12,6 @@ from trade_gateway.ros._graph import Graph, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.from_ros._providers import Method, Records, plain, provider
 
-__all__ = ["Offered", "parameters_from_ros", "publisher_from_ros", "service_from_ros", "topic_from_ros"]
-
 _STOPPED_WITHIN_S: Final = 2.0
 _STOPS_OWED: Final = 10
 _STOP_AGAIN_S: Final = 0.2

@@ -24,8 +24,6 @@ from trade_gateway.ros.ros1._wire import action_types
 if TYPE_CHECKING:
     from trade_gateway.ros.ros1._ros1 import Ros1
 
-__all__ = ["ActionClient"]
-
 _THERE_S: Final = 5.0
 """Timeout for an action to appear at its client's first use."""
 _LOOK_S: Final = 0.05

@@ -21,8 +21,6 @@ from trade_gateway.ros.ros1._wire import action_types
 if TYPE_CHECKING:
     from trade_gateway.ros.ros1._ros1 import Ros1
 
-__all__ = ["ActionServer"]
-
 _EVERY_S: Final = 0.2
 _KEPT_S: Final = 5.0
 """How long the state of an ended goal, and a cancel whose goal has not arrived, are kept and published."""

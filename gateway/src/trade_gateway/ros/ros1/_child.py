@@ -14,8 +14,6 @@ from urllib.parse import urlparse
 
 from trade_gateway.ros.ros1._node._frames import Channel, Head
 
-__all__ = ["Child"]
-
 _log: Final = logging.getLogger("trade.ros1")
 _HERE: Final = str(Path(__file__).parent)
 _START: Final = "import runpy, sys; sys.path.append(sys.argv.pop(1)); runpy.run_module('_node', run_name='__main__')"

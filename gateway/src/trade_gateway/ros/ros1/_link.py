@@ -13,8 +13,6 @@ from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros1._child import Child
 from trade_gateway.ros.ros1._node._frames import Channel, Head
 
-__all__ = ["Link", "Opened"]
-
 _AT_ONCE: Final = 16
 """Number of pending requests; each holds a thread of the node."""
 _MARGIN_S: Final = 0.5

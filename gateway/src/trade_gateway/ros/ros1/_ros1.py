@@ -31,8 +31,6 @@ from trade_gateway.ros.ros1._node._frames import Head
 from trade_gateway.ros.ros1._service import Served
 from trade_gateway.ros.ros1._wire import message_head, service_head
 
-__all__ = ["Nodes", "Ros1"]
-
 
 class Nodes:
     """The visible nodes. Each watcher is called on its own thread, in order, with every change."""

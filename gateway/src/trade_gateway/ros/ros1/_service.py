@@ -10,8 +10,6 @@ from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._node._frames import Head
 
-__all__ = ["Served"]
-
 _MOST: Final = 32
 """Number of requests that wait."""
 _LATE_S: Final = 5.0

@@ -4,8 +4,6 @@ import time
 from enum import IntEnum
 from typing import Final
 
-__all__ = ["ENDED", "Status", "Time", "day", "now"]
-
 Time = dict[str, int]
 
 

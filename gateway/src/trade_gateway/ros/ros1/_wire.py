@@ -13,8 +13,6 @@ from rosbags.interfaces import Nodetype
 from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._node._frames import Head
 
-__all__ = ["ActionTypes", "action_types", "message_head", "service_head"]
-
 _RULE: Final = "=" * 80
 _AROUND: Final = {
     "Goal": ("goal", "goal_id", "actionlib_msgs/msg/GoalID"),

@@ -11,8 +11,6 @@ from typing import Any, Final
 
 from trade_gateway.ros._graph import Ended
 
-__all__ = ["ANY", "CANCEL", "ENDS", "STATUS", "Refusal", "Status", "uuid"]
-
 CANCEL: Final = "action_msgs/srv/CancelGoal"
 STATUS: Final = "action_msgs/msg/GoalStatusArray"
 ANY: Final = bytes(16)

@@ -13,8 +13,6 @@ from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Asked, Server
 from trade_gateway.ros.ros2._topics import Topic
 
-__all__ = ["Action", "Pursued"]
-
 _MOST_ENDED: Final = 32
 """Number of results kept for late requests; a client of ROS 2 asks as soon as its goal is accepted."""
 _END_S: Final = 5.0

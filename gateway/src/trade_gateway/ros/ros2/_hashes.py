@@ -20,8 +20,6 @@ from rosbags.typesys import Stores, get_typestore
 from trade.errors import ConfigurationError
 from trade_gateway.ros._types import Types
 
-__all__ = ["Hashes"]
-
 _UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 

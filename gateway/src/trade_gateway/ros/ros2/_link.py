@@ -19,8 +19,6 @@ import zenoh
 
 from trade.errors import ConfigurationError
 
-__all__ = ["CLOSED", "Declared", "Link"]
-
 CLOSED: Final = (zenoh.ZError, RuntimeError)
 """What zenoh raises for an object that is already closed, or that another thread is closing or using."""
 _OPEN_MS: Final = 500

@@ -20,19 +20,6 @@ import xxhash
 
 from trade.errors import ConfigurationError
 
-__all__ = [
-    "Kind",
-    "Seen",
-    "absolute",
-    "data_key",
-    "dds_type",
-    "every_token",
-    "gid",
-    "node_token",
-    "read_token",
-    "token",
-]
-
 _ADMIN: Final = "@ros2_lv"
 _NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TYPE: Final = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")

@@ -13,8 +13,6 @@ from trade_gateway.ros.ros2._link import Declared, Link
 from trade_gateway.ros.ros2._names import Kind, absolute, data_key, gid, node_token, token
 from trade_gateway.ros.ros2._presence import Presence
 
-__all__ = ["GID_BYTES", "LATCHED", "USUAL", "Attachment", "Endpoint", "Node", "Sender"]
-
 GID_BYTES: Final = 16
 _FORMAT: Final = struct.Struct(f"<qqB{GID_BYTES}s")
 

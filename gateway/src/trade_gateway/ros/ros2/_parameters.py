@@ -13,8 +13,6 @@ from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Server, answering
 
-__all__ = ["NoParameters", "all_of", "put"]
-
 Call = Callable[[str, str, Mapping[str, Any], float], Message]
 """Calls a service: its name, its type, the request, a timeout in seconds."""
 

@@ -20,8 +20,6 @@ from trade_gateway.ros._mailbox import Mailbox
 from trade_gateway.ros.ros2._link import Link
 from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_token
 
-__all__ = ["Presence", "Watching"]
-
 _INTRODUCTION_S: Final = 0.5
 """How long a first message waits for the token of its sender, which may arrive later."""
 _PAUSE_S: Final = 5.0

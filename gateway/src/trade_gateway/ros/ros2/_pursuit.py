@@ -15,8 +15,6 @@ from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Client, Unanswered
 from trade_gateway.ros.ros2._topics import TopicHeard
 
-__all__ = ["Pursuing"]
-
 _ACCEPT_S: Final = 5.0
 _CANCEL_S: Final = 5.0
 _ASK_S: Final = 30.0

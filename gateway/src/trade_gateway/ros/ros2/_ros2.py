@@ -28,8 +28,6 @@ from trade_gateway.ros.ros2._pursuit import Pursuing
 from trade_gateway.ros.ros2._services import Client, Server, answering
 from trade_gateway.ros.ros2._topics import Topic, TopicHeard
 
-__all__ = ["Ros2"]
-
 _Opened = TypeVar("_Opened", bound=Closes)
 
 

@@ -25,8 +25,6 @@ from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Endpoint, Node
 
-__all__ = ["Asked", "Client", "Server", "Unanswered", "answering"]
-
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
 """S01: a request that waited longer is refused, not executed; its client has given up."""

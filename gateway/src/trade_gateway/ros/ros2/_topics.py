@@ -22,8 +22,6 @@ from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node, Sender
 
-__all__ = ["Topic", "TopicHeard"]
-
 _DEPTH: Final = 10
 _LATE_S: Final = 1.0
 """S01, S04: a message that waited longer for a busy subscriber is dropped: it may be a command."""

@@ -19,8 +19,6 @@ from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.from_ros._sent_goals import TEXTS
 from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, Unacceptable
 
-__all__ = ["ActionsToRos", "GrippersToRos"]
-
 _logger = logging.getLogger("trade")
 _REACHED_M: Final = 0.001
 """A gripper within this distance of a commanded width has reached it."""

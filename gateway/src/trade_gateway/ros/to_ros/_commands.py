@@ -21,8 +21,6 @@ from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, 
 from trade_gateway.ros._nodes import Guest, Nodes
 from trade_gateway.ros._types import Message
 
-__all__ = ["CommandsToRos", "stops_of"]
-
 _logger = logging.getLogger("trade")
 
 _MOST_UNDER_WAY: Final = 2

@@ -15,8 +15,6 @@ from trade_gateway.ros._types import Message
 from trade_gateway.ros._urdf import Transform, UrdfJoint, read_urdf
 from trade_gateway.ros.to_ros._streams import LimbTopic, Topics
 
-__all__ = ["Description", "TransformsToRos"]
-
 _TF: Final = "tf2_msgs/msg/TFMessage"
 
 

@@ -13,8 +13,6 @@ from trade_gateway.ros._graph import Ended, Goal, Outcome
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros._types import Message
 
-__all__ = ["CallOfGoal", "Meaning", "ServedGoals", "Unacceptable", "text_of"]
-
 _logger = logging.getLogger("trade")
 
 _WAIT_S: Final = 2.0

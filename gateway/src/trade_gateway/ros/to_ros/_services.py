@@ -13,8 +13,6 @@ from trade_gateway.ros._mapping_sync import Place, absent_name, named_services
 from trade_gateway.ros._nodes import UNKNOWN, Nodes
 from trade_gateway.ros._types import Message
 
-__all__ = ["LocksToRos", "ServicesToRos"]
-
 _SET_BOOL: Final = "std_srvs/srv/SetBool"
 
 

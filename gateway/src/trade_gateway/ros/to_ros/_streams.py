@@ -14,8 +14,6 @@ from trade_gateway.ros._joints import LIMBS, JointNames, Measured, joints_of, li
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._types import Message
 
-__all__ = ["JointStatesToRos", "LimbTopic", "StreamsToRos", "Topics"]
-
 _logger = logging.getLogger("trade")
 
 _LOOK_EVERY_S: Final = 0.5

@@ -28,8 +28,6 @@ from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, text_of
 
-__all__ = ["TrajectoriesToRos"]
-
 _logger = logging.getLogger("trade")
 
 _TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"

@@ -5,8 +5,6 @@ import itertools
 import threading
 from collections.abc import Callable
 
-__all__ = ["Clock"]
-
 
 class Clock:
     """A monotonic clock that advances only when a test moves it.

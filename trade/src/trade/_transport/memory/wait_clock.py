@@ -9,8 +9,6 @@ from typing import Final, NamedTuple
 
 from trade._transport.wait_clock import WaitClock
 
-__all__ = ["MovedWaitClock"]
-
 _SOON_S: Final = 0.5
 """How long what is expected may take, in seconds of the computer's clock."""
 _GIVEN_S: Final = 0.2

@@ -18,8 +18,6 @@ from rospy.impl.tcpros_service import TCPROSServiceClient
 
 from ._master import Refused, Unreachable, ask
 
-__all__ = ["call"]
-
 
 class _Client(TCPROSServiceClient):
     def _read_service_error(self, sock: Any, b: Any) -> str:

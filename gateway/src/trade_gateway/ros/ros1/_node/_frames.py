@@ -11,8 +11,6 @@ import threading
 from collections import deque
 from typing import Any, Callable, Dict
 
-__all__ = ["Channel", "Head", "Heard"]
-
 Head = Dict[str, Any]
 Heard = Callable[[Head, bytes], object]
 """Receives a frame."""

@@ -7,8 +7,6 @@ import time
 
 from ._frames import Channel
 
-__all__ = ["Heart"]
-
 _EVERY_S = 0.5
 _STUCK_S = 60.0
 """Every request to a master has a deadline; work that takes longer than this will never finish."""

@@ -6,8 +6,6 @@ import http.client
 import xmlrpc.client
 from typing import Any
 
-__all__ = ["Refused", "Unreachable", "ask", "is_reachable"]
-
 _UNREACHABLE = (OSError, http.client.HTTPException, xmlrpc.client.ProtocolError)
 
 

@@ -13,8 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Callable
 from urllib.parse import urlparse
 
-__all__ = ["Peers"]
-
 _CONNECT_S = 1.0
 _AGAIN_S = 2.0
 """Pause between attempts at an address without an answer."""

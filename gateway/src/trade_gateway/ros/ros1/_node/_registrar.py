@@ -19,8 +19,6 @@ from rospy.impl.tcpros_base import get_tcpros_server_address
 from ._master import Refused, Unreachable, ask, is_reachable
 from ._peers import Peers
 
-__all__ = ["Registrar"]
-
 _EVERY_S = 0.5
 _CONNECT_AGAIN_S = 3.0
 _REGISTER = {"topic": "registerPublisher", "heard": "registerSubscriber", "service": "registerService"}
