@@ -47,7 +47,8 @@ class BusRig:
 
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
-        options.setdefault("ports", self.ports)
+        if "ports" not in options:
+            options["ports"] = self.ports
         options.setdefault("register", lambda _, groups: self.announced.append(groups))
         options.setdefault("deregister", lambda _: None)
         robot = attach(self.robot, **options)

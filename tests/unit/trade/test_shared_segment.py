@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -114,6 +115,11 @@ def put(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def descriptors_at_rest() -> int:
+    """The least of several looks: containers look at their files and addresses now and then."""
+    return min((descriptors(), time.sleep(0.01))[0] for _ in range(10))
 
 
 def memory(size: int, *seals: int, kind: Callable[[], int] | None = None) -> int:
@@ -350,11 +356,11 @@ def test_what_is_no_segment_ends_its_connection_only(
     passed: list[Callable[[], int]],
     announced: int,
 ) -> None:
-    before, open_before = dropped(there), descriptors()
+    before, open_before = dropped(there), descriptors_at_rest()
     connection = offering(there, here, [make() for make in passed], announced)
     assert ends(connection, call_of(here), key_of(echo, here.address.identity))
     wait_until(lambda: dropped(there) == before + 1, "it is counted")
-    wait_until(lambda: descriptors() == open_before, "its descriptors are closed")
+    wait_until(lambda: descriptors() <= open_before, "its descriptors are closed")
     assert studio.ran == []
     assert len(echo(bytes(_BIG))) == _BIG
 

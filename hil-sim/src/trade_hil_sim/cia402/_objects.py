@@ -122,6 +122,7 @@ DRIVE: Final = (
     Object(0x607A, 0, "target_position", "i32", "rw", mapped="rt"),
     Object(0x607C, 0, "home_offset", "i32", "rw"),
     *_array(0x607D, "position_limit", ["position_limit_min", "position_limit_max"], "i32", [-I32, I32 - 1]),
+    Object(0x607E, 0, "polarity", "u8", "rw"),
     Object(0x607F, 0, "max_profile_velocity", "u32", "rw", 2_000_000, mapped="rt"),
     Object(0x6081, 0, "profile_velocity", "u32", "rw", 20_000, mapped="rt"),
     Object(0x6083, 0, "profile_acceleration", "u32", "rw", 200_000, mapped="rt", low=1),
