@@ -10,6 +10,7 @@ import pytest
 from tests.unit.trade.joint_with_policy import Neck
 from tests.unit.trade.test_audit import rows
 from trade import Container, Settings, current_call, service, where
+from trade._protocol.keys import ESTOP_PROVIDER
 from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, Stopped
 from trade.testing import InFlightMessage, MemorySystem, memory_system
@@ -177,3 +178,40 @@ def test_S07_a_relay_checks_who_asks_and_its_record_names_them(system: MemorySys
     asked = [(row.kind, row.what, row.about, row.who, row.outcome) for row in found if row.what == "trade.stop_group"]
     assert ("stop", "trade.stop_group", "rosie", "anna", "ok") in asked
     assert ("refused", "trade.stop_group", "", "mallory", "AccessDenied") in asked
+
+
+def estop_calls(system: MemorySystem) -> list[str]:
+    """The keys of calls of the e-stop service, from now on."""
+    keys: list[str] = []
+
+    def seen(message: InFlightMessage) -> bool:
+        if "stop/" in message.key and message.key.endswith(f"/{ESTOP_PROVIDER}"):
+            keys.append(message.key)
+        return False
+
+    system.lose(seen)
+    return keys
+
+
+def test_S09_an_e_stop_is_confirmed_through_a_container_that_sees_the_robot(system: MemorySystem) -> None:
+    joint = Joint()
+    robot, base, here = offer(system, "rosie", "rosie.neck", joint), system.container("base"), system.container("here")
+    apart(system, here, robot)
+    began, calls = time.monotonic(), estop_calls(system)
+    report = here.estop("smoke")
+    assert report.complete
+    assert len(calls) == 1
+    assert robot.address.who in report.confirmed
+    assert time.monotonic() - began < 2.0
+    assert len(joint.stops) == 1
+    with pytest.raises(Stopped):
+        base.find(where(name="go"))()
+
+
+def test_S09_an_e_stop_that_all_confirm_goes_through_no_other_container(system: MemorySystem) -> None:
+    """The control: others do not repeat what the links have done."""
+    offer(system, "rosie", "rosie.neck", Joint())
+    system.container("base")
+    here, calls = system.container("here"), estop_calls(system)
+    assert here.estop("smoke").complete
+    assert calls == []

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Final, Protocol
 
 from trade._audit.events import open_audit
@@ -49,7 +50,7 @@ from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
 from trade._settings import Settings
-from trade._stop_line import GroupStop, StopLines, StopLineService, StopReport, session_for, together
+from trade._stop_line import GroupStop, RelayedEstop, StopLines, StopLineService, StopReport, session_for, together
 from trade._streams import source as _streams
 from trade._streams.source import Streams
 from trade._streams.subscriptions import Subscriptions
@@ -317,7 +318,7 @@ class Components:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
             self.providers.add(estops, (DOMAIN,), name=ESTOP_PROVIDER)
-            self.estop.begin(estops, self.stop_lines.estop)
+            self.estop.begin(estops, self.stop_lines.estop, partial(RelayedEstop, self._home, self.registry))
             self._leaving.callback(self.announcer.appear().close)
             self.watch = RegistryListener(
                 self.transport,

@@ -34,15 +34,20 @@ _ENTRY_LAG_S: Final = 1.0
 _LONGEST_REASON: Final = 500
 
 
-class LineReports(Protocol):
-    """An e-stop under way on the stop lines."""
+_SOON_ROUNDS: Final = 5
+"""After so many rounds of 0.1 s without a report of all, others are asked to give the e-stop, too."""
+
+
+class OtherReports(Protocol):
+    """An e-stop under way on the stop lines, or through other containers."""
 
     def report(self) -> EstopReport: ...
 
     def wait(self) -> EstopReport: ...
 
 
-Beside = Callable[[str, str, float], LineReports]
+Beside = Callable[[str, str, float], OtherReports]
+"""Begins an e-stop on another way, by its id, reason and limit."""
 
 
 class EstopController:
@@ -76,6 +81,7 @@ class EstopController:
         )
         self._provider: object = None
         self._beside: Beside | None = None
+        self._through: Beside | None = None
 
     def open_here(self) -> tuple[Estop, ...]:
         """The e-stops that are open in this container."""
@@ -85,15 +91,17 @@ class EstopController:
         """Whether that e-stop was opened or cleared here."""
         return self._estops.knows(estop_id)
 
-    def begin(self, provider: object, lines: Beside | None = None) -> None:
+    def begin(self, provider: object, lines: Beside | None = None, through: Beside | None = None) -> None:
         """Begins to take orders.
 
         Args:
             provider: the registered provider of e-stops; its entry lists the open ones, as its ``open_estops``.
-            lines: begins an e-stop on the stop lines of others, by its id, reason and limit.
+            lines: begins an e-stop on the stop lines of others.
+            through: begins it in other containers, which may see more.
         """
         self._provider = provider
         self._beside = lines
+        self._through = through
         self._registry.changes.subscribe(self._heard)
         self._line.listen(self._estops.take)
 
@@ -117,27 +125,35 @@ class EstopController:
                 new id.
         """
         check_limit(limit_s)
-        if estop_id and not is_chunk(estop_id):
-            raise ConfigurationError(where="estop", problem=f"{estop_id!r} is not an id; use letters, digits, . _ -")
+        check_id(estop_id or "new")
         estop = Estop(estop_id or new_estop_id(), str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop.id, estop)
 
-        beside: LineReports | None = None
+        until = time.monotonic() + limit_s
+        others: list[OtherReports] = []
         rounds = 0
 
+        def begin(way: Beside | None) -> None:
+            if way is not None:
+                others.append(way(estop.id, estop.reason, max(0.1, until - time.monotonic())))
+
         def over() -> bool:
-            nonlocal beside, rounds
+            nonlocal rounds
             rounds += 1
-            if rounds > 1 and beside is None and self._beside is not None:  # the links alone did not do it at once
-                beside = self._beside(estop.id, estop.reason, limit_s)
-            return self._estops.is_cleared(estop.id) or (beside is not None and self._is_done(beside.report()))
+            if rounds == 2:  # the links alone did not do it at once
+                begin(self._beside)
+            if rounds == _SOON_ROUNDS:
+                begin(self._through)
+            return self._estops.is_cleared(estop.id) or self._is_done(
+                all_of(estop.id, [one.report() for one in others])
+            )
 
         report = self._line.ask([order], self._awaited, limit_s, over)
-        if self._beside is not None:
-            beside = beside or self._beside(estop.id, estop.reason, limit_s)  # for containers without a link
-            done = report.complete and any(who != self._own.who for who in report.confirmed)
-            report = all_of(estop.id, [report, beside.report() if done else beside.wait()])
-        return self._with_versions(report)
+        if not others:
+            begin(self._beside)  # for containers without a link
+        done = report.complete and any(who != self._own.who for who in report.confirmed)
+        found = [one.report() if done else one.wait() for one in others]
+        return self._with_versions(all_of(estop.id, [report, *found]))
 
     def _is_done(self, report: EstopReport) -> bool:
         """Whether the report covers all containers that are known here."""
@@ -145,7 +161,7 @@ class EstopController:
         return report.complete and known <= {*report.confirmed, *report.failed}
 
     def relay(self, estop_id: str, reason: str, limit_s: float, *, beyond: bool) -> EstopReport:
-        """Carries out an e-stop from the stop line, in the whole system or in this container only."""
+        """Carries out an e-stop of another container, in the whole system or in this container only."""
         mine = Estop(estop_id, str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop_id, mine)
         expected = self._awaited if beyond else lambda: {self._own}
@@ -309,6 +325,12 @@ class EstopController:
         """Takes no more orders. Idempotent."""
         self._line.close()
         self._estops.close()
+
+
+def check_id(estop_id: str) -> None:
+    """Raises ConfigurationError if it is not a valid id of an e-stop."""
+    if not is_chunk(estop_id):
+        raise ConfigurationError(where="estop", problem=f"{estop_id!r} is not an id; use letters, digits, . _ -")
 
 
 def new_estop_id() -> str:

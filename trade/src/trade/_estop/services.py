@@ -6,7 +6,7 @@ twelfth of that of all other functions of the middleware.
 
 from trade._context.call_context import current_call
 from trade._estop.broadcast import EstopReport
-from trade._estop.controller import EstopController
+from trade._estop.controller import LIMIT_S, EstopController, check_id, check_limit
 from trade._protocol.messages import Estop
 from trade._services.decorator import service
 
@@ -23,11 +23,19 @@ class EstopServices:
         return self._estopping.open_here()
 
     @service(effect="stop")
-    def estop(self, reason: str = "") -> EstopReport:
-        """Stops everything in the whole system until the e-stop is cleared; reports which containers did, or failed."""
+    def estop(self, reason: str = "", estop_id: str = "", limit_s: float = LIMIT_S) -> EstopReport:
+        """Stops everything in the whole system until the e-stop is cleared; reports which containers did, or failed.
+
+        With the id of an e-stop that the caller has given, it gives the same one to all containers that it sees.
+        """
         call = current_call()
         asked = f"asked by {call.caller}" if call is not None else ""
-        return self._estopping.estop(f"{reason} ({asked})" if reason else asked)
+        why = f"{reason} ({asked})" if reason else asked
+        check_limit(limit_s)
+        if estop_id:
+            check_id(estop_id)
+            return self._estopping.relay(estop_id, why, limit_s, beyond=True)
+        return self._estopping.estop(why, limit_s=limit_s)
 
     @service(effect="read")
     def estops(self) -> list[Estop]:

@@ -7,12 +7,14 @@ docs/wire-protocol.md, "The stop line", describes its messages.
 from trade._stop_line.client import LineCall, StopLines
 from trade._stop_line.elsewhere import elsewhere
 from trade._stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
+from trade._stop_line.relayed_estop import RelayedEstop
 from trade._stop_line.service import StopLineService
 
 __all__ = [
     "GroupStop",
     "GroupStopServices",
     "LineCall",
+    "RelayedEstop",
     "StopLineService",
     "StopLines",
     "StopReport",
