@@ -60,8 +60,9 @@ def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: 
     with caplog.at_level(logging.WARNING, "trade"):
         assert outsider.reach._thread is not None
         outsider.reach._thread.join(20)  # it has nothing to do once this is settled
-    assert f"no link to {endpoint}: something listens there but refuses the link" in caplog.text
-    with pytest.raises(CannotConnect, match="Do both have the same user and password"):
+    assert f"no link was made in time (tried {endpoint.partition('/')[2]} (accepts connections" in caplog.text
+    refused = r"\(accepts connections, but not this container\)\); a link takes the same user and password at both ends"
+    with pytest.raises(CannotConnect, match=refused):
         outsider.system.connect(endpoint)
 
 

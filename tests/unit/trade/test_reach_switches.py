@@ -109,7 +109,7 @@ def test_an_endpoint_may_be_a_name(apart: tuple[Container, Container]) -> None:
 
 def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -> None:
     empty = free_endpoint()
-    with pytest.raises(CannotConnect, match=r"nothing accepts connections there\. Is it up") as raised:
+    with pytest.raises(CannotConnect, match=r"nothing accepts connections there \(tried .*\(refused\)\)$") as raised:
         here.system.connect(empty)
     assert raised.value.endpoint == empty
     assert isinstance(raised.value, ConnectionError)
@@ -118,14 +118,14 @@ def test_connecting_to_an_endpoint_without_a_listener_says_so(here: Container) -
 def test_connecting_to_something_else_says_that_it_does_not_let_us_in(here: Container) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as other,
-        pytest.raises(CannotConnect, match="something listens there but refuses the link"),
+        pytest.raises(CannotConnect, match=r"no link was made .*accepts connections, but not this container"),
     ):
         here.system.connect(f"tcp/127.0.0.1:{other.getsockname()[1]}")
 
 
 def test_connecting_to_a_name_that_means_nothing_says_so(system: str, start_container: Any) -> None:
     container = start_container("far", system=system, credentials=("me", "secret"), insecure_lan=True)
-    with pytest.raises(CannotConnect, match="Is it up, and is the address right"):
+    with pytest.raises(CannotConnect, match="the name has no address now"):
         container.system.connect("tcp/no-such-host.invalid:7450")
 
 

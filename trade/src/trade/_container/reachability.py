@@ -80,6 +80,7 @@ def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Rea
 
 def _apart(reach: Dialer, own: Address, system: str, found: Reachability) -> dict[str, str]:
     """The endpoints without a link, and why; a link from there to here counts, too."""
+    reach.try_all(list(found.apart))
     reasons = {endpoint: reach.why_apart(endpoint, certain=not found.others) for endpoint in found.apart}
     apart = {endpoint: why for endpoint, why in reasons.items() if why}
     if not found.others:

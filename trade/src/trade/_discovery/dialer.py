@@ -95,7 +95,7 @@ class Dialer:
             raise CannotConnect(endpoint=endpoint, reason=_ATTACHED.format(hub=self._links.hub))
         there = self._dial(endpoint)
         if not there:
-            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links))
+            raise CannotConnect(endpoint=endpoint, reason=self._why(endpoint))
         with self._lock:
             self._check_open()
             self._kept[endpoint] = there
@@ -136,8 +136,13 @@ class Dialer:
         """The configured endpoints that no link leads to."""
         return [endpoint for endpoint in self.configured if not self._links.linked_at(endpoint)]
 
+    def try_all(self, endpoints: Sequence[str]) -> None:
+        """Tries to reach endpoints, side by side, so that `why_apart` knows what came of each."""
+        for _ in self._attempts.accepting([endpoint for endpoint in endpoints if endpoint != self._links.hub]):
+            pass
+
     def why_apart(self, endpoint: str, *, certain: bool) -> str:
-        """Why no link leads to an endpoint.
+        """Why no link leads to an endpoint, by what `try_all` found.
 
         Args:
             endpoint: a configured endpoint.
@@ -147,10 +152,25 @@ class Dialer:
         Returns:
             The reason; empty if a link exists.
         """
-        why = _why(endpoint, self._links)
-        if certain or self._links.hub or not accepts(endpoint):
-            return why
-        return "" if self._dial(endpoint) else why
+        if certain or self._links.hub or not any(attempt.accepted for attempt in self._tried(endpoint)):
+            return self._why(endpoint)
+        return "" if self._dial(endpoint) else self._why(endpoint)
+
+    def _tried(self, endpoint: str) -> list[Attempt]:
+        addresses = {endpoint, *Endpoint.read(endpoint).resolved()}
+        return [attempt for attempt in self._attempts.listed() if attempt.address in addresses]
+
+    def _why(self, endpoint: str) -> str:
+        """Only what is known: each address, what came of it, and what a link takes."""
+        if self._links.hub:
+            return _NO_LINK if accepts(endpoint) else WITHOUT_HUB
+        tried = self._tried(endpoint)
+        said = f" (tried {', '.join(map(str, tried))})" if tried else ""
+        if tried and not any(attempt.accepted for attempt in tried):
+            return f"nothing accepts connections there{said}"
+        known = [f"{_NO_LINK}{said}", _NEEDED[self._links.certified]]
+        known += [_BRIDGES] if self._links.bridges else []
+        return "; ".join(known)
 
     # --- the thread
 
@@ -203,8 +223,9 @@ class Dialer:
             return
         silent, self._unsure = self._unsure, []
         for endpoint in silent:
-            if accepts(endpoint):
-                _logger.warning("%s", CannotConnect(endpoint=endpoint, reason=_REFUSED[self._links.certified]))
+            self.try_all([endpoint])
+            if any(attempt.accepted for attempt in self._tried(endpoint)):
+                _logger.warning("%s", CannotConnect(endpoint=endpoint, reason=self._why(endpoint)))
 
     def _ended(self) -> bool:
         return self._closed
@@ -229,25 +250,17 @@ class Dialer:
             thread.join(5)
 
 
-_REFUSED: Final = {
-    False: "something listens there but refuses the link. Do both have the same user and password?",
+_NO_LINK: Final = "no link was made in time"
+_NEEDED: Final = {
+    False: "a link takes the same user and password at both ends (TRADE_CREDENTIALS)",
     True: (
-        "something listens there but there is no link. Are both certificates in date and of one authority, and is the "
-        "peer's valid for the addresses it listens on?"
+        "a link takes certificates in date of one authority at both ends, and the peer's has to name the address that "
+        "it listens on"
     ),
 }
-"""By whether this container has a certificate."""
+"""By whether this container has a certificate. The other end gives no reason when it refuses."""
 _ATTACHED: Final = (
     "this container is attached to the hub of its host at {hub}, which links it to others: let the hub link to them "
     "(TRADE_CONNECT where it runs), or set TRADE_HUB=off for this container"
 )
-_BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
-
-
-def _why(endpoint: str, links: Links) -> str:
-    if not accepts(endpoint):
-        if links.hub:
-            return WITHOUT_HUB
-        return "nothing accepts connections there. Is it up, and is the address right?"
-    refused = _REFUSED[links.certified]
-    return refused + _BRIDGES if links.bridges else refused
+_BRIDGES: Final = "bridges link to each other by connect in their settings only, when they start"

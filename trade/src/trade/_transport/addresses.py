@@ -19,6 +19,8 @@ _LIMIT_S: Final = 1.5
 """A SYN that was lost is repeated after 1 s."""
 _MOST_KEPT: Final = 256
 _TIMED_OUT: Final = "timed out"
+ACCEPTS: Final = "accepts connections"
+"""What a problem of a link begins with that was not made although a connection was."""
 _UNRESOLVED: Final = "the name has no address now"
 
 
@@ -32,9 +34,14 @@ class Attempt(NamedTuple):
     ago_s: float
     """How long ago that was."""
 
+    @property
+    def accepted(self) -> bool:
+        """Whether it accepted a connection, even if no link was made."""
+        return not self.problem or self.problem.startswith(ACCEPTS)
+
     def __str__(self) -> str:
         """``10.9.0.5:7450 (refused)``."""
-        return f"{self.address.partition('/')[2] or self.address} ({self.problem or 'accepts'})"
+        return f"{self.address.partition('/')[2] or self.address} ({self.problem or ACCEPTS})"
 
 
 class Knock(Protocol):

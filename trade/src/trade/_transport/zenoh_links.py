@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 import zenoh
 
 from trade._security.certificates import authority
+from trade._transport.addresses import ACCEPTS
 from trade._transport.credentials import dictionary_file
 from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface
 from trade._transport.interfaces import Own, own_addresses
@@ -242,7 +243,7 @@ class Links:
         """
         there = self._ask_who(endpoint, wait_s, ended)
         if not there.session:
-            return Joined("", "accepts connections, but not this container")
+            return Joined("", f"{ACCEPTS}, but not this container")
         if there.session == self._own:
             return Joined("", "this container itself")
         if not there.session.startswith(session):
@@ -253,7 +254,7 @@ class Links:
         for way in ways:
             if self.linked(there.session) or way(there, wait_s, ended):
                 return Joined(there.session)
-        return Joined("", "accepts this container, but no link was made in time")
+        return Joined("", f"{ACCEPTS} and this container, but no link was made in time")
 
     def _moved(self) -> bool:
         """Whether others would dial addresses that this host had when it started, and that are not all of today's."""
