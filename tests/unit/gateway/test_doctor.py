@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 
 from tests.support.simulated_robots import HAND, HEAD, TAIL
 from tests.unit.drivers.test_second_reader import HOLDS, other_program
-from trade import Container
+from trade import Container, where
 from trade._transport.endpoints import free_endpoint
+from trade._transport.interfaces import Own, own_addresses
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
 from trade_drivers.plugins._ports import SeenPorts
@@ -319,6 +320,24 @@ def test_the_exit_code_shows_errors(system: str, robot_file: Path) -> None:
     assert "0 errors" in well.output
 
 
+@pytest.mark.realtime
+def test_a_container_whose_host_has_other_addresses_than_at_its_start_is_named(
+    start_container: Callable[..., Container], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lan = {"system": "lab", "credentials": ("lab", "secret"), "insecure_lan": True}
+    endpoint = free_endpoint()
+    robot = start_container("rosie", listen=[endpoint.replace("127.0.0.1", "0.0.0.0")], **lan)
+    member = start_container("member", connect=[endpoint], **lan)
+    assert member.find(where(name="network", container="rosie"), wait_s=20)().listens == list(robot.settings.listen)
+    assert not [found for found in host.in_sight(member, "lab") if found.level != "ok"]
+    before = own_addresses()
+    monkeypatch.setattr("trade._transport.zenoh_links.own_addresses", lambda: [*before, Own("10.9.0.9", 24, 2)])
+    [found] = [found for found in host.in_sight(member, "lab") if found.level != "ok"]
+    assert (found.level, found.about) == ("warning", "rosie")
+    assert "other addresses than when it started" in found.text
+    assert "by name" in found.fix
+
+
 @pytest.mark.real_clock
 def test_a_hub_that_has_ended_is_reported(system: str, start_container: Callable[..., Container]) -> None:
     member = start_container("member")
@@ -350,12 +369,12 @@ def test_an_endpoint_without_an_answer_is_an_error(system: str, monkeypatch: pyt
 def test_a_client_with_bad_certificates_is_not_advised_to_connect_without(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, where, fix in (
+    for name, value, fix in (
         ("TRADE_TLS", str(tmp_path), "the message says what helps"),
         ("TRADE_CONNECT", "nonsense", "correct that variable, or leave it out"),
     ):
         with monkeypatch.context() as changed:
-            changed.setenv(name, where)
+            changed.setenv(name, value)
             found = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
         [error] = [one for one in found if one["about"] == "settings"]
         assert error["fix"] == fix, error

@@ -18,7 +18,6 @@ from trade._transport.endpoints import free_endpoint, loopback_interface
 from trade._transport.interfaces import Own, is_near, own_addresses
 from trade._transport.scouting import Beacon, hello, read_hello, scout
 from trade._transport.zenoh import ZenohTransport, configuration
-from trade._transport.zenoh_links import _tell_change
 
 ID = "de88bef20f15d9afd64d6f625e211ef4"
 CAPTURED = bytes.fromhex(
@@ -35,7 +34,7 @@ def leaving() -> Iterator[ExitStack]:
 
 def beacon(leaving: ExitStack, *locators: str) -> Beacon:
     told = list(locators)
-    made = Beacon(ID, lambda *_: told, here_only=True, changed=lambda *_: None)
+    made = Beacon(ID, lambda *_: told, here_only=True)
     return leaving.enter_context(closing(made))
 
 
@@ -97,20 +96,35 @@ def test_the_addresses_are_those_of_the_kernel() -> None:
     assert Own("10.9.0.5", 24, 2).dialled
 
 
-def test_a_change_of_addresses_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    before, now = [HERE, Own("10.9.0.5", 24, 2)], [HERE, Own("10.9.0.9", 24, 2)]
-    _tell_change(before, now)
-    assert "the addresses of this host changed: new 10.9.0.9; gone 10.9.0.5" in caplog.text
-    caplog.clear()
-    _tell_change(now, [HERE])
-    assert "changed: gone 10.9.0.9." in caplog.text
-
-
-def opened(leaving: ExitStack) -> ZenohTransport:
+def opened(leaving: ExitStack, listen: str = "") -> ZenohTransport:
     made = ZenohTransport(
-        configuration(namespace="scouting", listen=[free_endpoint()], connect=[], credentials=("lab", "secret"))
+        configuration(
+            namespace="scouting", listen=[listen or free_endpoint()], connect=[], credentials=("lab", "secret")
+        )
     )
     return leaving.enter_context(closing(made))
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_a_change_of_the_addresses_that_others_dial_is_logged(
+    leaving: ExitStack, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, everywhere: bool
+) -> None:
+    known = [HERE, Own("10.9.0.5", 24, 2)]
+    monkeypatch.setattr("trade._transport.zenoh_links.own_addresses", lambda: list(known))
+    own = free_endpoint()
+    links = opened(leaving, own.replace("127.0.0.1", "0.0.0.0") if everywhere else own).links
+    links.watch_addresses()
+    assert not links.moved()
+    known[1] = Own("10.9.0.9", 24, 2)
+    links.watch_addresses()
+    assert links.moved() == everywhere
+    assert ("the addresses of this host changed: new 10.9.0.9; gone 10.9.0.5." in caplog.text) == everywhere
+    caplog.clear()
+    links.watch_addresses()
+    assert caplog.text == ""
+    del known[1]
+    links.watch_addresses()
+    assert ("changed: gone 10.9.0.9." in caplog.text) == everywhere
 
 
 def told(transport: ZenohTransport, other: ZenohTransport) -> tuple[str, list[str]]:

@@ -397,6 +397,7 @@ class Components:
         """Makes the files again by which others on this host reach this container, if they have vanished."""
         try:
             if isinstance(self.transport, ZenohTransport):
+                self.transport.links.watch_addresses()
                 self.transport.keep_files()
             if self.stop_line is not None:
                 self.stop_line.keep_place()

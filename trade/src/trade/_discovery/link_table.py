@@ -57,6 +57,8 @@ class NetworkInfo(Struct, frozen=True, kw_only=True):
     """The end of its certificate, in seconds since the epoch; None: it has none."""
     links: list[LinkInfo]
     """Its direct links."""
+    moved: bool = False
+    """Whether it listens on all interfaces, and their addresses are no longer those of its start."""
 
 
 class _Seen(Struct):
@@ -153,4 +155,5 @@ def network(
         broadcast=dialer is not None and dialer.broadcasts,
         certificate_ends=None if certificate is None else certificate.until.timestamp(),
         links=table.infos(),
+        moved=links is not None and links.moved(),
     )

@@ -113,7 +113,6 @@ class Beacon:
         session: the id that it announces.
         locators: the endpoints to announce; takes the addresses of this host now.
         here_only: answer on the loopback interface only (S21).
-        changed: called with the addresses before and now, when they changed.
     """
 
     def __init__(
@@ -122,12 +121,10 @@ class Beacon:
         locators: Callable[[list[Own], str], list[str]],
         *,
         here_only: bool,
-        changed: Callable[[list[Own], list[Own]], None],
     ) -> None:
         self._session = session
         self._locators = locators
         self._here_only = here_only
-        self._changed = changed
         self._joined: set[tuple[str, int]] = set()
         self._known = own_addresses()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -160,9 +157,7 @@ class Beacon:
             self._socket.sendto(hello(self._session, self._locators(own_addresses(), source[0])), source)
 
     def _look(self) -> None:
-        before, self._known = self._known, own_addresses()
-        if {own[:2] for own in before} != {own[:2] for own in self._known}:
-            self._changed(before, self._known)
+        self._known = own_addresses()
         self._join()
 
     def _join(self) -> None:

@@ -132,6 +132,7 @@ class Links:
         """The endpoints that the main session dials."""
         self._known_at_start = _dialled()
         """The addresses at the start: all that the main session ever announces by gossip."""
+        self._known = self._known_at_start
         self._tag = _tag(settings)
         self._reached_at = self.listen or [Endpoint.read(self.hub)]
         self._shown = next((own for own in self._reached_at if not own.loopback), self._reached_at[0])
@@ -207,7 +208,7 @@ class Links:
     def beacon(self) -> Beacon:
         """Answers scouts until it is closed, with the addresses at which this host can be dialled at that moment."""
         self._check_here()
-        return Beacon(self._beacon_id, self._locators, here_only=self._here_only, changed=_tell_change)
+        return Beacon(self._beacon_id, self._locators, here_only=self._here_only)
 
     def _locators(self, known: list[Own], asker: str) -> list[str]:
         """Where others can dial the main session now, best first for who asks."""
@@ -249,16 +250,31 @@ class Links:
         if not there.session.startswith(session):
             return Joined("", f"another container answers now ({there.session[:_NAME]})")
         ways = [self._introduced, self._prompted]
-        if self._prompt is not None and not self.bridges and (self._moved() or _dials_first(self._own, there)):
+        if self._prompt is not None and not self.bridges and (self.moved() or _dials_first(self._own, there)):
             ways.reverse()
         for way in ways:
             if self.linked(there.session) or way(there, wait_s, ended):
                 return Joined(there.session)
         return Joined("", f"{ACCEPTS} and this container, but no link was made in time")
 
-    def _moved(self) -> bool:
+    def moved(self) -> bool:
         """Whether others would dial addresses that this host had when it started, and that are not all of today's."""
-        return any(own.everywhere for own in self.listen) and _dialled() != self._known_at_start
+        return self._everywhere and _dialled() != self._known_at_start
+
+    @property
+    def _everywhere(self) -> bool:
+        return any(own.everywhere for own in self.listen)
+
+    def watch_addresses(self) -> None:
+        """Logs a change of the addresses at which others dial the main session; called every two seconds."""
+        if not self._everywhere:
+            return
+        before, self._known = self._known, _dialled()
+        changes = (("new", self._known - before), ("gone", before - self._known))
+        if said := "; ".join(f"{what} {', '.join(sorted(ips))}" for what, ips in changes if ips):
+            _logger.warning(
+                "the addresses of this host changed: %s. Those that dial a name, and discovery, find it there", said
+            )
 
     def _ask_who(self, endpoint: str, wait_s: float, ended: Callable[[], bool]) -> _There:
         asking = self._beside(endpoint)
@@ -364,15 +380,6 @@ def _close(extra: zenoh.Session) -> None:
     closing = threading.Thread(target=close, name="trade-link-end", daemon=True)
     closing.start()
     closing.join(_MOMENT_S)
-
-
-def _tell_change(before: list[Own], now: list[Own]) -> None:
-    came = sorted({own.ip for own in now} - {own.ip for own in before})
-    went = sorted({own.ip for own in before} - {own.ip for own in now})
-    _logger.warning(
-        "the addresses of this host changed: %s. Other containers find this one at its addresses of now",
-        "; ".join(f"{what} {', '.join(ips)}" for what, ips in (("new", came), ("gone", went)) if ips),
-    )
 
 
 def _found(beacon: str, locators: Iterable[str]) -> Found:

@@ -201,6 +201,7 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
     for sentence in member.beyond(wait_s=_PATIENCE_S if member.settings.connect else 0):
         fix = "make an address of it reachable from here; until then, only stops of its groups get there"
         yield Finding(level="warning", about=about, text=sentence, fix=fix)
+    yield from _moved(member)
     if others:
         yield Finding(level="ok", about=about, text=f"visible: {', '.join(others)}")
         return
@@ -208,6 +209,18 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
         return
     fix = "`trade up ROBOT.toml` starts one; another host needs the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
     yield Finding(level="ok", about=about, text="no container is visible", fix=fix)
+
+
+def _moved(member: Container) -> Iterator[Finding]:
+    """Checks whether containers are at other addresses than at their start."""
+    asked = [handle for handle in member.everywhere("network").handles if not handle.local]
+    for outcome in member.call_all(asked):
+        if outcome.ok and outcome.result.moved:
+            text = (
+                f"its host has other addresses than when it started; it listens on {', '.join(outcome.result.listens)}"
+            )
+            fix = "dial its host by name in TRADE_CONNECT, or turn discovery on: both follow its addresses"
+            yield Finding(level="warning", about=outcome.handle.container, text=text, fix=fix)
 
 
 def _hub(file: HubFile) -> Iterator[Finding]:
