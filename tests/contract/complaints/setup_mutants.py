@@ -1,9 +1,11 @@
 """What naive code makes of setting up a robot and of its computer. Each changes one function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 
+from trade._transport.addresses import Attempts
+from trade._transport.endpoints import Endpoint
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep
 from trade_gateway.supervisor._restart_policy import Life, Transition
 
@@ -29,3 +31,13 @@ def a_start_without_its_device_is_a_crash(patch: pytest.MonkeyPatch) -> None:
 
 def no_rule_of_udev_is_read(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("trade_gateway.cli.hardware._doctor_brltty._lines", lambda _: [])
+
+
+def addresses_are_tried_one_after_the_other(patch: pytest.MonkeyPatch) -> None:
+    def accepting(self: Attempts, endpoints: Sequence[str]) -> Iterator[str]:
+        for text in endpoints:
+            for endpoint, problem in self._knock([Endpoint.read(text)], 4.0):
+                if not problem:
+                    yield str(endpoint)
+
+    patch.setattr(Attempts, "accepting", accepting)

@@ -1,8 +1,11 @@
 """Complaints of other projects about calibrating a robot, starting it with its computer, and its adapters."""
 
+import time
 from math import tau
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.contract.complaints import setup_mutants as mutants
 from tests.contract.complaints.bodies import outcome
@@ -10,6 +13,8 @@ from tests.contract.complaints.table import complaint
 from tests.unit.gateway.test_calibrate import Hand, angles, done_after
 from tests.unit.gateway.test_doctor_brltty import Host
 from tests.unit.gateway.test_life import launched, life
+from tests.unit.trade.test_addresses import GOOD, VPN, Wire, as_written
+from trade._transport.addresses import Attempts
 from trade_drivers import Joint
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, measured
 from trade_gateway.supervisor._restart_policy import State
@@ -60,3 +65,14 @@ def test_brltty_takes_the_adapter_away(folder: Path) -> None:
     assert any(str(host.rules) in text for text in said), "nothing says that brltty has the adapter"
     host.rules.write_text("")
     assert not host.check()
+
+
+@pytest.mark.virtual_time
+@complaint(("folder", mutants.addresses_are_tried_one_after_the_other, "the good address is tried after 24 s"))
+def test_dead_addresses_delay_a_connection(_: Path) -> None:
+    tried = Attempts(resolve=as_written, knocks=Wire(**{"10_9_0_5": (0.01, "")}).knock)
+    began = time.monotonic()
+    assert next(tried.accepting([*VPN, GOOD])) == GOOD
+    took_s = time.monotonic() - began
+    assert took_s < 5, f"the good address is tried after {took_s:.0f} s"
+    assert next(tried.accepting([GOOD])) == GOOD  # the control
