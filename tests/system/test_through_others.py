@@ -4,11 +4,14 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROSIES_HEAD, Bench, Program
 from tests.system.networks import PATIENCE_S, Member, Networks
 
 NEWCOMER = Path(__file__).with_name("newcomer.py")
@@ -90,3 +93,78 @@ def test_S07_dead_addresses_do_not_delay_a_stop(visitor: Visitor) -> None:
         assert "rosie.neck.halt" in report
         took.append(took_s)
     assert sorted(took)[TURNS // 2] < 1.0, took
+
+
+STOP = """
+import json, time
+from trade import Container, Settings
+settings = Settings.read(container="visitor")
+began = time.monotonic()
+with Container(settings) as container:
+    report = container.stop("rosie", "a test", limit_s=4)
+print(json.dumps([report.complete, time.monotonic() - began, list(report.stopped), report.failed]))
+"""
+MOVE = ["call", "--deadline", "60", "rosie.head.move_to"]
+HUB = "tcp/10.232.2.2:7450"
+
+
+class Hosts:
+    """Programs on three hosts: a robot, a hub that reaches it, and people who reach the hub only."""
+
+    def __init__(self, networks: Networks, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        networks.lay("inside", left="10.232.1.1", mid="10.232.1.2")
+        networks.lay("outside", mid="10.232.2.2", right="10.232.2.3")
+        self.networks, self._folder, self._patch = networks, folder, patch
+        for name, value in (("CREDENTIALS", "lab:secret"), ("INSECURE_LAN", "1")):
+            patch.setenv(f"TRADE_{name}", value)
+
+    def at(self, host: str, listen: str = "", connect: str = "") -> str:
+        """Programs that start from now on are on this host, and use these endpoints; returns its namespace."""
+        folder = self._folder / host
+        for name, value in (
+            ("RUNTIME_DIR", str(folder)),
+            ("STATE_DIR", str(folder / "state")),
+            ("LISTEN", listen),
+            ("CONNECT", connect),
+        ):
+            if value:
+                self._patch.setenv(f"TRADE_{name}", value)
+            else:
+                self._patch.delenv(f"TRADE_{name}", raising=False)
+        return self.networks.host(host)
+
+
+def test_S07_a_robot_that_moves_stops_in_a_second_whatever_addresses_are_dead(
+    networks: Networks,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    benches: Callable[..., Bench],
+    run: Callable[..., Program],
+) -> None:
+    """Ten dead addresses before that of a hub, ten times in a row; a call is answered within 5 s."""
+    hosts = Hosts(networks, tmp_path, monkeypatch)
+    bench = benches(ROSIES_HEAD, inside=hosts.at("left", listen=f"tcp/{ROBOT}"))
+    run("-m", "trade_gateway", "hub", inside=hosts.at("mid", listen=f"tcp/{BASE},{HUB}", connect=f"tcp/{ROBOT}")).line()
+    host = hosts.at("right", connect=",".join([*DEAD, HUB]))
+
+    def trade(*words: str) -> tuple[list[str], float]:
+        began, program = time.monotonic(), run("-m", "trade_gateway", *words, inside=host)
+        lines = program.lines()
+        assert program.wait() == 0, program.errors
+        return lines, time.monotonic() - began
+
+    took: list[float] = []
+    for turn in range(TURNS):
+        goal = 1.0 if turn % 2 == 0 else -1.0
+        moving = run("-m", "trade_gateway", *MOVE, f"[{goal}, 0.0]", "speed_rad_s=0.1", inside=host)
+        wait_until(bench.moving, "it moves")
+        since = time.monotonic()
+        complete, took_s, stopped, failed = json.loads(run("-c", STOP, inside=host).line())
+        assert (complete, failed) == (True, {}), (stopped, failed)
+        assert not bench.moving()
+        assert abs(bench.rests("neck.pan", since)[-1]) < 0.9
+        took.append(took_s)
+        assert moving.wait() != 0
+        assert trade("call", "rosie.head.state", "--json")[1] < 5.0
+        trade("resume", "rosie.neck")
+    assert max(took) < 1.0, took
