@@ -117,6 +117,22 @@ def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
             wait_until(lambda: len(driver.addresses()) == 2)
 
 
+def test_connections_from_before_the_guard_count(
+    door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
+) -> None:
+    port = door.getsockname()[1]
+    assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
+    accepted = [door.accept()[0] for _ in range(MOST_STRANGERS + 2)]  # so that none of them is an event
+    guard = PortGuard([port], lambda: 0)
+    try:
+        wait_until(lambda: f"at port {port} are not links" in caplog.text, "it is logged, with no further one")
+        assert not dial(port)
+    finally:
+        guard.close()
+        for one in accepted:
+            one.close()
+
+
 def test_connections_that_their_clients_have_ended_count_and_the_log_names_rate_and_source(
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:

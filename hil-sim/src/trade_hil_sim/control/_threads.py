@@ -11,7 +11,6 @@ from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.control._server import Answer, ControlServer, State
 from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.robot._robot import buses_of, read_robot
 
 
 class _DirectControl(SimControl):
@@ -46,6 +45,8 @@ class SimThreads:
     """
 
     def __init__(self, robot_file: Path | str, *, log: Path | None = None, paced: bool = False) -> None:
+        from trade_hil_sim.robot._robot import buses_of, read_robot  # noqa: PLC0415 - robot files are of trade-drivers
+
         self.running = True
         """Whether it is still running."""
         with ExitStack() as undo:

@@ -7,9 +7,9 @@ import sys
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-if sys.platform == "linux":
+try:
     import fcntl
-else:
+except ImportError:  # only some operating systems have it
     fcntl = None
 
 _DUMP_ADDRESSES: Final = 22

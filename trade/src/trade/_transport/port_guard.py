@@ -70,7 +70,7 @@ class PortGuard:
         with select.epoll() as arrivals:
             for sock in self._sockets:
                 arrivals.register(sock, select.EPOLLIN | select.EPOLLET)
-            look_until = 0.0
+            look_until = time.monotonic() + _QUIET_S  # some may have come before this thread began
             while not self._ending.is_set():
                 came, now = arrivals.poll(_LOOK_S), time.monotonic()
                 look_until = now + _QUIET_S if came or self._shut else look_until
