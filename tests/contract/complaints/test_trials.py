@@ -19,6 +19,8 @@ from trade.testing import MemorySystem, memory_system
 from trade_drivers import Motor
 from trade_gateway.cli._output import say_error
 from trade_gateway.cli.services._call import parse_arguments
+from trade_gateway.cli.services._services import describe
+from trade_gateway.clients._schemas import service_view
 from trade_gateway.recording._channels import LOCKS
 from trade_gateway.recording._reader import entries
 
@@ -154,3 +156,18 @@ def test_an_error_fills_the_screen(_: Path) -> None:
     assert lines[0] == "RuntimeError: the gripper is jammed"
     assert len(lines) <= 4, f"the error is {len(lines)} lines long"
     assert 'raise RuntimeError("the gripper is jammed")' in lines[2]
+
+
+class Cup:
+    @service(achieves=["empty(cup)"])
+    def drink(self) -> None: ...
+
+
+@complaint(("folder", mutants.a_description_has_what_a_caller_types, "its post-condition is left out"))
+def test_a_description_leaves_post_conditions_out(_: Path) -> None:
+    with memory_system() as system:
+        [drink] = system.container("me").register(Cup(), "cup")
+        shown = [describe(drink)["achieves"], service_view(drink, allowed=True).achieves]
+        found = [one.label for one in system.container("me").services(where(achieves="empty(cup)"))]
+    assert shown == [("empty(cup)",)] * 2, "its post-condition is left out"
+    assert found == ["cup.drink"]
