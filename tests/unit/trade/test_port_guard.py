@@ -117,6 +117,19 @@ def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
             wait_until(lambda: len(driver.addresses()) == 2)
 
 
+def test_another_network_of_the_port_stays_open(door: socket.socket, dial: Callable[[int], bool]) -> None:
+    port = door.getsockname()[1]
+    with socket.create_server(("127.0.0.2", port), backlog=64):
+        guard = PortGuard([port], lambda: 0)
+        try:
+            assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
+            wait_until(lambda: not dial(port), "the crowded one is shut")
+            with socket.create_connection(("127.0.0.2", port), timeout=5):
+                pass
+        finally:
+            guard.close()
+
+
 def test_connections_from_before_the_guard_count(
     door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Final
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from trade._audit.events import Audit
 from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
@@ -157,6 +157,11 @@ class EstopBroadcast:
         self._channel.close()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(2)
+
+
+def told_here(report: EstopReport) -> EstopReport:
+    """A report of another container, which may have another protocol version, with versions as this one names them."""
+    return structs.replace(report, versions={who: one for who, one in report.versions.items() if one != PROTOCOL})
 
 
 def all_of(estop_id: str, reports: Iterable[EstopReport]) -> EstopReport:

@@ -167,7 +167,10 @@ class EstopController:
         expected = self._awaited if beyond else lambda: {self._own}
         cleared = partial(self._estops.is_cleared, estop_id)
         report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
-        return self._with_versions(report)
+        named = {*report.confirmed, *report.missing, *report.failed}
+        known = {state.address.who: state.protocol for state in self._registry.containers() if state.protocol}
+        mine = {who: version for who, version in {**known, self._own.who: PROTOCOL}.items() if who in named}
+        return structs.replace(self._with_versions(report), versions=mine)  # who asks may have another version
 
     def subscribe(self, callback: Callable[[Estop], str]) -> None:
         """Calls this, on another thread, with every open and every future e-stop; it returns the problem, or empty.

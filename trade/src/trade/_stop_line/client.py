@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Generic, TypeVar
 
-from trade._estop.broadcast import EstopReport, all_of
+from trade._estop.broadcast import EstopReport, all_of, told_here
 from trade._protocol.messages import Malformed
 from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport, together
@@ -168,7 +168,11 @@ class StopLines:
             relays -= place.path is not None
             beyond = place.path is None or relays >= 0
             asked.append((place, self._request("estop", limit_s, reason, id=estop_id, pass_on=beyond)))
-        return LineCall(asked, limit_s, lambda answer: answer.estop, lambda reports: all_of(estop_id, reports))
+
+        def report_of(answer: StopAnswer) -> EstopReport | None:
+            return None if answer.estop is None else told_here(answer.estop)
+
+        return LineCall(asked, limit_s, report_of, lambda reports: all_of(estop_id, reports))
 
     def stop(self, group: str, reason: str, limit_s: float) -> LineCall[StopReport]:
         """Begins to stop a whole group; does not wait."""

@@ -8,6 +8,7 @@ Existing links are not affected, and the stop line is separate. Linux only.
 
 import contextlib
 import ctypes
+import ipaddress
 import logging
 import os
 import select
@@ -55,10 +56,11 @@ class PortGuard:
         self._links = links
         self._most = most
         self._sockets = _listening(self._ports) if sys.platform == "linux" and _OPEN_FILES.is_dir() else []
-        self._shut = False
+        self._shut = frozenset[int]()
+        """The sockets that accept no new connection now, by their places."""
         self._flood: _Flood | None = None
-        self._known = frozenset[str]()
-        """The far ends of the connections at the last look."""
+        self._known = frozenset[tuple[str, str]]()
+        """The connections at the last look: the far end and ours, as ``address:port`` in the kernel's words."""
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trade-port-guard", daemon=True)
         for sock in self._sockets if most < MOST_STRANGERS else ():
@@ -77,8 +79,7 @@ class PortGuard:
                 if now < look_until or self._flood is not None:
                     self._look(now)
                     self._ending.wait(_AGAIN_S)
-        if self._shut:
-            self._filter(shut=False)
+        self._filter(frozenset())
 
     def _look(self, now: float) -> None:
         try:
@@ -91,21 +92,24 @@ class PortGuard:
             self._flood = _Flood(now, ", ".join(map(str, sorted(self._ports))), there)
         elif self._flood is not None:
             self._flood.note(new)
-        if not self._shut and strangers > self._most:
-            self._filter(shut=True)
-        elif self._shut and strangers <= self._most // 2:
-            self._filter(shut=False)
-        if self._flood is not None and self._flood.said(now, strangers, self._most, shut=self._shut):
+        if strangers <= self._most // 2:
+            self._filter(frozenset())
+        elif strangers > self._most:
+            crowded = {place for place, sock in enumerate(self._sockets) if _count(sock, there) > self._most // 2}
+            self._filter(self._shut | crowded)
+        if self._flood is not None and self._flood.said(now, strangers, self._most, shut=bool(self._shut)):
             self._flood = None
 
-    def _filter(self, *, shut: bool) -> None:
+    def _filter(self, shut: frozenset[int]) -> None:
+        """Shuts these sockets, and opens the others: strangers at one network do not keep new links from another."""
         program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(_DROP_ALL))
-        for sock in self._sockets:
+        changed = self._shut ^ shut
+        for place in changed:
             with contextlib.suppress(OSError):  # the socket is closed
-                if shut:
-                    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
+                if place in shut:
+                    self._sockets[place].setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
                 else:
-                    sock.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+                    self._sockets[place].setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
         self._shut = shut
 
     def close(self) -> None:
@@ -138,32 +142,43 @@ def _is_guarded(sock: socket.socket, ports: frozenset[int]) -> bool:
     return bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)) and sock.getsockname()[1] in ports
 
 
-def _connections(ports: frozenset[int]) -> frozenset[str]:
-    """The far ends of the connections to these ports of this host, as ``address:port`` in the kernel's words."""
+def _count(sock: socket.socket, there: Iterable[tuple[str, str]]) -> int:
+    """The number of these connections that came in at a listening socket."""
+    try:
+        host, port = sock.getsockname()[:2]
+    except OSError:  # it is closed
+        return 0
+    ours = [end.partition(":") for _, end in there]
+    everywhere = not ipaddress.ip_address(host).packed.strip(b"\0")
+    return sum(int(end, 16) == port and (everywhere or _address(address) == host) for address, _, end in ours)
+
+
+def _connections(ports: frozenset[int]) -> frozenset[tuple[str, str]]:
+    """The connections to these ports of this host: the far end and ours, in the kernel's words."""
     ends = {f":{port:04X}" for port in ports}
-    found: set[str] = set()
+    found: set[tuple[str, str]] = set()
     for path in _CONNECTIONS:
         with contextlib.suppress(FileNotFoundError), path.open(encoding="ascii") as lines:
             for line in lines:
                 fields = line.split(maxsplit=4)
                 if fields[3] in _OPEN and fields[1][-5:] in ends:
-                    found.add(fields[2])
+                    found.add((fields[2], fields[1]))
     return frozenset(found)
 
 
 class _Flood:
     """What is said of a flood: once when connections are refused, and once when it is over."""
 
-    def __init__(self, now: float, ports: str, ends: Iterable[str]) -> None:
+    def __init__(self, now: float, ports: str, ends: Iterable[tuple[str, str]]) -> None:
         self._began = self._last = now
         self._ports = ports
         self._said = False
         self._came = Counter[str]()
         self.note(ends)
 
-    def note(self, ends: Iterable[str]) -> None:
-        """These far ends are new."""
-        self._came.update(end.partition(":")[0] for end in ends)
+    def note(self, ends: Iterable[tuple[str, str]]) -> None:
+        """These connections are new."""
+        self._came.update(end.partition(":")[0] for end, _ in ends)
 
     def said(self, now: float, strangers: int, most: int, *, shut: bool) -> bool:
         """Logs what is due; returns whether it is over."""
