@@ -159,7 +159,7 @@ class EstopBroadcast:
             self._thread.join(2)
 
 
-def told_here(report: EstopReport) -> EstopReport:
+def as_seen_here(report: EstopReport) -> EstopReport:
     """A report of another container, which may have another protocol version, with versions as this one names them."""
     return structs.replace(report, versions={who: one for who, one in report.versions.items() if one != PROTOCOL})
 

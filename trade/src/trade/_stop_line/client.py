@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Generic, TypeVar
 
-from trade._estop.broadcast import EstopReport, all_of, told_here
+from trade._estop.broadcast import EstopReport, all_of, as_seen_here
 from trade._protocol.messages import Malformed
 from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport, together
@@ -170,7 +170,7 @@ class StopLines:
             asked.append((place, self._request("estop", limit_s, reason, id=estop_id, pass_on=beyond)))
 
         def report_of(answer: StopAnswer) -> EstopReport | None:
-            return None if answer.estop is None else told_here(answer.estop)
+            return None if answer.estop is None else as_seen_here(answer.estop)
 
         return LineCall(asked, limit_s, report_of, lambda reports: all_of(estop_id, reports))
 

@@ -7,7 +7,7 @@ import msgspec
 
 from trade._calls.handle import CallHost, Handle
 from trade._calls.run import Run
-from trade._estop.broadcast import EstopReport, all_of, told_here
+from trade._estop.broadcast import EstopReport, all_of, as_seen_here
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import where
 from trade._registry.registry import Record, Registry
@@ -31,7 +31,7 @@ class RelayedEstop:
     def report(self) -> EstopReport:
         """The answers so far, merged."""
         ended = [run for run in self._runs if run.done() and run.exception(0) is None]
-        return all_of(self._id, [told_here(msgspec.convert(run.result(0), EstopReport)) for run in ended])
+        return all_of(self._id, [as_seen_here(msgspec.convert(run.result(0), EstopReport)) for run in ended])
 
     def wait(self) -> EstopReport:
         """Waits until all have answered, or the time is over."""

@@ -148,9 +148,9 @@ def _count(sock: socket.socket, there: Iterable[tuple[str, str]]) -> int:
         host, port = sock.getsockname()[:2]
     except OSError:  # it is closed
         return 0
-    ours = [end.partition(":") for _, end in there]
+    own_ends = [end.partition(":") for _, end in there]
     everywhere = not ipaddress.ip_address(host).packed.strip(b"\0")
-    return sum(int(end, 16) == port and (everywhere or _address(address) == host) for address, _, end in ours)
+    return sum(int(end, 16) == port and (everywhere or _address(address) == host) for address, _, end in own_ends)
 
 
 def _connections(ports: frozenset[int]) -> frozenset[tuple[str, str]]:
