@@ -1,5 +1,6 @@
 """An e-stop through other containers: each gives it under the same id to all that it sees (S09)."""
 
+import contextlib
 import time
 from typing import Any, Final
 
@@ -49,7 +50,5 @@ def _begun(home: CallHost, record: Record, reason: str, estop_id: str, limit_s: 
 
 def _wait(run: "Run[Any]", left_s: float) -> None:
     if left_s > 0 and not run.done():
-        try:
+        with contextlib.suppress(TimeoutError, TradeError):  # it was not over in time
             run.exception(left_s)
-        except TradeError:  # it was not over in time
-            return
