@@ -22,7 +22,7 @@ class Sum:
     """What was played so far."""
 
     began: float = field(default_factory=time.monotonic)
-    told: float = field(default_factory=time.monotonic)
+    reported_at: float = field(default_factory=time.monotonic)
     stories: int = 0
     virtual_s: float = 0.0
     calls: int = 0
@@ -51,8 +51,8 @@ class Sum:
     def tell(self, seeds: int) -> None:
         """Tell how far it is, now and then: not in the output, which is the same each time."""
         now = time.monotonic()
-        if now - self.told >= _TELL_S:
-            self.told = now
+        if now - self.reported_at >= _TELL_S:
+            self.reported_at = now
             print(
                 f"{self.stories} of {seeds} stories in {now - self.began:.0f} s, {len(self.wrong)} with a violation",
                 file=sys.stderr,

@@ -84,8 +84,8 @@ def test_ctrl_c_prints_what_was_found_so_far() -> None:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("seed 1: ")
         process.send_signal(signal.SIGINT)
-        said, told = process.communicate(timeout=60)
+        said, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "interrupted after " in told
+    assert "interrupted after " in errors
     assert " with a violation" in said
-    assert "Traceback" not in told
+    assert "Traceback" not in errors

@@ -17,11 +17,12 @@ import trade._services.signature as signatures
 from tests.support.waiting import wait_until
 from trade import Container, Handle, Settings, service, where
 from trade._calls.arguments import ArgumentEncoder
-from trade._discovery.host_folder import HostFolder, free_endpoint
+from trade._discovery.host_folder import HostFolder
 from trade._protocol.keys import TALLY, Address
 from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._registry.registry import Registry
 from trade._transport.base import Publisher
+from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
 

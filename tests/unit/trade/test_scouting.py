@@ -33,8 +33,8 @@ def leaving() -> Iterator[ExitStack]:
 
 
 def beacon(leaving: ExitStack, *locators: str) -> Beacon:
-    told = list(locators)
-    made = Beacon(ID, lambda *_: told, here_only=True)
+    locators_now = list(locators)
+    made = Beacon(ID, lambda *_: locators_now, here_only=True)
     return leaving.enter_context(closing(made))
 
 
@@ -127,14 +127,14 @@ def test_a_change_of_the_addresses_that_others_dial_is_logged(
     assert ("changed: gone 10.9.0.9." in caplog.text) == everywhere
 
 
-def told(transport: ZenohTransport, other: ZenohTransport) -> tuple[str, list[str]]:
+def listener(transport: ZenohTransport, other: ZenohTransport) -> tuple[str, list[str]]:
     return other.links._own, list(map(str, other.links.listen))
 
 
 def test_an_open_session_dials_on_request(leaving: ExitStack) -> None:
     one, other = opened(leaving), opened(leaving)
     assert one._prompt is not None
-    assert one._prompt.dial(*told(one, other))
+    assert one._prompt.dial(*listener(one, other))
     wait_until(lambda: one.links.linked(other.links._own), "they are linked")
     assert one.links.linked_at(str(other.links.listen[0]))  # it dialled
 
@@ -148,18 +148,18 @@ def test_S21_an_open_session_ignores_hellos_of_strangers(leaving: ExitStack) -> 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for own in own_addresses():
             if ":" not in own.ip:
-                stranger.sendto(hello(*told(one, other)), (own.ip, port))
+                stranger.sendto(hello(*listener(one, other)), (own.ip, port))
     threading.Event().wait(0.5)
     assert not one.links.linked(other.links._own)
 
-    assert one._prompt.dial(*told(one, other))
+    assert one._prompt.dial(*listener(one, other))
     wait_until(lambda: one.links.linked(other.links._own), "they are linked")
 
 
 def test_a_session_with_another_id_is_not_linked(leaving: ExitStack) -> None:
     one, other = opened(leaving), opened(leaving)
     assert one._prompt is not None
-    assert one._prompt.dial(ID, told(one, other)[1])
+    assert one._prompt.dial(ID, listener(one, other)[1])
     threading.Event().wait(0.5)
     assert not one.links.linked(other.links._own)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from trade._discovery.host_folder import free_endpoint
 from trade._transport.base import Channel, ChannelClosed, Presence, Questions
+from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 from trade.testing._ear import meet

@@ -17,6 +17,8 @@ from trade.errors import NoContainerFound
 
 _LOOK_S: Final = 0.02
 _ASK_S: Final = 0.5
+_MOST_ASKED: Final = 16
+"""Where more are known, a question to each would cost more than what one of them may see."""
 _OWN_PROVIDERS: Final = 2
 """What every container has: one with no more is a client, which comes and goes."""
 _HIDDEN: Final = (
@@ -103,7 +105,8 @@ def beyond(
         wait_s: how long to wait until it sees them, too, in seconds.
     """
     lists = registry.select(where(name="containers", group=DOMAIN))
-    asked = [handle(record.key).with_(deadline_s=_ASK_S) for record in lists if not record.local]
+    others = [record for record in lists if not record.local][:_MOST_ASKED]
+    asked = [handle(record.key).with_(deadline_s=_ASK_S) for record in others]
     seen: dict[str, tuple[ContainerInfo, list[str]]] = {}
     for outcome in batch.all_outcomes([one.bind() for one in asked]):
         for info in outcome.result if outcome.ok else ():

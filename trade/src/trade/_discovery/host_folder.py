@@ -16,15 +16,13 @@ from typing import Final
 
 from trade._atomic_file import fresh_beside
 from trade._paths import runtime_folder, runtime_folders
-from trade._transport.endpoints import Endpoint, free_endpoint
+from trade._transport.endpoints import Endpoint
 from trade.errors import ConfigurationError
 
 try:
     import fcntl
 except ImportError:  # only some operating systems have it
     fcntl = None
-
-__all__ = ["HostFolder", "free_endpoint"]
 
 _logger = logging.getLogger("trade")
 

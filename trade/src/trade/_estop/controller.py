@@ -161,7 +161,12 @@ class EstopController:
         return report.complete and known <= {*report.confirmed, *report.failed}
 
     def relay(self, estop_id: str, reason: str, limit_s: float, *, beyond: bool) -> EstopReport:
-        """Carries out an e-stop of another container, in the whole system or in this container only."""
+        """Carries out an e-stop of another container, in the whole system or in this container only.
+
+        Its report names the version of each container: who asks may have another one than this container.
+        """
+        check_limit(limit_s)
+        check_id(estop_id)
         mine = Estop(estop_id, str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop_id, mine)
         expected = self._awaited if beyond else lambda: {self._own}
@@ -169,8 +174,8 @@ class EstopController:
         report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
         named = {*report.confirmed, *report.missing, *report.failed}
         known = {state.address.who: state.protocol for state in self._registry.containers() if state.protocol}
-        mine = {who: version for who, version in {**known, self._own.who: PROTOCOL}.items() if who in named}
-        return structs.replace(self._with_versions(report), versions=mine)  # who asks may have another version
+        versions = {who: version for who, version in {**known, self._own.who: PROTOCOL}.items() if who in named}
+        return structs.replace(self._with_versions(report), versions=versions)
 
     def subscribe(self, callback: Callable[[Estop], str]) -> None:
         """Calls this, on another thread, with every open and every future e-stop; it returns the problem, or empty.

@@ -6,7 +6,7 @@ twelfth of that of all other functions of the middleware.
 
 from trade._context.call_context import current_call
 from trade._estop.broadcast import EstopReport
-from trade._estop.controller import LIMIT_S, EstopController, check_id, check_limit
+from trade._estop.controller import LIMIT_S, EstopController
 from trade._protocol.messages import Estop
 from trade._services.decorator import service
 
@@ -31,9 +31,7 @@ class EstopServices:
         call = current_call()
         asked = f"asked by {call.caller}" if call is not None else ""
         why = f"{reason} ({asked})" if reason else asked
-        check_limit(limit_s)
         if estop_id:
-            check_id(estop_id)
             return self._estopping.relay(estop_id, why, limit_s, beyond=True)
         return self._estopping.estop(why, limit_s=limit_s)
 

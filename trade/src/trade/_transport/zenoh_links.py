@@ -361,13 +361,8 @@ def _dialled() -> set[str]:
 
 def _dials_first(own: str, there: _There) -> bool:
     """Whether, of two sessions that hear of each other, this one dials: its id is the greater, last byte first."""
-    if there.kind == ROUTER:
-        return True
-
-    def rank(session: str) -> bytes:
-        return bytes.fromhex(session.zfill(_DIGITS))[::-1]
-
-    return rank(own) > rank(there.session)
+    mine, other = (bytes.fromhex(session.zfill(_DIGITS))[::-1] for session in (own, there.session))
+    return there.kind == ROUTER or mine > other
 
 
 def _close(extra: zenoh.Session) -> None:
