@@ -137,6 +137,19 @@ def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(t
                 Client(made.url, trust=trust).ask("GET", "/services")
 
 
+def test_a_client_that_reads_and_writes_in_two_threads_gets_no_ticket_meanwhile(tmp_path: Path) -> None:
+    papers = Papers(tmp_path / "pki").of("http", addresses=["127.0.0.1"])
+    trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
+    with memory_system() as system, opened(system.container("me"), tmp_path, tls=papers) as (made, _):
+        place = urlsplit(made.url)
+        plain = socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S)  # type: ignore[arg-type]
+        with trust.wrap_socket(plain, server_hostname=place.hostname) as joined:
+            joined.sendall(b"GET /me HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            assert joined.recv(1) == b"H"
+            assert joined.version() == "TLSv1.3"
+            assert joined.session is None or not joined.session.has_ticket
+
+
 def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: Path) -> None:
     path = tmp_path / "tokens.toml"
     one = add_token(path, "anna")

@@ -237,6 +237,7 @@ def _context(folder: Path) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.verify_mode = ssl.CERT_OPTIONAL
+    context.num_tickets = 0  # a ticket that arrives while another thread of a client writes can hang that client
     try:
         context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
         context.load_verify_locations(folder / "ca.pem")
