@@ -184,5 +184,5 @@ TROUBLES: Final[dict[str, Trouble]] = {
     "clock step": Trouble(
         lambda stage, _: stage.clock.step_wall_clock(stage.drawn.choice((-3600.0, -2.0, 2.0, 3600.0)))
     ),
-    "stalls": Trouble(lambda stage, _: stage.clock.stall_threads(_STALL)),
+    "stalls": Trouble(lambda stage, _: stage.clock.stall_threads(_STALL, spare="sim-")),  # no device stalls with it
 }

@@ -39,7 +39,6 @@ def conditions(shown: dict[str, Any]) -> tuple[list[str], list[str]]:
     return shown["needs"], shown["achieves"]
 
 
-@pytest.mark.real_clock
 def test_the_http_gateway_lists_and_documents_conditions(tmp_path: Path) -> None:
     with served_axis(tmp_path) as served:
         served.robot.system.container("hands").register(Hand(), "robot.hand")
@@ -58,7 +57,6 @@ def test_the_http_gateway_lists_and_documents_conditions(tmp_path: Path) -> None
         assert (operation["x-trade-needs"], operation["x-trade-achieves"]) == (NEEDS, ACHIEVES)
 
 
-@pytest.mark.real_clock
 def test_an_agent_sees_conditions() -> None:
     async def look(client: Client) -> None:
         listed = {one["name"]: conditions(one) for one in await client("services", group="rosie")}

@@ -14,7 +14,6 @@ pytestmark = pytest.mark.virtual_time
 STATIC = Path(__file__).parents[3] / "gateway" / "src" / "trade_gateway" / "dashboard" / "static"
 
 
-@pytest.mark.real_clock
 def test_the_page_and_its_files_are_public_and_run_no_foreign_script(tmp_path: Path) -> None:
     with memory_system() as system, opened(system.container("me"), tmp_path) as (gateway, _):
         anybody = Client(gateway.url)
@@ -34,7 +33,6 @@ def test_the_page_and_its_files_are_public_and_run_no_foreign_script(tmp_path: P
             assert (again.status, again.body) == (304, b"")
 
 
-@pytest.mark.real_clock
 @pytest.mark.parametrize("path", [route.path for route in pages()])
 def test_a_page_of_the_dashboard_is_only_read(tmp_path: Path, path: str) -> None:
     with memory_system() as system, opened(system.container("me"), tmp_path) as (gateway, _):

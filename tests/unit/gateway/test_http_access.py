@@ -22,6 +22,8 @@ from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.http import HttpGateway, Tokens, add_token
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Opened]:
@@ -114,6 +116,7 @@ def test_S21_an_http_gateway_on_a_network_needs_encryption_and_a_policy(tmp_path
             HttpGateway(me, listen=first.url.removeprefix("http://"), tokens=Tokens(tokens))
 
 
+@pytest.mark.real_clock  # TLS is in C
 def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(tmp_path: Path) -> None:
     ours, others = Papers(tmp_path / "pki"), Papers(tmp_path / "other")
     with memory_system() as system:
@@ -137,6 +140,7 @@ def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(t
                 Client(made.url, trust=trust).ask("GET", "/services")
 
 
+@pytest.mark.real_clock  # TLS is in C
 def test_a_client_that_reads_and_writes_in_two_threads_gets_no_ticket_meanwhile(tmp_path: Path) -> None:
     papers = Papers(tmp_path / "pki").of("http", addresses=["127.0.0.1"])
     trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
@@ -209,6 +213,7 @@ def test_no_path_leads_out_of_the_served_folder(served: Opened, path: str) -> No
     assert "[tokens]" not in str(answer.body)
 
 
+@pytest.mark.real_clock  # TLS is in C
 @pytest.mark.parametrize("reset", [False, True])
 @pytest.mark.parametrize("asks", ["", "GET /me HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", "nonsense\r\n\r\n"])
 def test_a_client_that_breaks_off_leaves_no_traceback(

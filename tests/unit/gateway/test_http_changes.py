@@ -16,6 +16,8 @@ from trade._audit.events import Event
 from trade.testing import memory_system
 from trade_gateway.supervisor import ChildInfo
 
+pytestmark = pytest.mark.virtual_time
+
 POLICY = policy_text(
     "bert=guest tester=all olga=operator vera=viewer",
     all=EVERYTHING,

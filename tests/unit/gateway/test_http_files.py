@@ -14,6 +14,8 @@ from trade.rules import Rules
 from trade.testing import memory_system
 from trade_gateway.cli.watching.rule_file import RuleFile
 
+pytestmark = pytest.mark.virtual_time
+
 POLICY = policy_text(
     "bert=guest tester=all olga=operator vera=viewer",
     all=EVERYTHING,

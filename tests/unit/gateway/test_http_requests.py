@@ -25,6 +25,8 @@ from trade.testing import memory_system
 from trade_gateway.cli import app
 from trade_gateway.http import add_token
 
+pytestmark = pytest.mark.virtual_time
+
 
 class Lamp:
     def __init__(self, handle: Handle | None = None) -> None:

@@ -14,6 +14,8 @@ from trade._audit.store import AuditStore
 from trade.errors import ConfigurationError
 from trade_gateway.clients._system_info import newest
 
+pytestmark = pytest.mark.virtual_time
+
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Opened]:

@@ -23,6 +23,8 @@ from trade_gateway.clients._clients import MOST_OF_ONE
 from trade_gateway.http._http import MOST_BODY_BYTES
 from trade_gateway.mcp._pictures import MOST_PICTURE_BYTES
 
+pytestmark = pytest.mark.virtual_time(packages=["httpcore", "httpx", "mcp", "sse_starlette"])
+
 APPROVERS = """
 [roles.approver]
 call = ["approvals"]

@@ -119,13 +119,14 @@ def test_S01_what_another_client_has_locked_gets_no_goal(stand: Stand, base: Ros
         assert base.goals == []
 
 
-@pytest.mark.real_clock
 def test_an_action_that_moves_nothing_needs_no_lock_and_has_no_stop(stand: Stand, base: RosBase) -> None:
     stand.up(FROM + 'effect = "note"\n')
     assert drives(stand)(**GO).driven_m == 2.0
     assert stand.robot.container.services(where(group="base", name="stop")) == []
     base.holds = True
+    base.goes.clear()
     run = drives(stand).start(**GO)
+    assert base.goes.wait(PATIENCE_S)
     run.cancel()
     assert base.canceled.wait(PATIENCE_S)
 

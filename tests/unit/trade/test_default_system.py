@@ -174,7 +174,6 @@ def test_S09_an_open_estop_latches_whatever_home_the_environment_names(
             assert move(container) == 0.3
 
 
-@pytest.mark.real_clock
 @pytest.mark.parametrize("folder", ["user{uid}-ffffffff", "lab"])
 def test_S23_last_known_angles_of_an_earlier_name_are_taken_over(tmp_path: Path, folder: str) -> None:
     """Without them, a zero that was lost with power would not be noticed. An explicit system takes nothing over."""

@@ -98,7 +98,6 @@ def test_a_script_serves_until_it_is_ended(
     wait_until(lambda: not me.services("sums"))
 
 
-@pytest.mark.real_clock
 def test_serving_ends_when_the_container_is_closed_elsewhere(system: str) -> None:
     running = trade.container()
     serving = threading.Thread(target=trade.serve)

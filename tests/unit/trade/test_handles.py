@@ -226,7 +226,6 @@ def test_a_handle_reaches_a_third_container_and_works_there(start_container: Any
     assert found(here, "use")(found(here, "value", group="counted")) == 0
 
 
-@pytest.mark.real_clock
 def test_a_handle_works_before_its_registry_entry_came(
     here: Container, there: Container, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,7 +64,6 @@ def test_a_constraint_that_means_none_or_several_is_not_called(here: Container) 
         here.call(where(name="set_level"), 1)
 
 
-@pytest.mark.real_clock
 def test_all_are_called_at_once(here: Container, there: Container) -> None:
     meeting = Meeting(4)
     for container, name in ((here, "a"), (there, "b")):

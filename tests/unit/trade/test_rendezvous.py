@@ -182,7 +182,6 @@ def test_a_folder_that_others_may_write_is_refused(system: str, tmp_path: Path) 
         Container()
 
 
-@pytest.mark.real_clock
 def test_a_folder_that_is_a_link_is_refused(system: str, tmp_path: Path) -> None:
     (tmp_path / "runtime").mkdir()
     (tmp_path / "elsewhere").mkdir(mode=0o700)

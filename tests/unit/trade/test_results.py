@@ -146,7 +146,6 @@ def schema(properties: dict[str, Any]) -> dict[str, Any]:
     return {"$ref": "#/$defs/Pose", "$defs": {"Pose": pose}}
 
 
-@pytest.mark.real_clock
 def test_a_type_the_caller_has_is_used() -> None:
     assert type_from_schema(schema({"x_m": {"type": "number"}}), {"Pose": PATH}) is Pose
 

@@ -129,7 +129,6 @@ def test_local_and_remote_callers_share_one_queue(
     assert bench.most == 1
 
 
-@pytest.mark.real_clock
 def test_a_queued_call_that_is_cancelled_is_dropped_at_once(offer: Any, bench: Bench, eventually: Any) -> None:
     work = offer(bench)("work")
     first, second = work.start(0), None

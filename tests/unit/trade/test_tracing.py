@@ -233,7 +233,6 @@ def test_the_time_in_a_serial_queue_is_reported(here: Container, there: Containe
     assert served["q.follow"].waited_s >= waited_s
 
 
-@pytest.mark.real_clock
 def test_what_is_secret_is_in_no_trace(here: Container, there: Container, arm: Arm) -> None:
     here.set_tracing(True)
     assert here.call(where(name="login"), "swordfish") == "swordfish"

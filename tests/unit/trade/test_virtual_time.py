@@ -1,6 +1,8 @@
 """Virtual time: waits cost nothing, the same seed gives the same run, and what it cannot do is refused by name."""
 
+import _thread
 import asyncio
+import http.client
 import importlib
 import queue
 import re
@@ -66,6 +68,22 @@ def test_threads_wait_for_each_other_by_every_primitive(clock: VirtualTime) -> N
     assert 1 <= clock.elapsed_s < 1.01
 
 
+def test_threads_meet_at_a_barrier(clock: VirtualTime) -> None:
+    barrier, met = threading.Barrier(3), list[float]()
+
+    def come(after_s: float) -> None:
+        time.sleep(after_s)
+        barrier.wait(60)
+        met.append(clock.elapsed_s)
+
+    threads = [threading.Thread(target=come, args=[after_s]) for after_s in (1, 2, 30)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert met == [pytest.approx(30, abs=0.01)] * 3
+
+
 def test_a_wait_ends_at_its_deadline(clock: VirtualTime) -> None:
     with pytest.raises(queue.Empty):
         queue.SimpleQueue().get(timeout=7)
@@ -97,6 +115,95 @@ def test_executors_and_asyncio_are_on_the_same_clock(clock: VirtualTime) -> None
 
     asyncio.run(both())
     assert clock.elapsed_s == pytest.approx(6, abs=0.01)
+
+
+def test_an_http_server_and_its_clients_are_on_the_same_clock(clock: VirtualTime) -> None:
+    serving: queue.Queue[tuple[asyncio.AbstractEventLoop, asyncio.Event, int]] = queue.Queue()
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        await asyncio.sleep(60)
+        writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\nConnection: close\r\n\r\nready")
+        writer.close()
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+            serving.put((asyncio.get_running_loop(), over, server.sockets[0].getsockname()[1]))
+            await over.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    loop, over, port = serving.get(timeout=5)
+    client = http.client.HTTPConnection("127.0.0.1", port, timeout=100)
+    client.request("GET", "/")
+    assert client.getresponse().read() == b"ready"
+    client.close()
+    assert clock.elapsed_s == pytest.approx(60, abs=0.01)
+    loop.call_soon_threadsafe(over.set)
+    thread.join(5)
+
+
+def test_a_loop_of_asyncio_reaches_no_other_process(clock: VirtualTime) -> None:
+    async def connect() -> None:
+        await asyncio.open_connection("127.0.0.1", 1)
+
+    with pytest.raises(ConnectionRefusedError, match="virtual time reaches no other process"):
+        asyncio.run(connect())
+
+
+class _Worker(threading.Thread):
+    def run(self) -> None:
+        time.sleep(7)
+
+
+def test_classes_that_are_threads_are_on_the_same_clock(clock: VirtualTime) -> None:
+    worker = _Worker()
+    worker.start()
+    worker.join(5)
+    assert worker.is_alive()
+    worker.join()
+    assert not worker.is_alive()
+    assert clock.elapsed_s == pytest.approx(7, abs=0.01)
+
+
+def test_a_thread_that_virtual_time_did_not_start_sets_no_event(clock: VirtualTime) -> None:
+    event, problems = threading.Event(), list[BaseException]()
+
+    def intrude() -> None:
+        try:
+            event.set()
+        except VirtualTimeError as refused:
+            problems.append(refused)
+        finally:
+            done.release()
+
+    done = _thread.allocate_lock()
+    done.acquire()
+    _thread.start_new_thread(intrude, ())
+    done.acquire()
+    assert "it was there before virtual time began" in str(*problems)
+    assert not event.is_set()
+
+
+def test_stalls_spare_devices(clock: VirtualTime) -> None:
+    took: dict[str, float] = {}
+
+    def work() -> None:
+        began, lock = time.monotonic(), threading.Lock()
+        for _ in range(20):
+            with lock:
+                pass
+        took[threading.current_thread().name] = time.monotonic() - began
+
+    clock.stall_threads(1.0, 2.0, spare="sim-")
+    threads = [threading.Thread(target=work, name=name) for name in ("driver", "sim-bus")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert took["driver"] > 1
+    assert took["sim-bus"] < 0.01
 
 
 def test_containers_lock_move_and_expire(clock: VirtualTime) -> None:

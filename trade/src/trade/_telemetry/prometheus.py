@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from itertools import accumulate
-from typing import TYPE_CHECKING, Final
+from socket import socket
+from typing import TYPE_CHECKING, Final, cast
 
 from trade._counters import BOUNDS_S, CallCounters, Measure
 from trade._settings import Settings
@@ -96,7 +97,7 @@ def open_metrics(
         problem = f"{settings.metrics}: {taken.strerror}; each container of a host needs a port of its own"
         raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
 
-    server.socket = BoundedListener(server.socket, _MOST_CONNECTIONS)
+    server.socket = cast("socket", BoundedListener(server.socket, _MOST_CONNECTIONS))
     server.socket.listen(_BACKLOG)
     server.RequestHandlerClass.timeout = _ASKED_WITHIN_S  # type: ignore[attr-defined] # as for every stream handler
 

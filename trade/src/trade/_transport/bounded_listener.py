@@ -2,59 +2,64 @@
 
 import socket
 import threading
+from collections.abc import Callable
 from typing import Any, Final
 
 
-class _Counted(socket.socket):
+class _Counted:
     """A connection that is counted until it is closed."""
 
-    listener: "BoundedListener | None" = None
+    def __init__(self, connection: socket.socket, closed: Callable[[], None]) -> None:
+        self._connection: Final = connection
+        self._closed: Callable[[], None] | None = closed
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._connection, name)
 
     def close(self) -> None:
         """Idempotent."""
-        listener, self.listener = self.listener, None
-        if listener is not None:
-            listener.closed()
-        super().close()
+        self._end()
+        self._connection.close()
 
     def detach(self) -> int:
         """Another object closes the socket: it is no longer counted."""
-        listener, self.listener = self.listener, None
-        if listener is not None:
-            listener.closed()
-        return super().detach()
+        self._end()
+        return self._connection.detach()
+
+    def _end(self) -> None:
+        closed, self._closed = self._closed, None
+        if closed is not None:
+            closed()
 
 
-class BoundedListener(socket.socket):
-    """A listening socket that limits its connections.
+class BoundedListener:
+    """A listening socket that limits its connections. It has the attributes of the socket.
 
     Args:
-        bound: the socket to replace; this object takes its descriptor.
+        bound: the socket; this object closes it.
         most: the largest number of connections at once, whether or not they have sent anything yet.
     """
 
     def __init__(self, bound: socket.socket, most: int) -> None:
-        timeout = bound.gettimeout()
-        super().__init__(bound.family, bound.type, bound.proto, fileno=bound.detach())
-        self.settimeout(timeout)
+        self._bound: Final = bound
         self._most: Final = most
         self._open = 0
         self._guard = threading.Lock()
 
-    def accept(self) -> tuple[socket.socket, Any]:
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bound, name)
+
+    def accept(self) -> tuple[Any, Any]:
         """Raises BlockingIOError: the limit is reached; the new connection was closed."""
-        plain, address = super().accept()
-        made = _Counted(plain.family, plain.type, plain.proto, fileno=plain.detach())
+        made, address = self._bound.accept()
         with self._guard:
             taken = self._open < self._most
             self._open += taken
         if not taken:
             made.close()
             raise BlockingIOError
-        made.listener = self
-        return made, address
+        return _Counted(made, self._closed), address
 
-    def closed(self) -> None:
-        """Called by a connection when it closes."""
+    def _closed(self) -> None:
         with self._guard:
             self._open -= 1

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import gc
+import threading
 from collections.abc import Generator, Sequence, Set
 from typing import ClassVar
 
@@ -11,10 +12,12 @@ from trade._settings import Settings
 from trade._threads import fork_guard
 from trade._transport.base import Transport
 from trade._transport.memory import MemoryTransport, Network
+from trade.testing.virtual._descriptors import Descriptors
 from trade.testing.virtual._loop import Policy
 from trade.testing.virtual._modules import replaced
 from trade.testing.virtual._outside import Watch
 from trade.testing.virtual._scheduler import Deadlock, Scheduler, VirtualTimeError
+from trade.testing.virtual._threads import thread_methods
 
 __all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
 
@@ -46,14 +49,16 @@ class VirtualTime:
         """Set the wall clock ahead or back, in seconds; the monotonic clock continues."""
         self._scheduler.wall_step_ns += round(by_s * 1e9)
 
-    def stall_threads(self, probability: float, longest_s: float = 2.0) -> None:
+    def stall_threads(self, probability: float, longest_s: float = 2.0, *, spare: str | tuple[str, ...] = ()) -> None:
         """From now on, threads stand still where another one may run, as on a computer that does not run them.
 
         Args:
             probability: of each such place, from 0 (none, as at the beginning) to 1.
             longest_s: the longest stall, in seconds.
+            spare: how the names of threads begin that are not of this computer, such as those of simulated devices.
         """
-        self._scheduler.stall, self._scheduler.longest_stall_s = probability, longest_s
+        scheduler = self._scheduler
+        scheduler.stall, scheduler.longest_stall_s, scheduler.spared = probability, longest_s, spare
 
     def sleep(self, duration_s: float) -> None:
         """Let time pass, in seconds; other threads run meanwhile."""
@@ -85,6 +90,7 @@ def virtual_time(
     if VirtualTime._current is not None:
         raise VirtualTimeError("virtual time runs already: a test has one `virtual_time`, or the marker")
     scheduler = Scheduler(seed, switch, limit_s)
+    files = Descriptors(scheduler)
     networks: dict[str, Network] = {}
 
     start = Container.__init__
@@ -97,19 +103,22 @@ def virtual_time(
         start(container, settings, transport=transport or MemoryTransport(network, settings.container))
 
     policy = asyncio.get_event_loop_policy()  # pyright: ignore[reportDeprecated] - Python 3.10 has no other way
-    with replaced(scheduler, packages) as undo:
+    with replaced(scheduler, files, packages) as undo:
         if gc.isenabled():  # a finalizer would run on any thread, also on one that virtual time does not know
             undo.callback(gc.enable)
             gc.disable()
         undo.callback(setattr, Container, "__init__", start)
         Container.__init__ = start_in_memory  # type: ignore[method-assign]
         undo.callback(asyncio.set_event_loop_policy, policy)  # pyright: ignore[reportDeprecated]
-        asyncio.set_event_loop_policy(Policy(scheduler))  # pyright: ignore[reportDeprecated]
+        asyncio.set_event_loop_policy(Policy(scheduler, files))  # pyright: ignore[reportDeprecated]
         undo.callback(scheduler.end)
         undo.callback(_forget_containers, set(fork_guard.live))
         undo.callback(setattr, VirtualTime, "_current", None)
         VirtualTime._current = VirtualTime(scheduler)
         undo.callback(Watch(scheduler).close)
+        for name, method in thread_methods(scheduler).items():
+            undo.callback(setattr, threading.Thread, name, getattr(threading.Thread, name))
+            setattr(threading.Thread, name, method)
         try:
             yield VirtualTime._current
         except VirtualTimeError:

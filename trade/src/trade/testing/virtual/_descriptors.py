@@ -6,6 +6,7 @@ import importlib
 import itertools
 import os
 import select
+import selectors
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,6 +18,7 @@ from trade.testing.virtual._scheduler import Scheduler, WaitList
 
 _FIRST: Final = 1_000_000
 """Descriptors from here on are virtual; a process has never so many real ones."""
+_SELECTORS: Final = ("DefaultSelector", "SelectSelector", "PollSelector", "EpollSelector", "KqueueSelector")
 
 
 class Waitable(Protocol):
@@ -167,6 +169,7 @@ def stand_ins(files: Descriptors) -> dict[ModuleType, dict[str, Any]]:
             "epoll": partial(_Epoll, files),
             "select": partial(_select, files),
         },
+        selectors: dict.fromkeys(_SELECTORS, partial(Selector, files)),
     }
     for name, made in (("pty", _pty), ("tty", _tty), ("termios", _termios), ("serial", _serial)):
         with contextlib.suppress(ImportError):  # pyserial need not be installed
@@ -243,6 +246,25 @@ def _select(
     numbers = {_number_of(file): file for file in reading}
     found = files.wait(list(numbers), 0.0 if writing else timeout_s)
     return [numbers[number] for number in found], list(writing), []
+
+
+class Selector(selectors.SelectSelector):
+    """As any of `selectors`."""
+
+    def __init__(self, files: Descriptors) -> None:
+        super().__init__()
+        self._files = files
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        keys = list(self.get_map().values())
+        writing = any(key.events & selectors.EVENT_WRITE for key in keys)
+        reading = [key.fd for key in keys if key.events & selectors.EVENT_READ]
+        readable = set(self._files.wait(reading, 0.0 if writing else timeout))
+        found = [
+            (key, (key.events & selectors.EVENT_WRITE) | (selectors.EVENT_READ if key.fd in readable else 0))
+            for key in keys
+        ]
+        return [(key, events & key.events) for key, events in found if events & key.events]
 
 
 def _number_of(file: Any) -> int:

@@ -1,9 +1,11 @@
 """Puts stand-ins in place of `threading`, `time` and their like in modules, and takes them out again."""
 
 import asyncio.base_events
+import asyncio.selector_events
 import concurrent.futures._base
 import concurrent.futures.thread
 import contextlib
+import http.client
 import importlib
 import importlib.util
 import logging
@@ -34,12 +36,18 @@ PACKAGES: Final = (
     "canopen",
     "dynamixel_sdk",
     "pymodbus",
+    "anyio",
+    "starlette",
+    "uvicorn",
+    "websockets",
 )
 """The packages whose modules live on virtual time, beside those that a test names."""
 _STANDARD: Final = (
     asyncio.base_events,
+    asyncio.selector_events,
     concurrent.futures._base,
     concurrent.futures.thread,
+    http.client,
     logging,
 )
 """Modules of the standard library that wait, or hold a lock while other code runs."""
@@ -51,7 +59,7 @@ _RLOCK: Final = type(threading.RLock())
 class Replacements:
     """The stand-ins, by the identity of what they replace."""
 
-    def __init__(self, scheduler: Scheduler) -> None:
+    def __init__(self, scheduler: Scheduler, files: Descriptors) -> None:
         self._of: dict[int, Any] = {}
         self._keep: list[Any] = []
         threads = self._module(threading, _threads.stand_ins(scheduler))
@@ -63,7 +71,6 @@ class Replacements:
         self._module(secrets, _ids(scheduler))
         self._module(uuid, {"uuid4": lambda: uuid.UUID(int=scheduler.numbers.getrandbits(128), version=4)})
         self._module(random, _drawn(scheduler))
-        files = Descriptors(scheduler)
         for module, names in _descriptors.stand_ins(files).items():
             self._module(module, names)
         self._module(socket, _sockets.stand_ins(scheduler, files))
@@ -97,10 +104,10 @@ class Replacements:
         return found
 
 
-def replaced(scheduler: Scheduler, packages: Iterable[str]) -> contextlib.ExitStack:
+def replaced(scheduler: Scheduler, files: Descriptors, packages: Iterable[str]) -> contextlib.ExitStack:
     """Replace the names in all modules of these packages, also in those imported later; closing it puts them back."""
     undo = contextlib.ExitStack()
-    replacements = Replacements(scheduler)
+    replacements = Replacements(scheduler, files)
     roots = {*PACKAGES, *packages}
     for module in _STANDARD:
         _replace_in(module, replacements, undo)

@@ -80,6 +80,8 @@ class Scheduler:
         self.stall = 0.0
         """The probability of a stall where another thread may run."""
         self.longest_stall_s = 0.0
+        self.spared: str | tuple[str, ...] = ()
+        """How the names of threads begin that never stall."""
         self.importing = 0
         """How many imports are under way. They switch no threads, as only the first run of a process has them."""
         self._limit_ns = _BEGIN_NS + round(limit_s * 1e9)
@@ -159,7 +161,8 @@ class Scheduler:
         """A place where another thread may run, with the probability of a switch or a stall."""
         if self.importing:
             return
-        if self.stall and self.random.random() < self.stall:
+        stalls = self.stall and self.random.random() < self.stall
+        if stalls and not self._current.name.startswith(self.spared):
             self.sleep(self.random.random() * self.longest_stall_s)
         if self._ready and self._switch and self.random.random() < self._switch:
             self.yield_now()
@@ -202,6 +205,11 @@ class Scheduler:
     def knows_this_thread(self) -> bool:
         """Whether the caller is a thread of the simulation."""
         return not self._ended and _thread.get_ident() in self._tasks
+
+    def refuse_strangers(self) -> None:
+        """Raises VirtualTimeError in a thread that virtual time did not start, while it runs."""
+        if not self._ended:
+            self._me()
 
     def give_up(self, waited_s: float) -> None:
         """Called beside the simulation: the thread that runs waits for something that virtual time does not have."""

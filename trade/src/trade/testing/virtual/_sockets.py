@@ -28,18 +28,21 @@ class Socket:
 
     _network: Network
 
-    def __init__(self, family: int = -1, *_: int, fileno: int | None = None) -> None:
+    def __init__(self, family: int = -1, *_: int, fileno: int | None = None, **_named: int) -> None:
         if fileno is not None or family not in (-1, socket.AF_INET, socket.AF_UNIX):
             raise VirtualTimeError(f"a socket of family {family} was opened: virtual time has TCP and Unix sockets")
         self.family: Final = socket.AF_INET if family == -1 else family
-        self.type = socket.SOCK_STREAM
+        self.type: Final = socket.SOCK_STREAM
+        self.proto: Final = socket.IPPROTO_TCP if self.family == socket.AF_INET else 0
         self.peer: Socket | None = None
         self.incoming = bytearray()
         self.waiting: WaitList = deque()
         self._backlog: deque[Socket] | None = None
         self._name: Any = ("127.0.0.1", 0) if self.family == socket.AF_INET else ""
         self._timeout_s: float | None = socket.getdefaulttimeout()
-        self._ended = False
+        self._io_refs = 0
+        """How many files of it are open, which read on after it was closed."""
+        self._closed = self._ended = False
         """Whether no more will come."""
         self._number = self._network.files.add(self)
 
@@ -89,7 +92,7 @@ class Socket:
         self._name = address
 
     def listen(self, _most: int = 128) -> None:
-        self._backlog = deque()
+        self._backlog = self._backlog or deque()
 
     # --- connections
 
@@ -161,6 +164,13 @@ class Socket:
     def sendall(self, data: Any, flags: int = 0) -> None:
         self.send(data, flags)
 
+    makefile: Any = socket.socket.makefile  # in Python, over the methods here
+
+    def _decref_socketios(self) -> None:
+        self._io_refs -= 1
+        if self._closed:
+            self.close()
+
     def _wait(self) -> None:
         """Until it is ready; as long as its time-out allows."""
         scheduler = self._network.scheduler
@@ -184,7 +194,8 @@ class Socket:
             self._end()
 
     def close(self) -> None:
-        if self._number < 0:
+        self._closed = True
+        if self._number < 0 or self._io_refs > 0:
             return
         self._network.files.forget(self._number)
         self._number = -1

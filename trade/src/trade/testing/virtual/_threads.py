@@ -138,6 +138,16 @@ class Condition:
         self.notify(len(self._waiters))
 
 
+class Barrier(threading.Barrier):
+    """As `threading.Barrier`, over another condition."""
+
+    _new_condition: Callable[[], Condition]
+
+    def __init__(self, parties: int, action: Callable[[], None] | None = None, timeout: float | None = None) -> None:
+        super().__init__(parties, action, timeout)
+        self._cond = self._new_condition()
+
+
 class Event:
     """As `threading.Event`. Setting and clearing it are places where another thread may run."""
 
@@ -151,6 +161,7 @@ class Event:
         return self._flag
 
     def set(self) -> None:
+        self._scheduler.refuse_strangers()
         self._flag = True
         self._scheduler.wake_all(self._waiters)
         self._scheduler.may_yield()
@@ -203,28 +214,37 @@ class Semaphore:
         self.release()
 
 
-class Thread(threading.Thread):
-    """As `threading.Thread`. It is a real one, which runs while it has the scheduler's turn."""
+def thread_methods(scheduler: Scheduler) -> dict[str, Callable[..., Any]]:
+    """Methods of `threading.Thread` itself, as classes are derived from it.
 
-    _scheduler: Scheduler
-    _task: Task | None = None
+    A thread that one of the simulation starts belongs to it. It is a real one, which runs while it has its turn.
+    """
+    real, tasks = threading.Thread, dict[threading.Thread, Task]()
+    real_start, real_join, real_is_alive = real.start, real.join, real.is_alive
 
-    def start(self) -> None:
+    def start(self: threading.Thread) -> None:
+        if not scheduler.knows_this_thread():
+            real_start(self)
+            return
         task, run = Task(self.name), self.run
-        self._task = task
-        self.run = lambda: _run_in_turn(self._scheduler, task, run)  # type: ignore[method-assign]
-        super().start()
-        self._scheduler.add(task, self.ident or 0)
-        self._scheduler.may_yield()
+        self.run = lambda: _run_in_turn(scheduler, task, run)  # type: ignore[method-assign]
+        real_start(self)
+        tasks[self] = task
+        scheduler.add(task, self.ident or 0)
+        scheduler.may_yield()
 
-    def join(self, timeout: float | None = None) -> None:
-        if self._task is None:
-            raise RuntimeError("cannot join thread before it is started")
-        if not self._task.done:
-            self._scheduler.wait([self._task.joiners], timeout)
+    def join(self: threading.Thread, timeout: float | None = None) -> None:
+        task = tasks.get(self)
+        if task is None or not scheduler.knows_this_thread():
+            real_join(self, timeout)
+        elif not task.done:
+            scheduler.wait([task.joiners], timeout)
 
-    def is_alive(self) -> bool:
-        return self._task is not None and not self._task.done
+    def is_alive(self: threading.Thread) -> bool:
+        task = tasks.get(self)
+        return real_is_alive(self) if task is None else not task.done
+
+    return {"start": start, "join": join, "is_alive": is_alive}
 
 
 def _run_in_turn(scheduler: Scheduler, task: Task, run: Callable[[], None]) -> None:
@@ -242,7 +262,7 @@ def _run_in_turn(scheduler: Scheduler, task: Task, run: Callable[[], None]) -> N
         scheduler.remove(task)
 
 
-class Timer(Thread):
+class Timer(threading.Thread):
     """As `threading.Timer`."""
 
     _new_event: Callable[[], Event]
@@ -274,13 +294,14 @@ def stand_ins(scheduler: Scheduler) -> dict[str, type]:
     rlock = type("RLock", (RLock,), bound)
     event = type("Event", (Event,), bound)
     semaphore = type("Semaphore", (Semaphore,), bound)
+    condition = type("Condition", (Condition,), {**bound, "_new_rlock": rlock})
     return {
         "Lock": type("Lock", (Lock,), bound),
         "RLock": rlock,
-        "Condition": type("Condition", (Condition,), {**bound, "_new_rlock": rlock}),
+        "Condition": condition,
+        "Barrier": type("Barrier", (Barrier,), {"_new_condition": condition}),
         "Event": event,
         "Semaphore": semaphore,
         "BoundedSemaphore": semaphore,
-        "Thread": type("Thread", (Thread,), bound),
-        "Timer": type("Timer", (Timer,), {**bound, "_new_event": event}),
+        "Timer": type("Timer", (Timer,), {"_new_event": event}),
     }
