@@ -7,14 +7,20 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
+from tests.endurance.chaos._mutants import MUTANTS as LOCKS
 from tests.endurance.explore._stage import Outcome
 from tests.endurance.explore._story import draw, play
+from tests.support.mutants import HOW
 from tests.system.siege_minimised import fewest
 
 _TELL_S = 30.0
+
+MUTANTS: dict[str, Callable[[], None]] = {**LOCKS, **{name: partial(how, setattr) for name, how in HOW.items()}}
+"""The ways of `make mutants` to break the product."""
 
 
 @dataclass
@@ -62,11 +68,15 @@ class Sum:
 
 def main(words: Sequence[str] | None = None) -> int:
     asked = _asked(words)
+    if asked.mutant:
+        MUTANTS[asked.mutant]()
     found = Sum()
     try:
         for seed in range(asked.first, asked.first + asked.seeds):
             _play(seed, asked, found)
             found.tell(asked.seeds)
+            if asked.mutant and found.wrong:
+                break
     except KeyboardInterrupt:
         print(f"interrupted after {found.stories} of {asked.seeds} stories", file=sys.stderr)
         code = 130
@@ -86,6 +96,8 @@ def _play(seed: int, asked: argparse.Namespace, found: Sum) -> None:
             print(outcome, flush=True)
         return
     print(outcome, *outcome.violations, sep="\n  ", flush=True)
+    if asked.mutant:
+        return
     again = f"make explore SEEDS=1 ARGS='--first {seed}"
     print(f"  again: {again}{'' if asked.only is None else ' --only ' + ','.join(map(str, asked.only))}'", flush=True)
     numbers = [one.number for one in outcome.troubles]
@@ -101,6 +113,7 @@ def _asked(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=_positive, default=50, help="how many stories to play (default: 50)")
     parser.add_argument("--first", type=_natural, default=1, help="the seed of the first one (default: 1)")
     parser.add_argument("--only", type=_numbers, help="the numbers of the troubles to keep, such as 0,2; of one story")
+    parser.add_argument("--mutant", choices=MUTANTS, help="break the product in this way; ends when that is seen")
     parser.add_argument("--quiet", action="store_true", help="print only what was wrong, and the sum")
     asked = parser.parse_args(words)
     if asked.only is not None and asked.seeds != 1:

@@ -41,9 +41,21 @@ def test_a_story_that_breaks_a_rule_is_printed_with_the_command_for_its_fewest_t
     assert "troubles: " in quiet
 
 
+def test_a_mutant_ends_with_the_first_story_that_shows_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken: list[str] = []
+    monkeypatch.setitem(command.MUTANTS, "no-fence", lambda: broken.append("no-fence"))
+    monkeypatch.setattr(command, "play", drawn)
+    assert command.main(["--first", str(BAD - 1), "--seeds", "30", "--mutant", "no-fence"]) == 1
+    assert broken == ["no-fence"]
+    assert "2 stories, 0.020 virtual hours, 4 calls, 1 with a violation: 5" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        (["--mutant", "no-such"], "invalid choice: 'no-such'"),
         (["--seeds", "0"], "0 stories show nothing"),
         (["--seeds", "-3"], "'-3' is not a whole number"),
         (["--first", "one"], "'one' is not a whole number"),
