@@ -35,9 +35,9 @@ def a_read_that_fails_ends_the_loop(patch: pytest.MonkeyPatch) -> None:
 def a_drives_frame_is_unpacked_unseen(patch: pytest.MonkeyPatch) -> None:
     take_status = DriveAxis.take_status
 
-    def unpacked(self: DriveAxis, data: bytes) -> None:
+    def unpacked(self: DriveAxis, data: bytes, now_ns: int) -> None:
         table.STATUS.layout.unpack(data)
-        take_status(self, data)
+        take_status(self, data, now_ns)
 
     patch.setattr(DriveAxis, "take_status", unpacked)
 

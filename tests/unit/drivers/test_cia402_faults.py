@@ -1,6 +1,8 @@
 """What goes wrong on a CAN bus, beyond what is in the table of faults: what the others do, and what lasts."""
 
+import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -10,6 +12,7 @@ from tests.unit.drivers.fault_table import TABLE, Sick
 from tests.unit.drivers.legs import HALT, HIP, KNEE, Leg, leg, rig
 from trade.errors import DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, Tolerances, Trajectory, TrajectoryPoint
+from trade_drivers.vendors.cia402._cycle import DriveExchange
 from trade_hil_sim import (
     Command,
     Duplicate,
@@ -39,6 +42,26 @@ def test_a_fault_of_one_stops_the_others_of_its_group(leg: Leg, fault: str) -> N
     assert isinstance(moving.wait().error, ROWS[fault].error or ())
     assert leg.wait_for("at_rest", KNEE, started.t)
     assert leg.controlwords(KNEE, started.t)[-1] & HALT
+
+
+def test_a_drive_that_fails_before_it_has_taken_its_goal_moves_again_once_it_is_enabled(
+    leg: Leg, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hip = leg.attach().motor("leg.hip")
+    hip.enable()
+    write = DriveExchange.write_positions
+
+    def fail(self: DriveExchange, positions: Any, gate: Any) -> None:
+        write(self, positions, gate)
+        leg.sim.do(Emergency(ids=(HIP,), code=0x4310))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DriveExchange, "write_positions", fail)
+        with pytest.raises(DeviceFault, match="over-temperature"):
+            hip.move_to(0.3)
+    time.sleep(1.0)
+    hip.enable()
+    assert hip.move_to(0.3) == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize("fault", UNHEARD)

@@ -163,7 +163,7 @@ def test_a_step_leads_towards_the_aim_and_far_enough_to_keep_its_speed(
     here: int, there: int, accel: int, speed: int
 ) -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
-    axis.note(Sample(here, 0, 0, 0))
+    axis.note(Sample(here, 0, 0, 0), 0)
     step = axis.step(Goal(there, accel, speed), 0)
     assert (step.accel, step.speed) == (accel, speed)
     assert min(here, there) <= step.position <= max(here, there)
@@ -174,16 +174,16 @@ def test_a_step_leads_towards_the_aim_and_far_enough_to_keep_its_speed(
 @pytest.mark.parametrize(("passed_s", "hold"), [(0.1, 2200), (0.42, 2200), (0.43, None), (9.0, None)])
 def test_an_unheard_joint_gets_hold_commands_until_it_surely_rests_by_itself(passed_s: float, hold: int | None) -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
-    axis.note(Sample(2200, 160, 0, 10**9))
+    axis.note(Sample(2200, 160, 0, 10**9), 10**9)
     axis.sent_ns = 10**9 + 1
     assert axis.hold_counts(axis.sent_ns + int(passed_s * 1e9), BLIND_NS) == hold
-    axis.note(Sample(2300, 0, 0, axis.sent_ns + 1))
+    axis.note(Sample(2300, 0, 0, axis.sent_ns + 1), axis.sent_ns + 1)
     assert axis.hold_counts(axis.sent_ns + 10**10, BLIND_NS) == 2300
 
 
 def test_a_joint_unheard_on_its_way_gets_no_hold_beyond_its_last_goal() -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
-    axis.note(Sample(2200, 160, 0, 10**9))
+    axis.note(Sample(2200, 160, 0, 10**9), 10**9)
     axis.motion = SimpleNamespace(goal_of=lambda _: 4000)  # type: ignore[assignment]
     axis.sent, axis.sent_ns = 2300, 10**9 + 1
     assert axis.hold_counts(10**9 + 60_000_000, BLIND_NS) == 2296  # where it must have got to

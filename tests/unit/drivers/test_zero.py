@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from math import inf, tau
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -13,13 +14,14 @@ from tests.support.simulated_robots import HEAD
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Rig, written_now
 from tests.unit.drivers.legs import Leg
-from tests.unit.drivers.motor_rig import KINDS
+from tests.unit.drivers.motor_rig import KINDS, ODRIVE
 from tests.unit.drivers.tail_rig import TailRig
 from trade.errors import ConfigurationError, DeviceFault, TradeError
 from trade_drivers import AttachedRobot, Joint, Motor, parse
 from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.joints._zero import Zero
 from trade_drivers.plugins._validate import check
+from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_hil_sim import Absent, BrownOut, Place
 
 pytestmark = pytest.mark.virtual_time
@@ -142,6 +144,22 @@ def test_S23_a_dip_of_power_while_the_driver_is_up_is_a_fault_with_both_angles(b
     bench.lose_power(bench.kind.zero)
     wait_until(lambda: "its zero is in doubt" in fault(motor), "the dip is a fault")
     bench.refuses(motor, measured(motor), mark)
+
+
+@pytest.mark.parametrize(("stood_s", "doubts"), [(0.0, True), (0.6, False)])
+def test_S23_an_angle_is_where_the_joint_was_until_it_was_read_if_the_driver_stood_still(
+    stood_s: float, doubts: bool
+) -> None:
+    """A measurement counts from its request on, which may be long before the joint answered."""
+    [joint] = parse(ODRIVE, "tail.toml").joints[:1]
+    axis = OdriveAxis("rosie.tail.root", "can0", joint, 100.0)
+    axis.silent, axis.zero.period_s, axis.zero.unled_s = False, 0.01, 0.6
+    for angle_rad, asked_ns, late_s in ((0.0, 10**9, 0.0), (0.8, 10**9 + 10**7, stood_s)):
+        axis.asked_ns = asked_ns
+        axis.measured_at(axis.scale.counts(angle_rad), 0.0, 0.0, asked_ns + round(late_s * 1e9))
+        axis.motion = SimpleNamespace()  # type: ignore[assignment]
+        axis.tell_moving()
+    assert axis.zero.in_doubt == doubts
 
 
 @pytest.mark.parametrize("row", [("abc", "def"), (None, None), (inf, inf), (1.0, -1.0), (b"x", 1.0)], ids=str)

@@ -122,10 +122,13 @@ class Axis(BusDevice[Sample]):
         self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
         self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 
-    def note(self, sample: Sample) -> None:
-        """Stores a cyclic measurement, and compares its zero."""
+    def note(self, sample: Sample, now_ns: int) -> None:
+        """Stores a cyclic measurement, and compares its zero.
+
+        Its time is that of its request. The joint may have moved until now, if this thread stood still meanwhile.
+        """
         before, self.sample = self.sample, sample
-        self._compare_zero(sample, before)
+        self._compare_zero(sample, (now_ns - before.at_ns) / 1e9 if before is not None else 0.0)
         resting = abs(sample.velocity) <= self.grain.still_velocity and (
             before is not None and abs(sample.position - before.position) <= self.grain.still_counts
         )
@@ -200,8 +203,7 @@ class Axis(BusDevice[Sample]):
             raise self.faulty()
         return self.fresh(now_ns, stale_after_ns)
 
-    def _compare_zero(self, sample: Sample, before: Sample | None) -> None:
-        elapsed_s = (sample.at_ns - before.at_ns) / 1e9 if before is not None else 0.0
+    def _compare_zero(self, sample: Sample, elapsed_s: float) -> None:
         angle_rad = self.scale.angle_rad(sample.position)
         self.zero.measured(angle_rad, elapsed_s)
         if not self._doubted_zero and (doubt := self.zero.doubt(angle_rad)):

@@ -97,7 +97,7 @@ class MotorAxis(Axis):
         self.why_silent = ""
         if self.silent or not at_ns:
             return
-        self.note(Sample(round(position), round(velocity), round(effort), at_ns))
+        self.note(Sample(round(position), round(velocity), round(effort), at_ns), now_ns)
 
     def latch(self, fault: str) -> None:
         """Latches a fault until the motor is enabled again; the first one is kept."""

@@ -100,9 +100,9 @@ class ServoAxis(Axis, Generic[_Health]):
     def problem(self, before: _Health | None, now: _Health) -> str:
         """Returns the fault that forbids motion; empty if there is none."""
 
-    def take_sample(self, data: bytes, at_ns: int) -> None:
-        """Stores a cyclic measurement."""
-        self.note(self.sampled(data, at_ns))
+    def take_sample(self, data: bytes, at_ns: int, now_ns: int) -> None:
+        """Stores a cyclic measurement that was requested at a time and is read now."""
+        self.note(self.sampled(data, at_ns), now_ns)
 
     def take_health(self, data: bytes, at_ns: int) -> _Health:
         """Stores a slow measurement, and latches its fault."""

@@ -142,7 +142,8 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
     def stop_found_moving(self, axis: _Servo) -> None:
         """Makes a joint hold if it moves and no client owns the motion."""
         if axis.health is not None and axis.health.torque and axis.health.moving:
-            axis.take_sample(self.wire.read(axis.id, *axis.cyclic).data, self.clock())
+            asked_ns = self.clock()
+            axis.take_sample(self.wire.read(axis.id, *axis.cyclic).data, asked_ns, self.clock())
             self.hold([axis], self.clock())
 
     # --- parts of a cycle
@@ -165,7 +166,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             silent = {axis.id: axis for axis in part}
             for device_id, answer in self.wire.sync_read(part[0].cyclic[0], size, list(silent)):
                 if (axis := silent.pop(device_id, None)) is not None:
-                    axis.take_sample(answer.data, asked_ns)
+                    axis.take_sample(answer.data, asked_ns, self.clock())
                     if answer.alert and not axis.fault:
                         axis.health_due_ns = 0
             for axis in silent.values():

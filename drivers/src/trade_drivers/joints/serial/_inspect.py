@@ -161,7 +161,7 @@ def first_look(
     check_firmware(axis, kept.firmware(settings), key)
     check_homing(axis, settings, key)
     axis.take_health(health, asked_ns)
-    axis.take_sample(sample, asked_ns)
+    axis.take_sample(sample, asked_ns, clock_ns())
     return settings
 
 

@@ -75,7 +75,7 @@ class DriveAxis(MotorAxis):
 
     # --- received frames
 
-    def take_status(self, data: bytes) -> None:
+    def take_status(self, data: bytes, now_ns: int) -> None:
         """Handles TPDO1. Only the first TPDO1 after each SYNC counts."""
         asked_ns, self.asked_ns = self.asked_ns, 0
         if not asked_ns:
@@ -89,7 +89,7 @@ class DriveAxis(MotorAxis):
             return
         self.statusword = statusword
         self.state_now = state_of(self.statusword)
-        self.note(Sample(position, self.velocity, torque, asked_ns))
+        self.note(Sample(position, self.velocity, torque, asked_ns), now_ns)
         self._judge(asked_ns)
 
     def take_motion(self, data: bytes) -> None:

@@ -57,7 +57,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         self.rival = True
 
     def _listen_to(self, axis: DriveAxis) -> None:
-        self.net.hear(table.STATUS.base + axis.id, axis.take_status)
+        self.net.hear(table.STATUS.base + axis.id, lambda data: axis.take_status(data, self.clock()))
         self.net.hear(table.MOTION.base + axis.id, axis.take_motion)
         self.net.hear(table.EMERGENCY + axis.id, axis.take_emergency)
         self.net.hear(table.HEARTBEAT + axis.id, lambda data: axis.take_heartbeat(data, self.clock()))

@@ -47,7 +47,7 @@ def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: 
     ):
         yield from write(bus, job, axis, entry, value)
     yield from _climb(bus, job, axis, mode)
-    axis.fault, axis.ready, axis.entered = "", True, mode
+    axis.fault, axis.ready, axis.entered, axis.raised_ns = "", True, mode, 0
     axis.stream = bus.stream_for(axis, mode, axis.target)
 
 
