@@ -9,8 +9,8 @@ from tests.endurance.explore._records import Held, Moved, Stopped
 from tests.endurance.explore._robots import KINDS
 from trade_hil_sim import Entry, events
 
-_HELD_RAD: Final = 0.005
-"""Three counts of a servo: a joint that is made to hold where it was measured may turn so far."""
+_HELD_RAD: Final = 0.031
+"""A joint has arrived within 0.03 rad of its goal if something blocks it, and takes the rest once that is gone."""
 _REFUSED: Final = frozenset({"LockLost", "LockedByOther", "NotLocked"})
 
 

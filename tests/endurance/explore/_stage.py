@@ -247,6 +247,9 @@ class Stage:
     def judge(self) -> None:
         for bus in self.buses.values():
             bus.do(Heal())
+        for kind in self.cast.robots:
+            if kind.group not in self.attached:  # its device was silent each time that its driver was started
+                self.attach(kind)
         self.clock.sleep(_LEFT_S)
         found = self.outcome.violations
         for system in ("judge", "planner"):

@@ -20,8 +20,10 @@ from trade_drivers.bus.can import CanPort
 from trade_hil_sim.cia402._node import Node
 
 SEEDS = 50
-FOUND = [149]
-"""Stories that found a fault. 149: a wall clock that is set back, and a bus thread that waits for it."""
+FOUND = [149, 1299, 1463]
+"""Stories that found a fault. 149: a wall clock that is set back, and a bus thread that waits for it. 1299: a driver
+that stood still in a cycle took the motion of its joint meanwhile for a lost zero. 1463: a drive that failed before it
+had taken its goal took no other one."""
 _MUTANT_STORIES = 12
 """A mutant has to be seen in one of so many stories that it concerns."""
 
@@ -111,7 +113,7 @@ CAN = {"rosie.leg", "rosie.arm", "rosie.hand"}
         (_no_lease_ends, "still has", Concerned({"kill"})),
         (_gateway_forgets_locks, "and (worker|planner) held", Concerned(gateway=True)),
         (_gateway_drops_estops, "stop was confirmed", Concerned({"estop"}, operator_beyond=True)),
-        (_drives_need_no_heartbeat, "longer than", Concerned(seeds=[270])),  # a slow move, and no cable
+        (_drives_need_no_heartbeat, "longer than", Concerned(seeds=[420])),  # a slow move, and no cable
         (_bus_waits_by_wall_clock, "cannot be used at the end", Concerned(seeds=[149])),
     ],
 )

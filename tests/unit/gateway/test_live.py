@@ -28,8 +28,6 @@ from trade_gateway.recording._channels import (
 )
 from trade_gateway.recording._live import Live
 
-pytestmark = pytest.mark.virtual_time
-
 
 @pytest.fixture(scope="module", autouse=True)
 def _runtime() -> None:
@@ -106,7 +104,6 @@ def test_nothing_comes_in_from_a_viewer(live: Live) -> None:
             assert "does not support" in said["message"]
 
 
-@pytest.mark.real_clock
 def test_a_viewer_with_another_protocol_is_rejected_and_reported(live: Live) -> None:
     with pytest.raises(InvalidStatus):
         connect(live.url, subprotocols=[Subprotocol("foxglove.websocket.v1")]).__enter__()
@@ -114,7 +111,6 @@ def test_a_viewer_with_another_protocol_is_rejected_and_reported(live: Live) -> 
     wait_until(lambda: said.extend(live.notices()) or any("handshake failed" in line for line in said))
 
 
-@pytest.mark.real_clock
 def test_a_late_page_gets_the_current_locks_and_faults_and_no_other_page_does(live: Live) -> None:
     live.write(Message(LOCKS, 3, 3, encoded(Locks(locks=[]))))
     for message in (fault("hot"), fault("silent", "rosie.tail"), fault("")):

@@ -226,6 +226,7 @@ def asked_until(star: Star, reader: str, pattern: str, expected: list[str]) -> b
     return got == expected
 
 
+@pytest.mark.real_clock
 def test_only_the_container_itself_answers_for_what_it_offers(star: Star) -> None:
     drv, mallory = "registry/*/drv/c/e1/*", "registry/*/mallory/c/e1/*"
     forged, own = "registry/rosie.neck/drv/c/e1/P", "registry/rosie.neck/mallory/c/e1/P"

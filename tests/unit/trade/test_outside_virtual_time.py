@@ -63,14 +63,20 @@ async def _connect() -> None:
     await asyncio.open_connection("127.0.0.1", 9)
 
 
+async def _connect_unix() -> None:
+    await asyncio.open_unix_connection("/nowhere")
+
+
 def test_a_real_socket_is_refused_by_name_and_a_virtual_one_says_that_none_listens(clock: VirtualTime) -> None:
     with (
         contextlib.closing(_socket.socket()) as real,
         pytest.raises(VirtualTimeError, match=r"a real socket was used \(to \('192\.0\.2\.1', 9\)\)"),
     ):
         real.connect(("192.0.2.1", 9))
-    with pytest.raises(VirtualTimeError, match=r"asyncio's create_connection was called"):
+    with pytest.raises(ConnectionRefusedError, match=r"no thread of this test listens on .*9.*no other process"):
         asyncio.run(_connect())
+    with pytest.raises(VirtualTimeError, match=r"asyncio's create_unix_connection was called"):
+        asyncio.run(_connect_unix())
     with pytest.raises(ConnectionRefusedError, match=r"no thread of this test listens on .*9.*no other process"):
         socket.create_connection(("127.0.0.1", 9))
 

@@ -144,14 +144,6 @@ def test_an_http_server_and_its_clients_are_on_the_same_clock(clock: VirtualTime
     thread.join(5)
 
 
-def test_a_loop_of_asyncio_reaches_no_other_process(clock: VirtualTime) -> None:
-    async def connect() -> None:
-        await asyncio.open_connection("127.0.0.1", 1)
-
-    with pytest.raises(ConnectionRefusedError, match="virtual time reaches no other process"):
-        asyncio.run(connect())
-
-
 class _Worker(threading.Thread):
     def run(self) -> None:
         time.sleep(7)
