@@ -19,10 +19,10 @@ from trade import Container
 PAGE: Final = DOCS / "architecture.md"
 TEXT: Final = PAGE.read_text(encoding="utf-8")
 PACKAGES: Final = {
-    "trade": "trade/src",
-    "trade_drivers": "drivers/src",
-    "trade_gateway": "gateway/src",
-    "trade_hil_sim": "hil-sim/src",
+    "trade": ".",
+    "trade_drivers": "drivers",
+    "trade_gateway": "gateway",
+    "trade_hil_sim": "hil-sim",
 }
 """Where each of them is."""
 LAYERS: Final = "The rooms of trade: each imports only from those below it"

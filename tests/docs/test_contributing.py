@@ -12,8 +12,15 @@ from typing import Final
 ROOT: Final = Path(__file__).parents[2]
 PAGE: Final = ROOT / "CONTRIBUTING.md"
 MARKS: Final = ("<!-- map: made by test_the_map_has_every_room -->\n", "<!-- end of map -->\n")
-HOUSES: Final = {"trade": "trade", "drivers": "trade_drivers", "gateway": "trade_gateway", "hil-sim": "trade_hil_sim"}
-"""By folder, the package that programs import; plug-ins for pytest are beside it."""
+HOUSES: Final = {
+    "trade": ".",
+    "pytest_trade": ".",
+    "trade_drivers": "drivers",
+    "trade_gateway": "gateway",
+    "trade_hil_sim": "hil-sim",
+    "pytest_trade_hil_sim": "hil-sim",
+}
+"""Each package, and the folder that it is in."""
 
 
 def test_the_map_has_every_room() -> None:
@@ -29,16 +36,24 @@ def test_the_map_has_every_room() -> None:
 
 def _rows() -> Iterator[str]:
     """Each package, each room in it, by the first line that it says of itself."""
-    for folder, package in HOUSES.items():
-        packages = {path.parent for path in (ROOT / folder / "src").glob("*/__init__.py")}
-        for house in sorted(packages, key=lambda path: (path.name != package, path)):
-            yield f"| **`{house.relative_to(ROOT)}`** | {_first_line(house)} |\n"
-            for room in sorted(path.parent for path in house.glob("*/**/__init__.py")):
+    for package in HOUSES:
+        house = _house(package)
+        yield f"| **`{house.relative_to(ROOT)}`** | {_first_line(house)} |\n"
+        for room in sorted(path.parent for path in _sources(package) if path.name == "__init__.py"):
+            if room != house:
                 yield f"| `{room.relative_to(house)}` | {_first_line(room)} |\n"
 
 
+def _house(package: str) -> Path:
+    return ROOT / HOUSES[package] / package
+
+
+def _sources(package: str) -> list[Path]:
+    return list(_house(package).rglob("*.py"))
+
+
 def test_no_room_has_more_than_20_modules() -> None:
-    sources = [path for folder in HOUSES for path in (ROOT / folder / "src").rglob("*.py")]
+    sources = [path for package in HOUSES for path in _sources(package)]
     modules = Counter(path.parent for path in sources)
     assert len(modules) > 50
     assert {str(room): count for room, count in modules.items() if count > 20} == {}
@@ -56,10 +71,9 @@ def test_no_modules_import_each_other_while_they_are_loaded() -> None:
 @cache
 def _modules() -> dict[str, Path]:
     found: dict[str, Path] = {}
-    for folder in HOUSES:
-        source = ROOT / folder / "src"
-        for path in source.rglob("*.py"):
-            parts = path.relative_to(source).with_suffix("").parts
+    for package, folder in HOUSES.items():
+        for path in _sources(package):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 

@@ -74,7 +74,7 @@ def test_cells_of_tables_are_short(page: Path) -> None:
 def test_tests_named_in_the_pages_exist() -> None:
     tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     tests += "\n".join(
-        path.read_text(encoding="utf-8") for path in (ROOT / "drivers/src/trade_drivers/testing").glob("*.py")
+        path.read_text(encoding="utf-8") for path in (ROOT / "drivers/trade_drivers/testing").glob("*.py")
     )
     named = {name for page in PAGES for name in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))}
     missing = sorted(name for name in named if f"def {name}" not in tests)

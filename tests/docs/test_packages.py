@@ -61,7 +61,8 @@ def test_the_commands_of_the_gateways_page(system: str, folder: Path) -> None:
 @pytest.mark.parametrize("package", [*PACKAGES, "gateway"])
 def test_a_page_has_how_it_is_installed_and_links_that_lead_somewhere(package: str) -> None:
     text = page(package).read_text(encoding="utf-8")
-    name = re.search(r'^name = "(.*)"', (ROOT / package / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
+    project = ROOT if package == "trade" else ROOT / package
+    name = re.search(r'^name = "(.*)"', (project / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
     assert name
     assert text.startswith(f"# {name[1]}\n")
     assert re.search(rf'pip install "?{name[1]}\b', text)

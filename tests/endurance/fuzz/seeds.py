@@ -40,7 +40,7 @@ from trade_hil_sim.dynamixel import encode as dynamixel_packet
 from trade_hil_sim.robotiq._protocol import frame as modbus_frame
 
 VECTORS: Final = Path(__file__).parents[3] / "docs" / "wire-vectors.json"
-PACKAGE: Final = Path(__file__).parents[3] / "gateway/src/trade_gateway/talk/lexicon.toml"
+PACKAGE: Final = Path(__file__).parents[3] / "gateway/trade_gateway/language/lexicon.toml"
 _OF_KIND: Final = {
     "Call": "wire-call",
     "Reply": "wire-reply",

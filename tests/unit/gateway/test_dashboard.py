@@ -11,7 +11,7 @@ from trade_gateway.dashboard import pages
 
 pytestmark = pytest.mark.virtual_time
 
-STATIC = Path(__file__).parents[3] / "gateway" / "src" / "trade_gateway" / "dashboard" / "static"
+STATIC = Path(__file__).parents[3] / "gateway" / "trade_gateway" / "dashboard" / "static"
 
 
 def test_the_page_and_its_files_are_public_and_run_no_foreign_script(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_a_url_on_this_host_or_encrypted_is_taken_and_has_calls_noted(url: str) 
 
 
 def test_the_core_alone_does_not_load_it() -> None:
-    source = Path(__file__).parents[3] / "trade/src/trade"
+    source = Path(__file__).parents[3] / "trade"
     paths = sorted(source.rglob("*.py"))
     assert len(paths) > 100
     for path in paths:

@@ -336,6 +336,6 @@ BOUND_AT_IMPORT = re.compile(r" = (time|threading|queue)\.\w+( *$|[,)])")
 
 @pytest.mark.parametrize("package", ["trade", "drivers", "gateway", "hil-sim"])
 def test_no_default_argument_binds_a_clock_or_a_thread(package: str) -> None:
-    modules = {path: path.read_text() for path in (ROOT / package).glob("src/**/*.py") if path.parent.name != "virtual"}
+    modules = {path: path.read_text() for path in (ROOT / package).rglob("*.py") if path.parent.name != "virtual"}
     assert len(modules) > 20
     assert [path.name for path, source in modules.items() if BOUND_AT_IMPORT.search(source)] == []
