@@ -154,19 +154,19 @@ class _Stop:
     """Waits until it must end: on a signal, the parent's end, or the end of standard input."""
 
     def __init__(self) -> None:
-        self._bell, self._rope = os.pipe()
-        os.set_blocking(self._rope, False)
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_write, False)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         with suppress(OSError):
-            os.write(self._rope, b"!")
+            os.write(self._wake_write, b"!")
 
     def wait(self, parent: int | None, stdin: int | None) -> None:
         """Return when the simulator must end."""
         with ExitStack() as stack:
-            watched = [self._bell]
+            watched = [self._wake_read]
             if parent is not None:
                 try:
                     pidfd = os.pidfd_open(parent)
@@ -187,8 +187,8 @@ class _Stop:
         """Restore the signal handlers and close the pipe."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
-        os.close(self._bell)
-        os.close(self._rope)
+        os.close(self._wake_read)
+        os.close(self._wake_write)
 
 
 if __name__ == "__main__":

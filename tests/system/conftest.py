@@ -264,7 +264,7 @@ def keeping(system: str, tmp_path: Path, start_container: Callable[..., Containe
 
     def keep(text: str, grace_s: float = 20.0) -> Keeping:
         made.append(Keeping(tmp_path, start_container(f"door{len(made)}"), grace_s))
-        made[-1].go_by(text)
+        made[-1].set_children(text)
         return made[-1]
 
     yield keep

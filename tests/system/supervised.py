@@ -76,9 +76,9 @@ class Keeping:
         self.system = member.settings.system
         self.member = member
 
-    def go_by(self, text: str) -> None:
+    def set_children(self, text: str) -> None:
         self.file.write_text(f'system = "{self.system}"\n{text}')
-        self.supervisor.go_by(read_gateway_file(self.file).children)
+        self.supervisor.set_children(read_gateway_file(self.file).children)
 
     def child(self, name: str) -> ChildInfo | None:
         return next((info for info in self.supervisor.children() if info.name == name), None)

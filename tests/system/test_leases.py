@@ -54,8 +54,8 @@ def pair(system: str, tmp_path: Path, start_container: Callable[..., Container])
 def test_P71_containers_of_a_lost_gateway_move_to_the_standby_with_state_and_return_by_hand(
     pair: Pair,
 ) -> None:
-    pair.base.go_by(STANDBY + COUNTER)
-    pair.rover.go_by(LEASED + COUNTER)
+    pair.base.set_children(STANDBY + COUNTER)
+    pair.rover.set_children(LEASED + COUNTER)
     pair.rover.become("a", "up")
     wait_until(lambda: pair.base.become("a", "elsewhere").why == "rover has it", "rover has asked")
     call("count")
@@ -76,8 +76,8 @@ def test_P71_containers_of_a_lost_gateway_move_to_the_standby_with_state_and_ret
 
 
 def test_a_container_given_up_where_it_is_leased_is_tried_on_the_standby(pair: Pair) -> None:
-    pair.base.go_by(STANDBY + COUNTER)
-    pair.rover.go_by(LEASED + 'providers = [{ class = "tiny:Dies", groups = ["hall"] }]\n')
+    pair.base.set_children(STANDBY + COUNTER)
+    pair.rover.set_children(LEASED + 'providers = [{ class = "tiny:Dies", groups = ["hall"] }]\n')
     pair.rover.become("a", "given up")
     pair.base.become("a", "up")
     assert pair.rover.supervisor.restart("a", "anna")
@@ -89,14 +89,14 @@ def test_a_container_given_up_where_it_is_leased_is_tried_on_the_standby(pair: P
 def test_S20_what_drives_something_of_its_host_is_leased_only_if_its_class_is_relocatable(
     pair: Pair, class_: str, state: str
 ) -> None:
-    pair.base.go_by(STANDBY + COUNTER)
-    pair.rover.go_by(LEASED + f'providers = [{{ class = "tiny:{class_}", groups = ["hall"] }}]\n')
+    pair.base.set_children(STANDBY + COUNTER)
+    pair.rover.set_children(LEASED + f'providers = [{{ class = "tiny:{class_}", groups = ["hall"] }}]\n')
     found = pair.rover.become("a", state)
     assert ("it drives wheel of this host" in found.why) == (state == "given up")
 
 
 def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
-    pair.base.go_by(STANDBY + COUNTER)
+    pair.base.set_children(STANDBY + COUNTER)
     pair.base.become("a", "elsewhere")
     there = pair.base.supervisor.stand_in("a")
     wait_until(lambda: there.lease(None, "rover", "").turn, "what it had before is known to have ended")
@@ -128,14 +128,14 @@ def test_a_container_moves_with_its_state_from_a_busy_host_to_the_least_loaded_o
     standby = STANDBY.replace('"rover"', '["rover", "cart"]')
     cart = Keeping(tmp_path, start_container("cart"), 20.0)
     try:
-        pair.base.go_by(f"{standby}move_above = 1.0\n{COUNTER}")
-        pair.rover.go_by(LEASED + COUNTER)
+        pair.base.set_children(f"{standby}move_above = 1.0\n{COUNTER}")
+        pair.rover.set_children(LEASED + COUNTER)
         first = pair.rover.become("a", "up")
-        cart.go_by(LEASED + COUNTER)
+        cart.set_children(LEASED + COUNTER)
         call("count")
         there = pair.base.supervisor.stand_in("a")
         wait_until(lambda: there._loads._loads.keys() == {"", "rover", "cart"}, "base knows the loads of all hosts")
-        pair.base.go_by(standby + COUNTER)  # from now on, the test says what the loads are
+        pair.base.set_children(standby + COUNTER)  # from now on, the test says what the loads are
         wait_until(lambda: "cart" in there._arbiter.asked_at, "cart asks for it")
         for s in (6.0, 4.0, 2.0, 0.0):
             now = uptime_s() - s

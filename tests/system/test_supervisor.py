@@ -119,7 +119,7 @@ def test_a_child_that_always_fails_is_given_up_with_its_reason_until_its_file_ch
     assert why in given_up.why
     assert kept.texts()[-1].startswith("a ended 3 times in 300 s and is given up; the last time it ")
     assert sum("back in" in text for text in kept.texts()) == 2
-    kept.go_by(f"[container.a]\nrestarts = 2\n{COUNTER}")
+    kept.set_children(f"[container.a]\nrestarts = 2\n{COUNTER}")
     kept.become("a", "up")
     assert call("count") == 1
 
@@ -167,7 +167,7 @@ def test_only_what_is_started_otherwise_than_before_starts_again(keeping: Callab
     kept = keeping(f"[container.a]\n{COUNTER}{others}")
     before = {name: kept.become(name, "up").pid for name in "abc"}
     call("count")
-    kept.go_by(
+    kept.set_children(
         f"[container.a]\n{COUNTER}allow = ['tiny:*']\n[container.b]\nproviders = []\nrestarts = 1\n"
         f"[container.d]\n{COUNTER}"
     )

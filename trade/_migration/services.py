@@ -108,9 +108,9 @@ class MigrationServices:
         self._departing.restore_state(service, state, served_call().caller)
 
     @service
-    def prepare_arrival(self, luggage: ProviderSnapshot) -> Prepared:
+    def prepare_arrival(self, snapshot: ProviderSnapshot) -> Prepared:
         """For containers: create the arriving provider with its state; it is closed if it is not fetched in time."""
-        return self._arriving.prepare(luggage, served_call().caller)
+        return self._arriving.prepare(snapshot, served_call().caller)
 
     @service
     def arrive(self, ticket: str) -> None:

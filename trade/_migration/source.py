@@ -143,8 +143,8 @@ class MigrationSource:
         self._require_free(service, offer)
         there = self._target(to)
         with self._still(service, offer, f"migrating to container {there.container}") as still:
-            luggage = self._packed(service, offer, there, args)
-            prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(luggage)
+            snapshot = self._packed(service, offer, there, args)
+            prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(snapshot)
             keys = _keys(there.key.address, prepared)
             try:
                 self._require(who, service.key, offer)  # again, as time has passed

@@ -58,7 +58,7 @@ class Prepared(Struct, frozen=True):
 class _Ready(Struct, eq=False):
     caller: str
     provider: object
-    luggage: ProviderSnapshot
+    snapshot: ProviderSnapshot
     built: Built
     ending: contextlib.ExitStack
     """Closes the provider; emptied once it is offered."""
@@ -104,7 +104,7 @@ class MigrationTarget:
         self._arrived: dict[str, None] = {}
         """The last tickets that were used."""
 
-    def prepare(self, luggage: ProviderSnapshot, caller: str) -> Prepared:
+    def prepare(self, snapshot: ProviderSnapshot, caller: str) -> Prepared:
         """Create the provider and give it its state; no client can call it yet.
 
         Raises:
@@ -114,36 +114,36 @@ class MigrationTarget:
             LockedByOther, ConfigurationError: resources that it needs are taken here.
             Busy: too many providers are being prepared.
         """
-        self._require(luggage, caller)
+        self._require(snapshot, caller)
         if not self._places.acquire(blocking=False):
             raise Busy(service="trade.prepare_arrival", container=self._own.container)
         ticket = secrets.token_hex(8)
         with contextlib.ExitStack() as undo:
             undo.callback(self._places.release)
             ending = undo.enter_context(contextlib.ExitStack())
-            made, built = self._make(luggage, ending)
-            self._restore(luggage, made, built, undo)
+            made, built = self._make(snapshot, ending)
+            self._restore(snapshot, made, built, undo)
             due = self._scheduler.due(lambda: self._over(ticket))
             with self._lock:
-                self._ready[ticket] = _Ready(caller, made, luggage, built, ending, undo.pop_all(), due)
+                self._ready[ticket] = _Ready(caller, made, snapshot, built, ending, undo.pop_all(), due)
         due.at(time.monotonic_ns() + int(TICKET_S * 1e9))
         domain, _, provider = built.place.partition("/")
         return Prepared(ticket, domain, provider, tuple(built.services))
 
-    def _require(self, luggage: ProviderSnapshot, caller: str) -> None:
-        for group in luggage.groups or (domain_of(luggage.groups),):
-            self._access.require(caller, "register", group, f"{luggage.class_path} in {group}")
+    def _require(self, snapshot: ProviderSnapshot, caller: str) -> None:
+        for group in snapshot.groups or (domain_of(snapshot.groups),):
+            self._access.require(caller, "register", group, f"{snapshot.class_path} in {group}")
 
-    def _make(self, luggage: ProviderSnapshot, ending: contextlib.ExitStack) -> tuple[object, Built]:
-        kind = self._making.find(luggage.class_path)
-        implements = [self._interface(path) for path in luggage.implements]
-        if fingerprint(kind, implements, self._codec) != luggage.fingerprint:
+    def _make(self, snapshot: ProviderSnapshot, ending: contextlib.ExitStack) -> tuple[object, Built]:
+        kind = self._making.find(snapshot.class_path)
+        implements = [self._interface(path) for path in snapshot.implements]
+        if fingerprint(kind, implements, self._codec) != snapshot.fingerprint:
             problem = "its class is another version there: other services, other arguments or another state_version"
-            raise self._refusal(luggage, problem)
-        made = self._making.make(kind, luggage.args)
+            raise self._refusal(snapshot, problem)
+        made = self._making.make(kind, snapshot.args)
         ending.callback(end, made)
-        groups = checked_groups(made, luggage.groups)
-        built = self._providers.build(made, groups, implements, meta=luggage.meta)
+        groups = checked_groups(made, snapshot.groups)
+        built = self._providers.build(made, groups, implements, meta=snapshot.meta)
         ending.callback(self._providers.discard, built)
         return made, built
 
@@ -154,23 +154,23 @@ class MigrationTarget:
             raise NoSuchClass(class_path=path, container=here, reason="nothing there has imported this interface")
         return found
 
-    def _restore(self, luggage: ProviderSnapshot, made: object, built: Built, undo: contextlib.ExitStack) -> None:
+    def _restore(self, snapshot: ProviderSnapshot, made: object, built: Built, undo: contextlib.ExitStack) -> None:
         """Restore under a lock, so that the permit refuses every command that the provider gives meanwhile (S18)."""
         used = {resource for service in built.services.values() for resource in service.resources}
-        purpose = f"{luggage.class_path} arriving"
+        purpose = f"{snapshot.class_path} arriving"
         still = undo.enter_context(
             self._freezing.frozen(
                 built.services, lambda: [one for one in used if not self._providers.groups_of(one.name)], purpose
             )
         )
-        if luggage.has_state:
+        if snapshot.has_state:
             try:
-                restore(made, luggage.state)
+                restore(made, snapshot.state)
                 still.check()
             except Exception as error:
                 with contextlib.suppress(LockedByOther):
                     still.seal()  # it may still run, and must not move anything
-                raise self._refusal(luggage, f"restore_state there: {type(error).__name__}: {error}") from error
+                raise self._refusal(snapshot, f"restore_state there: {type(error).__name__}: {error}") from error
 
     def arrive(self, ticket: str, caller: str) -> None:
         """Offer a prepared provider; a ticket is valid once.
@@ -191,13 +191,13 @@ class MigrationTarget:
                 del self._arrived[forgotten]
         ready.due.cancel()
         try:
-            self._require(ready.luggage, caller)
+            self._require(ready.snapshot, caller)
             self._providers.host(ready.built)
         except BaseException:
             self._arrived.pop(ticket, None)
             ready.standing.close()
             raise
-        self._making.keep(ready.provider, ready.luggage.args)
+        self._making.keep(ready.provider, ready.snapshot.args)
         ready.ending.pop_all()
         ready.standing.close()
 
@@ -212,11 +212,11 @@ class MigrationTarget:
         """
         named = dict(args) if isinstance(args, Mapping) else tuple(args)
         version = fingerprint(self._making.find(class_path), (), self._codec)
-        luggage = ProviderSnapshot(
+        snapshot = ProviderSnapshot(
             class_path=class_path, fingerprint=version, args=named, groups=groups, has_state=True, state=state
         )
         try:
-            prepared = self.prepare(luggage, self._own.identity)
+            prepared = self.prepare(snapshot, self._own.identity)
         except CannotMigrate as refused:
             here = self._own.container
             raise CannotInstantiate(class_path=class_path, container=here, problem=refused.problem) from refused
@@ -248,5 +248,5 @@ class MigrationTarget:
         for ticket in list(self._ready):
             self._over(ticket)
 
-    def _refusal(self, luggage: ProviderSnapshot, problem: str) -> CannotMigrate:
-        return CannotMigrate(provider=luggage.class_path, to=self._own.container, problem=problem)
+    def _refusal(self, snapshot: ProviderSnapshot, problem: str) -> CannotMigrate:
+        return CannotMigrate(provider=snapshot.class_path, to=self._own.container, problem=problem)

@@ -2,10 +2,10 @@
 
 from trade_drivers.bus._jobs import Gate, PortLost, Steps, Work
 from trade_drivers.bus._thread import BusThread, Port, start_thread
-from trade_drivers.joints._axis import Axis, AxisT, Goal, Grain, Sample
+from trade_drivers.joints._axis import Axis, AxisT, Goal, Resolution, Sample
 from trade_drivers.joints._cycle import Exchange
 from trade_drivers.joints._inspect import Unfit, check_joints, check_least, check_rate
-from trade_drivers.joints._jobs import Manner
+from trade_drivers.joints._jobs import ControlMode
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
 from trade_drivers.joints._ramp import Ramp, towards
@@ -17,15 +17,15 @@ __all__ = [
     "AxisT",
     "BusMotor",
     "BusThread",
+    "ControlMode",
     "Exchange",
     "Gate",
     "Goal",
-    "Grain",
-    "Manner",
     "Motion",
     "Port",
     "PortLost",
     "Ramp",
+    "Resolution",
     "Sample",
     "Steps",
     "Unfit",

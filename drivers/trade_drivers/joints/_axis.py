@@ -24,7 +24,7 @@ AxisT = TypeVar("AxisT", bound="Axis")
 _AT_REST: Final = 2
 
 
-class Grain(Struct, frozen=True):
+class Resolution(Struct, frozen=True):
     """The resolution of a device's counts, and its thresholds for rest and arrival."""
 
     rad: float
@@ -65,22 +65,22 @@ class Goal(Struct, frozen=True, gc=False):
 class Scale:
     """Converts counts of the device to radians of the joint and back."""
 
-    def __init__(self, joint: Joint, grain: Grain) -> None:
+    def __init__(self, joint: Joint, resolution: Resolution) -> None:
         self._sign = -1 if joint.reversed else 1
         self._offset_rad = joint.offset_rad
-        self._grain = grain
+        self._resolution = resolution
 
     def counts(self, angle_rad: float) -> float:
         """Returns an angle in counts, not rounded."""
-        return self._grain.centre + (angle_rad - self._offset_rad) * self._sign / self._grain.rad
+        return self._resolution.centre + (angle_rad - self._offset_rad) * self._sign / self._resolution.rad
 
     def angle_rad(self, counts: int) -> float:
         """Returns the joint angle of a position."""
-        return self._offset_rad + (counts - self._grain.centre) * self._sign * self._grain.rad
+        return self._offset_rad + (counts - self._resolution.centre) * self._sign * self._resolution.rad
 
     def speed_rad_s(self, counts: int) -> float:
         """Returns the joint's speed, with its sign."""
-        return counts * self._sign * self._grain.rad_s
+        return counts * self._sign * self._resolution.rad_s
 
     def load(self, counts: int, full: int) -> float:
         """Returns the effort as a fraction of ``full``, with the joint's sign, at most 1."""
@@ -97,11 +97,11 @@ class Axis(BusDevice[Sample]):
     )
     """The remedy if its zero may have been lost."""
 
-    def __init__(self, name: str, bus: str, joint: Joint, grain: Grain, coupled: Sequence[str] = ()) -> None:
+    def __init__(self, name: str, bus: str, joint: Joint, resolution: Resolution, coupled: Sequence[str] = ()) -> None:
         super().__init__(name, bus, Resource(name, coupled=coupled))
         self.joint = joint
         self.id = joint.id
-        self.use(grain)
+        self.use(resolution)
         self.remedy = ""
         """The remedy for a fault that the device itself has latched."""
         self.ready = False
@@ -112,15 +112,15 @@ class Axis(BusDevice[Sample]):
         self.zero = Zero(joint, within_turn=self.within_turn)
         self._doubted_zero = False
 
-    def use(self, grain: Grain) -> None:
+    def use(self, resolution: Resolution) -> None:
         """Uses a resolution: limits and ranges are in its counts."""
         joint = self.joint
-        self.grain = grain
-        self.scale = Scale(joint, grain)
+        self.resolution = resolution
+        self.scale = Scale(joint, resolution)
         ends = sorted((self.scale.counts(joint.min_rad), self.scale.counts(joint.max_rad)))
         self.low, self.high = ceil(ends[0] - 0.5), floor(ends[1] + 0.5)  # nearest counts: a file has fewer digits
-        self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
-        self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
+        self.speed_counts = max(1, floor(joint.max_speed_rad_s / resolution.rad_s))
+        self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / resolution.rad_s2))
 
     def note(self, sample: Sample, now_ns: int) -> None:
         """Stores a cyclic measurement, and compares its zero.
@@ -129,8 +129,8 @@ class Axis(BusDevice[Sample]):
         """
         before, self.sample = self.sample, sample
         self._compare_zero(sample, (now_ns - before.at_ns) / 1e9 if before is not None else 0.0)
-        resting = abs(sample.velocity) <= self.grain.still_velocity and (
-            before is not None and abs(sample.position - before.position) <= self.grain.still_counts
+        resting = abs(sample.velocity) <= self.resolution.still_velocity and (
+            before is not None and abs(sample.position - before.position) <= self.resolution.still_counts
         )
         self.still = self.still + 1 if resting else 0
         self.misses = 0
@@ -154,7 +154,7 @@ class Axis(BusDevice[Sample]):
         if under_way or not (self.silent or self.doubted):
             self.resource.moving = under_way or (self.still < _AT_REST and self.may_hold_torque)
         if not (self.silent or self.doubted) and (under_way or not self.still):
-            measured = 0 if self.sample is None else abs(self.sample.velocity) * self.grain.rad_s
+            measured = 0 if self.sample is None else abs(self.sample.velocity) * self.resolution.rad_s
             self.zero.moving(self.joint.max_speed_rad_s if under_way else measured)
 
     @property
@@ -177,7 +177,7 @@ class Axis(BusDevice[Sample]):
         if self.motion is None or age_s < 0.05:
             return sample.position
         goal = self.motion.goal_of(self)
-        travelled = sample.velocity * self.grain.rad_s / self.grain.rad * min(age_s, blind_ns / 1e9)
+        travelled = sample.velocity * self.resolution.rad_s / self.resolution.rad * min(age_s, blind_ns / 1e9)
         low, high = sorted((sample.position, goal))
         return round(max(low, min(high, sample.position + travelled)))
 

@@ -44,8 +44,8 @@ def _check_braking(axis: Axis) -> None:
 def check_least(axis: Axis, least: str) -> None:
     """Raises ``Unfit`` for limits below the device's resolution; ``least`` describes it."""
     for key, value, count in (
-        (".max_speed_rad_s", axis.joint.max_speed_rad_s, axis.grain.rad_s),
-        (".max_accel_rad_s2", axis.joint.max_accel_rad_s2, axis.grain.rad_s2),
+        (".max_speed_rad_s", axis.joint.max_speed_rad_s, axis.resolution.rad_s),
+        (".max_accel_rad_s2", axis.joint.max_accel_rad_s2, axis.resolution.rad_s2),
     ):
         if value < count:
             raise Unfit(f"{value:.3g} is below {count:.3g}, {least}", key)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
 
-class Manner(Enum):
+class ControlMode(Enum):
     """The kind of a motion's commands, for devices with a mode for each."""
 
     GOALS = "goals"

@@ -9,7 +9,7 @@ from trade.errors import MotionStopped, TradeError
 from trade_drivers.bus._gate import Command, Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import Manner
+from trade_drivers.joints._jobs import ControlMode
 from trade_drivers.joints._profile import Leg, together
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class _Progress(Struct):
 class Motion(Command[AxisT, "Exchange[AxisT]"]):
     """A command that moves joints, and is watched until it ends."""
 
-    manner = Manner.GOALS
+    control_mode = ControlMode.GOALS
     attended_ns = 0
     """When it was last checked, by the lasting clock."""
 
@@ -112,7 +112,7 @@ class Move(Motion[AxisT]):
             abs(self._goals[axis] - sample.position) for axis, sample in zip(self.devices, samples, strict=True)
         ]
         legs = [
-            Leg(distance, speed, axis.accel_counts, axis.grain)
+            Leg(distance, speed, axis.accel_counts, axis.resolution)
             for axis, distance, speed in zip(self.devices, distances, self._speeds, strict=True)
         ]
         profiles = together(legs)
@@ -154,16 +154,18 @@ class Move(Motion[AxisT]):
             progress.waiting_s += elapsed_s
         if axis.still < 2:
             return False
-        return distance <= axis.grain.arrived or (distance <= axis.grain.near and progress.waiting_s > _SETTLING_S)
+        return distance <= axis.resolution.arrived or (
+            distance <= axis.resolution.near and progress.waiting_s > _SETTLING_S
+        )
 
     def _stuck(self, away: Sequence[AxisT]) -> TradeError | None:
         """Returns the fault of a joint that was measured without progress towards its goal, of those not there yet."""
         for axis in away:
             progress = self._progress[axis]
             late = progress.watched_s > self._patience_s
-            blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
+            blocked = progress.closest > axis.resolution.near and progress.waiting_s > _STUCK_S
             if late or blocked:
-                short_rad = progress.closest * axis.grain.rad
+                short_rad = progress.closest * axis.resolution.rad
                 fault = f"it makes no progress, {short_rad:.3g} rad short of its goal, as if blocked"
                 if blocked:  # blocked: latched, so that it does not move until a client enables it
                     axis.fault, axis.ready = fault, False

@@ -12,7 +12,7 @@ from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis, AxisT
 from trade_drivers.joints._cycle import Exchange
-from trade_drivers.joints._jobs import Enable, Halt, Manner, Relax
+from trade_drivers.joints._jobs import ControlMode, Enable, Halt, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._trajectory_run import Follow
@@ -63,12 +63,17 @@ class _Joints(Generic[AxisT, _Exchange]):
         return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
 
     def _set(
-        self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float, manner: Manner = Manner.GOALS
+        self,
+        goals: Sequence[int],
+        speeds: Sequence[int],
+        service: str,
+        valid_s: float,
+        control_mode: ControlMode = ControlMode.GOALS,
     ) -> None:
         """Sends a set-point, which replaces the previous one; returns once it is sent."""
         until_ns = self._exchange.clock() + int(valid_s * 1e9)
         with admitted(service, self.resources, at_once(self._exchange.clock)) as terms:
-            self._finish(SetPoint(self._exchange, self._axes, goals, speeds, terms, until_ns, manner))
+            self._finish(SetPoint(self._exchange, self._axes, goals, speeds, terms, until_ns, control_mode))
 
     def _goals(self, positions_rad: Sequence[float], service: str, argument: str) -> list[int]:
         values = one_each(positions_rad, [axis.name for axis in self._axes], service, argument)
@@ -116,7 +121,7 @@ class BusMotor(_Joints[AxisT, _Exchange], Motor):
             return
         [axis] = self._axes
         ends, speeds = [_end_counts(axis, velocity)], [_speed_counts(axis, abs(velocity))]
-        self._set(ends, speeds, service, valid_s, Manner.SPEEDS)
+        self._set(ends, speeds, service, valid_s, ControlMode.SPEEDS)
 
 
 class BusGroup(_Joints[Axis, Exchange[Any]], JointGroup):
@@ -177,7 +182,7 @@ def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
     # a joint outside its range by more than its resolution must not move further out
     end = joint.max_rad if velocity_rad_s > 0 else joint.min_rad
     angle_rad = end if sample is None else axis.scale.angle_rad(sample.position)
-    if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * axis.grain.arrived * axis.grain.rad:
+    if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * axis.resolution.arrived * axis.resolution.rad:
         raise LimitExceeded(what=axis.name, value=angle_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
     return round(axis.scale.counts(end))
 
@@ -190,5 +195,5 @@ def _goal_counts(axis: Axis, position_rad: float) -> int:
 def _speed_counts(axis: Axis, speed_rad_s: float | None) -> int:
     if speed_rad_s is None:
         return axis.speed_counts
-    within(speed_rad_s, axis.grain.rad_s, axis.joint.max_speed_rad_s, f"{axis.name} speed", "rad/s")
-    return max(1, int(speed_rad_s / axis.grain.rad_s))
+    within(speed_rad_s, axis.resolution.rad_s, axis.joint.max_speed_rad_s, f"{axis.name} speed", "rad/s")
+    return max(1, int(speed_rad_s / axis.resolution.rad_s))

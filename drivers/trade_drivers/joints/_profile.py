@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import NamedTuple
 
-from trade_drivers.joints._axis import Grain
+from trade_drivers.joints._axis import Resolution
 
 
 class Leg(NamedTuple):
@@ -13,7 +13,7 @@ class Leg(NamedTuple):
     distance_counts: int
     speed_counts: int
     accel_counts: int
-    grain: Grain
+    resolution: Resolution
 
 
 class Profile(NamedTuple):
@@ -34,8 +34,8 @@ def together(legs: Sequence[Leg]) -> list[Profile]:
 
 
 def _duration_s(leg: Leg, speed_counts: int, accel_counts: int) -> float:
-    distance, speed = abs(leg.distance_counts) * leg.grain.rad, speed_counts * leg.grain.rad_s
-    accel = accel_counts * leg.grain.rad_s2
+    distance, speed = abs(leg.distance_counts) * leg.resolution.rad, speed_counts * leg.resolution.rad_s
+    accel = accel_counts * leg.resolution.rad_s2
     if distance < speed * speed / accel:
         return 2 * sqrt(distance / accel)
     return distance / speed + speed / accel
@@ -57,9 +57,9 @@ def _stretched(leg: Leg, duration_s: float) -> Profile:
 
 def _accel_for(leg: Leg, speed: int, duration_s: float, ideal: float) -> int:
     """Returns the acceleration that compensates for the rounded speed, within the limit."""
-    cruise_s = abs(leg.distance_counts) * leg.grain.rad / (speed * leg.grain.rad_s)
+    cruise_s = abs(leg.distance_counts) * leg.resolution.rad / (speed * leg.resolution.rad_s)
     if 0 < cruise_s < duration_s:
-        exact = speed * leg.grain.rad_s / (duration_s - cruise_s) / leg.grain.rad_s2
+        exact = speed * leg.resolution.rad_s / (duration_s - cruise_s) / leg.resolution.rad_s2
         # only a profile that reaches its speed is a trapezoid; otherwise the triangle's acceleration is right
         ideal = exact if cruise_s >= duration_s / 2 else ideal
     return max(1, min(leg.accel_counts, round(ideal)))

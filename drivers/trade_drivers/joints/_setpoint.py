@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from trade.errors import TradeError
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import Manner
+from trade_drivers.joints._jobs import ControlMode
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ class SetPoint(Motion[AxisT]):
         speeds: Sequence[int],
         terms: Terms,
         until_ns: int,
-        manner: Manner = Manner.GOALS,
+        control_mode: ControlMode = ControlMode.GOALS,
     ) -> None:
         super().__init__(exchange, axes, terms._replace(expires_ns=min(terms.expires_ns, until_ns)))
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = dict(zip(axes, speeds, strict=True))
         self._until_ns = until_ns
-        self.manner = manner
+        self.control_mode = control_mode
 
     def goal_of(self, axis: AxisT) -> int:
         return self._goals[axis]

@@ -7,7 +7,7 @@ from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, T
 from trade_drivers.bus._gate import Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import Manner
+from trade_drivers.joints._jobs import ControlMode
 from trade_drivers.joints._motion import Motion
 from trade_drivers.motion._plan import Plan
 
@@ -27,7 +27,7 @@ class Follow(Motion[AxisT]):
     comes to rest within its range if no goal follows.
     """
 
-    manner = Manner.POSITIONS
+    control_mode = ControlMode.POSITIONS
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from trade_gateway.config._entry import Around, ContainerSpec, Entry
+from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
 from trade_gateway.config._tables import Tables, converted
 
 _LEASE_S: Final = 10.0
@@ -90,14 +90,14 @@ class Child(NamedTuple):
 
 
 def read_children(
-    path: Path, text: str, around: Around, tables: Mapping[str, Any], *, certified: bool
+    path: Path, text: str, defaults: FileDefaults, tables: Mapping[str, Any], *, certified: bool
 ) -> tuple[Child, ...]:
     """Reads the containers of a gateway file, in the order in which they are started.
 
     Args:
         path: the file.
         text: the file's text.
-        around: settings of the file for all containers.
+        defaults: settings of the file for all containers.
         tables: the tables ``[container.NAME]``.
         certified: whether the gateway has a certificate.
 
@@ -105,17 +105,17 @@ def read_children(
         ConfigurationError: with the file, the line, the key and the remedy.
     """
     entries = {name: converted(table, Supervised, path, text, ("container", name)) for name, table in tables.items()}
-    parts = _OfGateway(path, text, around, entries, certified=certified).parts()
-    return tuple(Child(part, entries[part.name], {**around.inherited, **part.environment}) for part in parts)
+    parts = _OfGateway(path, text, defaults, entries, certified=certified).parts()
+    return tuple(Child(part, entries[part.name], {**defaults.inherited, **part.environment}) for part in parts)
 
 
 class _OfGateway(Tables):
     """Tables of containers on the gateway's own host, each with its own certificate."""
 
     def __init__(
-        self, path: Path, text: str, around: Around, entries: Mapping[str, Supervised], *, certified: bool
+        self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, Supervised], *, certified: bool
     ) -> None:
-        super().__init__(path, text, around, entries)
+        super().__init__(path, text, defaults, entries)
         self._certified = certified
 
     def check_kind(self, name: str, entry: Entry) -> None:

@@ -158,7 +158,7 @@ INSIDE: Final[Mapping[str, type[Struct]]] = {
 """The type of the table under a key of an entry."""
 
 
-class Around(Struct, frozen=True, kw_only=True):
+class FileDefaults(Struct, frozen=True, kw_only=True):
     """Settings for all containers of a file."""
 
     system: str

@@ -15,7 +15,7 @@ from trade._transport.endpoints import Endpoint, loopback_interface
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
 from trade_gateway.config._children import Child, read_children
-from trade_gateway.config._entry import Around
+from trade_gateway.config._entry import FileDefaults
 from trade_gateway.config._supervised_system import as_gateway
 from trade_gateway.config._tables import read_toml
 from trade_gateway.process._addresses import addresses
@@ -291,14 +291,14 @@ def read_gateway_file(path: Path) -> Plan:
         for name, share in file.share.items()
     }
     laboratory = _of_children(file)
-    around = Around(
+    defaults = FileDefaults(
         system=file.system,
         policy=file.policy,
         audit=file.audit,
         environment=laboratory,
         inherited=_without_system(),
     )
-    children = read_children(path, text, around, file.container, certified=bool(file.tls))
+    children = read_children(path, text, defaults, file.container, certified=bool(file.tls))
     return Plan(file, file.settings(path), shares, children)
 
 

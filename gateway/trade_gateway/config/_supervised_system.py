@@ -26,9 +26,9 @@ def as_gateway(path: Path, text: str, raw: Mapping[str, Any]) -> Mapping[str, An
         problem = 'this is a system file; run `trade system up`, or write supervisor = "keeper" here'
         raise ConfigurationError(where=at(path, text, ("system",), ""), problem=problem)
     own = {key: said[key] for key in _OF_GATEWAY if key in said}
-    around = {"connect": said["connect"]} if said.get("connect") else {}
+    defaults = {"connect": said["connect"]} if said.get("connect") else {}
     containers = {
-        name: {**around, **table}
+        name: {**defaults, **table}
         for name, table in (cast("dict[str, Any]", tables) if isinstance(tables, dict) else {}).items()
         if is_supervised(table)
     }

@@ -12,7 +12,7 @@ from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade_gateway.config._children import Supervised
-from trade_gateway.config._entry import Around, ContainerSpec, Entry
+from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._supervised_system import is_supervised
 from trade_gateway.config._tables import Tables, at, converted, line_of, read_toml
@@ -77,10 +77,10 @@ def read_system_file(path: Path) -> SystemPlan:
         name: converted(table, Supervised if name in supervised else Entry, path, text, ("container", name))
         for name, table in named.items()
     }
-    around = Around(
+    defaults = FileDefaults(
         system=system.name, tls=system.tls, policy=system.policy, audit=system.audit, connect=system.connect
     )
-    reading = _WithGateways(path, text, around, entries, supervised)
+    reading = _WithGateways(path, text, defaults, entries, supervised)
     settings, parts = _own_settings(reading, text), reading.parts()
     if system.supervisor:
         parts = [_keeper(path, text, system, supervised), *parts]
@@ -99,7 +99,7 @@ def _keeper(path: Path, text: str, system: _System, supervised: Collection[str])
 
 def _own_settings(reading: Tables, text: str) -> Settings:
     """Returns the settings of `trade system` itself."""
-    system = reading.around
+    system = reading.defaults
     environment = {**os.environ, **reading.environment(system.tls, system.policy)}
     try:
         if system.policy:
@@ -114,9 +114,9 @@ class _WithGateways(Tables):
     """Tables of a system file, where a container may be a gateway."""
 
     def __init__(
-        self, path: Path, text: str, around: Around, entries: Mapping[str, Entry], supervised: Collection[str]
+        self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, Entry], supervised: Collection[str]
     ) -> None:
-        super().__init__(path, text, around, entries)
+        super().__init__(path, text, defaults, entries)
         self._supervised = supervised
 
     def check_kind(self, name: str, entry: Entry) -> None:
@@ -139,7 +139,7 @@ class _WithGateways(Tables):
             settings = read_gateway_file(file).settings
         for key, said, wanted in (
             ("name", settings.container, name),
-            ("system", settings.system, self.around.system),
+            ("system", settings.system, self.defaults.system),
         ):
             if said != wanted:
                 self.refuse(name, "gateway", f"{file} has {key} = {said!r}; here it is {wanted!r}")

@@ -26,9 +26,9 @@ from trade_gateway.config._entry import (
     KINDS,
     LOCAL,
     ONLY_WITH,
-    Around,
     ContainerSpec,
     Entry,
+    FileDefaults,
     HttpSpec,
     RecordSpec,
 )
@@ -50,13 +50,13 @@ class Tables:
     Args:
         path: the file.
         text: the file's text, to find line numbers.
-        around: settings for all containers.
+        defaults: settings for all containers.
         entries: the tables by name.
     """
 
-    def __init__(self, path: Path, text: str, around: Around, entries: Mapping[str, Entry]) -> None:
+    def __init__(self, path: Path, text: str, defaults: FileDefaults, entries: Mapping[str, Entry]) -> None:
         self.path = path
-        self.around = around
+        self.defaults = defaults
         self._text = text
         self._entries = entries
         self._ports: SeenPorts = {}
@@ -84,7 +84,7 @@ class Tables:
         health = self.program_path(entry.health.command[0]) if entry.health else ""
         part = ContainerSpec(name, entry, self._words(name, entry), environment, self.beside(entry.folder), health)
         with self.about(name, entry):
-            Settings.read(system=self.around.system, container=name, environment={})
+            Settings.read(system=self.defaults.system, container=name, environment={})
         if entry.is_local:
             self.check_here(name, entry, environment)
         return part
@@ -122,7 +122,7 @@ class Tables:
             self.refuse(name, "env", f"{unset[0]!r} is no name of a variable")
 
     def _check_program_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
-        folder, path = self.beside(entry.folder), {**self.around.inherited, **environment}.get("PATH")
+        folder, path = self.beside(entry.folder), {**self.defaults.inherited, **environment}.get("PATH")
         if not folder.is_dir():
             self.refuse(name, "folder" if entry.folder else "program", f"there is no folder {folder}")
         for key, words in (("program", entry.program), ("health", entry.health and entry.health.command)):
@@ -130,7 +130,7 @@ class Tables:
                 problem = f"there is no program {found}" if "/" in found else f"there is no {found} in PATH"
                 self.refuse(name, key, f"{problem} that this user may run")
         with self.about(name, entry, "announces"):
-            Settings.read(system=self.around.system, container=entry.announces or name, environment={})
+            Settings.read(system=self.defaults.system, container=entry.announces or name, environment={})
 
     def program_path(self, named: str) -> str:
         """Returns a program as an absolute path, or its bare name if it is to be found in PATH."""
@@ -158,10 +158,10 @@ class Tables:
             if policy := environment.get("TRADE_POLICY"):
                 read_policy(Path(policy))
             Settings.read(
-                system=self.around.system,
+                system=self.defaults.system,
                 container=name,
                 connect=self._connect(entry),
-                environment={**self.around.inherited, **environment},
+                environment={**self.defaults.inherited, **environment},
             )
 
     def _check_installed(self, name: str, entry: Entry) -> None:
@@ -205,7 +205,7 @@ class Tables:
             case _:
                 patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
                 does = ["container", "--name", name, *patterns]
-        return ["--system", self.around.system, *dialled, *does]
+        return ["--system", self.defaults.system, *dialled, *does]
 
     def _http_words(self, entry: Entry) -> list[str]:
         said = entry.http or HttpSpec()
@@ -229,27 +229,27 @@ class Tables:
         return str(self.beside(named)) if entry.is_local else named
 
     def _connect(self, entry: Entry) -> Sequence[str]:
-        return self.around.connect if entry.connect is None else entry.connect
+        return self.defaults.connect if entry.connect is None else entry.connect
 
     def _environment_of(self, entry: Entry) -> dict[str, str]:
-        around = self.around if entry.is_local else Around(system=self.around.system)
-        named = self.environment(entry.tls or around.tls, entry.policy or around.policy, entry.host)
+        defaults = self.defaults if entry.is_local else FileDefaults(system=self.defaults.system)
+        named = self.environment(entry.tls or defaults.tls, entry.policy or defaults.policy, entry.host)
         if entry.listen:
             named["TRADE_LISTEN"] = ",".join(entry.listen)
         if entry.metrics:
             named["TRADE_METRICS"] = entry.metrics
-        if audit := entry.audit or around.audit:
+        if audit := entry.audit or defaults.audit:
             named["TRADE_AUDIT"] = self._path(entry, audit)
         if entry.providers is not None and entry.is_local:
             known = os.environ.get("PYTHONPATH")
             named["PYTHONPATH"] = os.pathsep.join([str(self.beside(entry.folder)), *([known] if known else [])])
         if entry.program is not None:
-            named["TRADE_SYSTEM"] = self.around.system
+            named["TRADE_SYSTEM"] = self.defaults.system
             if dialled := self._connect(entry):
                 named["TRADE_CONNECT"] = ",".join(dialled)
             if entry.announces:
                 named["TRADE_CONTAINER"] = entry.announces
-        return {**around.environment, **named, **entry.env}
+        return {**defaults.environment, **named, **entry.env}
 
     def environment(self, tls: str, policy: str, host: str = LOCAL) -> dict[str, str]:
         """Returns the variables for a certificate and a policy, with paths on that host."""

@@ -10,7 +10,7 @@ from trade_gateway.drill._processes import Actor, DrillFailed
 from trade_gateway.drill._report import Played, Stop
 from trade_gateway.drill._scenes import Scene, limit_s
 from trade_gateway.drill._targets import Target
-from trade_gateway.drill._testbed import Stand
+from trade_gateway.drill._testbed import Testbed
 
 _TRIES: Final = 3
 _BEGUN_S: Final = 20.0
@@ -23,7 +23,7 @@ _QUIET_S: Final = 1.0
 _LOOK_EVERY_S: Final = 0.05
 
 
-def play(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
+def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
     """Runs a scene with the targets that it concerns.
 
     An attempt without a measurement is repeated, for example if a watchdog expires too early on a busy computer.
@@ -42,7 +42,7 @@ def play(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) ->
     return Played(scene=scene.name, what=scene.what, shows=scene.shows, stops=stops, problems=problems)
 
 
-def _played(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> list[Stop]:
+def _played(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> list[Stop]:
     stand.recover()
     _begin(stand, stand.call(scene, targets), targets)
     done_at = stand.strike(scene, targets)
@@ -69,7 +69,7 @@ def _played(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill)
     ]
 
 
-def _begin(stand: Stand, caller: Actor, targets: Sequence[Target]) -> None:
+def _begin(stand: Testbed, caller: Actor, targets: Sequence[Target]) -> None:
     """Starts the motion. Raises DrillFailed."""
     caller.tell()
 
@@ -85,7 +85,7 @@ def _begin(stand: Stand, caller: Actor, targets: Sequence[Target]) -> None:
     threading.Event().wait(_ON_ITS_WAY_S)
 
 
-def _quiet(stand: Stand, targets: Sequence[Target], done_at: float) -> bool:
+def _quiet(stand: Testbed, targets: Sequence[Target], done_at: float) -> bool:
     """Whether all of them have rested for long enough since the failure."""
     stand.look()
     if any(stand.judge.moves(target.name) for target in targets):

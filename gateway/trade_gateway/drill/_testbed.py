@@ -80,7 +80,7 @@ UP_S: Final = 60.0
 """Time for a process to start, in seconds; a busy computer needs seconds to import."""
 
 
-class Stand:
+class Testbed:
     """All processes of a drill, until it is closed.
 
     Args:
@@ -226,7 +226,7 @@ class Stand:
 
 
 @contextmanager
-def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], folder: Path) -> Generator[Stand]:
+def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], folder: Path) -> Generator[Testbed]:
     """A running testbed, whose processes end with the context.
 
     Raises:
@@ -242,7 +242,7 @@ def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], f
     remove_leftovers()
     try:
         with SimProcess(robot.where, buses=[target.bus for target in targets]) as simulated:
-            stand = Stand(robot, left_out, simulated, folder)
+            stand = Testbed(robot, left_out, simulated, folder)
             try:
                 stand.begin()
                 yield stand

@@ -79,7 +79,7 @@ class Leased(Protocol):
         ...
 
 
-class Asking:
+class LeaseHolder:
     """The end that requests a lease.
 
     Args:
@@ -192,7 +192,7 @@ class Asking:
         raise NoSuchService(constraint=f"{name} of {self._from}")
 
 
-class StandIn:
+class Standby:
     """The standby's end: gives leases, and runs the container while the other gateway has none.
 
     Args:
@@ -229,11 +229,11 @@ class StandIn:
         self._arbiter = Arbiter(self._askers, secrets.token_hex(4), known if known in self._askers else "")
         self._saved = 0
         self._look_at = 0.0
-        self.go_by(child)
+        self.set_children(child)
 
     # --- on the supervisor's thread
 
-    def go_by(self, child: Child) -> None:
+    def set_children(self, child: Child) -> None:
         """Applies the lease time and the load of the container's table from now on."""
         lease_s, self._above = child.terms.lease_s, child.terms.move_above
         self._measure_at = math.inf if self._above is None else min(self._measure_at, uptime_s())

@@ -23,7 +23,7 @@ from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._child_state import ChildInfo, News, Unit
-from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
+from trade_gateway.supervisor._lease_protocol import Leased, LeaseHolder, Standby
 from trade_gateway.supervisor._objects import CreatedObjects, furnish, save
 from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._program_health import await_program, epochs_of, health_problem
@@ -36,7 +36,7 @@ _ENDS_S: Final = GRACE_S + SAVE_S + 5.0
 
 
 class Supervisor:
-    """Supervises the children that `go_by` names, until `close` ends them in reverse order.
+    """Supervises the children that `set_children` names, until `close` ends them in reverse order.
 
     Args:
         member: returns the container that calls them; it may change.
@@ -72,17 +72,17 @@ class Supervisor:
         self._inbox: deque[Callable[[], None]] = deque()
         self._jobs: set[threading.Thread] = set()
         self._closing = False
-        self._bell, self._rope = os.pipe()
-        os.set_blocking(self._bell, False)
-        os.set_blocking(self._rope, False)
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
         self._selector = selectors.DefaultSelector()
-        self._selector.register(self._bell, selectors.EVENT_READ, self._rung)
+        self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
         self._thread = threading.Thread(target=self._run, name="trade-supervisor", daemon=True)
         self._thread.start()
 
     # --- from other threads
 
-    def go_by(self, children: Sequence[Child]) -> None:
+    def set_children(self, children: Sequence[Child]) -> None:
         """Sets the children, in start order; only those with a changed start are restarted."""
         self._post(partial(self._go_by, {child.name: child for child in children}))
 
@@ -114,10 +114,10 @@ class Supervisor:
         self._post(partial(self._stop, name, who))
         return True
 
-    def stand_in(self, name: str) -> StandIn:
+    def stand_in(self, name: str) -> Standby:
         """Returns the standby's end of a child's lease. Raises ConfigurationError if it has none."""
         unit = self._units.get(name)
-        if unit is None or not isinstance(unit.lease, StandIn):
+        if unit is None or not isinstance(unit.lease, Standby):
             problem = f"this gateway is no standby for a container {name!r}; its table needs stands_in_for"
             raise ConfigurationError(where=f"container {name}", problem=problem)
         return unit.lease
@@ -136,13 +136,13 @@ class Supervisor:
             job.join(_ENDS_S)
         self._store.close()
         self._selector.close()
-        os.close(self._bell)
-        os.close(self._rope)
+        os.close(self._wake_read)
+        os.close(self._wake_write)
 
     def _post(self, what: Callable[[], None]) -> None:
         self._inbox.append(what)
         with contextlib.suppress(BlockingIOError, OSError):  # woken already, or closed
-            os.write(self._rope, b"!")
+            os.write(self._wake_write, b"!")
 
     # --- the thread
 
@@ -160,9 +160,9 @@ class Supervisor:
                 self._look(unit, self._clock())
             self._shown = tuple(unit.info() for unit in self._units.values())
 
-    def _rung(self) -> None:
+    def _woken(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            os.read(self._bell, 4096)
+            os.read(self._wake_read, 4096)
 
     def _by_lease(self, unit: Unit) -> bool:
         """Ends a child that may no longer run here; returns whether it may."""
@@ -215,8 +215,8 @@ class Supervisor:
             same, was_leaving = unit.child.starts_like(child), bool(unit.leaving)
             if unit.child.lease != child.lease:
                 unit.lease = self._leased(child)
-            elif isinstance(unit.lease, StandIn):
-                unit.lease.go_by(child)
+            elif isinstance(unit.lease, Standby):
+                unit.lease.set_children(child)
             unit.child, unit.life.terms, unit.leaving = child, child.terms, ""
             if unit.begun and (was_leaving or not same):
                 self._do(unit, unit.life.start(self._clock()))
@@ -224,9 +224,9 @@ class Supervisor:
     def _leased(self, child: Child) -> Leased | None:
         lock = lock_of(self._folder, self._member().name, child.name)
         if child.terms.lease_from:
-            return Asking(child, self._member, self._post, self._complain, lock)
+            return LeaseHolder(child, self._member, self._post, self._complain, lock)
         if child.terms.stands_in_for:
-            return StandIn(child, self._member, self._post, self._store, lock)
+            return Standby(child, self._member, self._post, self._store, lock)
         return None
 
     def _restart(self, name: str, who: str) -> None:

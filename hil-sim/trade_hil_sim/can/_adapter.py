@@ -74,16 +74,16 @@ class Adapter(Protocol):
         """Unplug, for good."""
         ...
 
-    def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
-        """Wait for clients, the bell or the end of the wait, then do what clients want.
+    def serve(self, wake_read: int, wait_s: float, awake: Callable[[float], None]) -> bool:
+        """Wait for clients, a wake-up or the end of the wait, then do what clients want.
 
         Args:
-            bell: a file descriptor that ends the wait.
+            wake_read: a file descriptor that ends the wait.
             wait_s: how long to wait, in seconds.
             awake: called with the time, in seconds (monotonic), before anything of a client is carried out.
 
         Returns:
-            Whether the bell was rung.
+            Whether it was woken.
         """
         ...
 

@@ -117,7 +117,7 @@ class CanBus(BusThread):
         self._adapter.open()
 
     def _step(self) -> None:
-        if self._adapter.serve(self._errands.bell, self._patience_s(), self._pass_time):
+        if self._adapter.serve(self._errands.wake_read, self._patience_s(), self._pass_time):
             self._errands.run()
         self._pass_time(time.monotonic())
         self._adapter.flush()

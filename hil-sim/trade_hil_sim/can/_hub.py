@@ -131,9 +131,9 @@ class Hub:
         if self._holder is not None:
             self._holder.close()
 
-    def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
-        """Wait for clients, the bell or the end of the wait, then do what clients want; see `Adapter`."""
-        watched: list[int | HubClient | socket.socket] = [bell, *self._clients]
+    def serve(self, wake_read: int, wait_s: float, awake: Callable[[float], None]) -> bool:
+        """Wait for clients, a wake-up or the end of the wait, then do what clients want; see `Adapter`."""
+        watched: list[int | HubClient | socket.socket] = [wake_read, *self._clients]
         if self._listener is not None:
             watched.append(self._listener)
         writing = [client for client in self._clients if client.unsent]
@@ -148,7 +148,7 @@ class Hub:
                 self._accept()
             elif isinstance(thing, HubClient):
                 self._read(thing, t)
-        return bell in readable
+        return wake_read in readable
 
     def flush(self) -> None:
         """Write to clients what they can take."""

@@ -76,16 +76,16 @@ class Interface:
         """Disconnect the devices."""
         self.unplug()
 
-    def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
-        """Wait for frames, the bell or the end of the wait, then pass the frames on; see `Adapter`."""
+    def serve(self, wake_read: int, wait_s: float, awake: Callable[[float], None]) -> bool:
+        """Wait for frames, a wake-up or the end of the wait, then pass the frames on; see `Adapter`."""
         opened = self._socket
-        watched: list[int | socket.socket] = [bell] if opened is None else [bell, opened]
+        watched: list[int | socket.socket] = [wake_read] if opened is None else [wake_read, opened]
         readable = ready(watched, (), max(0.0, wait_s))
         t = time.monotonic()
         awake(t)
         if opened is not None and opened in readable:
             self._read(opened, t)
-        return bell in readable
+        return wake_read in readable
 
     def _read(self, opened: socket.socket, t: float) -> None:
         while opened is self._socket:

@@ -64,7 +64,7 @@ class ControlServer:
         if len(os.fsencode(self.path)) > LONGEST_PATH:
             raise SimulationError(f"{self.path} is too long for a socket; give a shorter path, such as /tmp/sim.sock")
         self._listener = _listen(self.path)
-        self._bell, self._rope = socket.socketpair()
+        self._wake_read, self._wake_write = socket.socketpair()
         self._thread = threading.Thread(target=self._run, name="sim-control", daemon=True)
         self._thread.start()
         return self
@@ -76,9 +76,9 @@ class ControlServer:
             return
         self._closing = True
         with suppress(BrokenPipeError):  # a client that hung up has woken it, and it has ended
-            self._rope.send(b"!")
+            self._wake_write.send(b"!")
         thread.join(5.0)
-        self._rope.close()
+        self._wake_write.close()
 
     def __enter__(self) -> "ControlServer":
         return self.open()
@@ -122,7 +122,7 @@ class ControlServer:
 
     def _run(self) -> None:
         with selectors.DefaultSelector() as selector:
-            selector.register(self._bell, selectors.EVENT_READ)
+            selector.register(self._wake_read, selectors.EVENT_READ)
             selector.register(self._listener, selectors.EVENT_READ, lambda: self._accept(selector))
             try:
                 while not self._closing:

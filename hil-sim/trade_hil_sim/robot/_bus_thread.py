@@ -84,16 +84,16 @@ class Mailbox:
         self._asked: deque[tuple[Callable[[], None], Callable[[Exception], None]]] = deque()
         """For each call, the functions that carry it out and refuse it."""
         self._guard = threading.Lock()
-        self._rope = -1
+        self._wake_write = -1
         """The write end of the wake-up pipe; below 0 while the thread does not listen."""
-        self.bell = -1
+        self.wake_read = -1
         """Readable after a call was queued or `ring` was called."""
 
     def open(self) -> None:
         """Open the wake-up pipe."""
-        self.bell, self._rope = os.pipe()
-        os.set_blocking(self.bell, False)
-        os.set_blocking(self._rope, False)
+        self.wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self.wake_read, False)
+        os.set_blocking(self._wake_write, False)
 
     def ask(self, act: Callable[[], _T]) -> _T:
         """Let the thread make a call, and wait for its result; not to be called in the thread itself.
@@ -110,7 +110,7 @@ class Mailbox:
                 done.set_exception(problem)
 
         with self._guard:
-            if self._rope < 0:
+            if self._wake_write < 0:
                 raise self._closed()
             self._asked.append((carry_out, done.set_exception))
             self._ring()
@@ -127,16 +127,16 @@ class Mailbox:
     def run(self) -> None:
         """In the thread, after a wake-up: make the queued calls."""
         with suppress(BlockingIOError):
-            os.read(self.bell, 4096)
+            os.read(self.wake_read, 4096)
         while self._asked:
             self._asked.popleft()[0]()
 
     def close(self) -> None:
         """In the thread, at its end: refuse queued and later calls."""
         with self._guard:
-            os.close(self._rope)
-            self._rope = -1
-        os.close(self.bell)
+            os.close(self._wake_write)
+            self._wake_write = -1
+        os.close(self.wake_read)
         while self._asked:
             self._asked.popleft()[1](self._closed())
 
@@ -144,9 +144,9 @@ class Mailbox:
         return SimulationError(f"{self._who} is closed")
 
     def _ring(self) -> None:
-        if self._rope >= 0:
+        if self._wake_write >= 0:
             with suppress(BlockingIOError):  # a wake-up is pending already
-                os.write(self._rope, b"!")
+                os.write(self._wake_write, b"!")
 
 
 class BusThread(ABC):

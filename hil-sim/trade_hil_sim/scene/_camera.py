@@ -124,9 +124,9 @@ class SceneCamera(BusThread):
         self._number = self._listener.getsockname()[1]
 
     def _step(self) -> None:
-        bell, opened = self._errands.bell, self._listener
-        readable = ready([bell] if opened is None else [bell, opened.fileno()])
-        if bell in readable:
+        wake_read, opened = self._errands.wake_read, self._listener
+        readable = ready([wake_read] if opened is None else [wake_read, opened.fileno()])
+        if wake_read in readable:
             self._errands.run()
         elif opened is not None:
             with suppress(OSError):
@@ -170,7 +170,7 @@ class SceneCamera(BusThread):
     def _patient(self, client: socket.socket, until: float) -> bool:
         """Wait; False if the client disconnects first, or the camera is woken."""
         left_s = until - time.monotonic()
-        return left_s <= 0 or not ready([client.fileno(), self._errands.bell], timeout_s=left_s)
+        return left_s <= 0 or not ready([client.fileno(), self._errands.wake_read], timeout_s=left_s)
 
     def _answer(self, line: str) -> bytes:
         if line.split(" ")[:2] != ["GET", _TARGET]:

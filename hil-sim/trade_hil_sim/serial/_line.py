@@ -119,7 +119,7 @@ class SerialLine(BusThread):
     def _begin(self) -> None:
         self._terminal = Terminal(self.link)
         self._epoll = select.epoll()
-        self._epoll.register(self._errands.bell, select.EPOLLIN)
+        self._epoll.register(self._errands.wake_read, select.EPOLLIN)
         self._epoll.register(self._terminal.master, select.EPOLLIN)
 
     def _end(self) -> None:
@@ -128,7 +128,7 @@ class SerialLine(BusThread):
 
     def _step(self) -> None:
         for fd, _ in self._epoll.poll(self._patience_s()):
-            if fd == self._errands.bell:
+            if fd == self._errands.wake_read:
                 self._errands.run()
             else:
                 self._read()

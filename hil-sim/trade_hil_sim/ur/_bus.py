@@ -129,7 +129,7 @@ class UrBus(BusThread):
                 self._drop(client)
 
     def _serve(self) -> None:
-        watched: list[int | Client | socket.socket] = [self._errands.bell, *self._listeners.values()]
+        watched: list[int | Client | socket.socket] = [self._errands.wake_read, *self._listeners.values()]
         watched += [] if self._absent else list(self._clients)
         readable = ready(watched, [client for client in self._clients if client.unsent], self._patience_s())
         names = {listener: name for name, listener in self._listeners.items()}
@@ -138,7 +138,7 @@ class UrBus(BusThread):
                 self._accept(names[thing], thing)
             elif isinstance(thing, Client):
                 self._hear(thing)
-        if self._errands.bell in readable:
+        if self._errands.wake_read in readable:
             self._errands.run()
 
     def _patience_s(self) -> float:

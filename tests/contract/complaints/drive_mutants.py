@@ -13,7 +13,7 @@ from trade_drivers.vendors.cia402._units import Scale
 
 def all_speeds_are_counts(patch: pytest.MonkeyPatch) -> None:
     def counts(axis: DriveAxis, *_: object) -> float:
-        return axis.grain.rad
+        return axis.resolution.rad
 
     patch.setattr("trade_drivers.vendors.cia402._units._converted", counts)
 

@@ -30,7 +30,7 @@ class SlcanAdapter:
         name = fcntl.ioctl(self._slave, _SIOCGIFNAME, bytes(40))
         self.interface = name[:16].split(b"\0")[0].decode()
         self._wire = can.Bus(interface="socketcan", channel=wire)
-        self._bell, self._rope = os.pipe()
+        self._wake_read, self._wake_write = os.pipe()
         self.off = False
         """Bus-off: it neither sends nor hears."""
         self.deaf = False
@@ -47,18 +47,18 @@ class SlcanAdapter:
         os.write(self._master, f"s{state}{errors:03}{errors:03}\r".encode())
 
     def close(self) -> None:
-        os.write(self._rope, b"!")
+        os.write(self._wake_write, b"!")
         self._thread.join(10)
         self._wire.shutdown()
-        for number in (self._slave, self._master, self._bell, self._rope):
+        for number in (self._slave, self._master, self._wake_read, self._wake_write):
             os.close(number)
 
     def _run(self) -> None:
         wire = self._wire.fileno()
         while True:
-            watched = [wire, self._bell] if self.deaf else [self._master, wire, self._bell]
+            watched = [wire, self._wake_read] if self.deaf else [self._master, wire, self._wake_read]
             ready, _, _ = select.select(watched, [], [], 0.1)
-            if self._bell in ready:
+            if self._wake_read in ready:
                 return
             if self._master in ready:
                 self._from_system(os.read(self._master, 4096))

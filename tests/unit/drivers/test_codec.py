@@ -16,7 +16,7 @@ from trade_drivers.joints._axis import Scale
 from trade_drivers.joints._profile import Leg, together
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
-from trade_drivers.vendors.dynamixel._axis import CYCLIC, GRAIN, SLOW, DynamixelAxis
+from trade_drivers.vendors.dynamixel._axis import CYCLIC, RESOLUTION, SLOW, DynamixelAxis
 from trade_drivers.vendors.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
 from trade_hil_sim.dynamixel import status
 
@@ -136,7 +136,7 @@ def test_counts_are_twos_complement_where_the_table_says_so() -> None:
 
 @given(st.integers(0, 4095), st.booleans(), st.floats(-3, 3))
 def test_counts_and_angles_convert_back_and_forth(counts: int, reversed_: bool, offset_rad: float) -> None:
-    scale = Scale(joint(reversed=reversed_, offset_rad=offset_rad), GRAIN)
+    scale = Scale(joint(reversed=reversed_, offset_rad=offset_rad), RESOLUTION)
     assert scale.counts(scale.angle_rad(counts)) == pytest.approx(counts, abs=1e-6)
 
 
@@ -148,7 +148,7 @@ def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
         assert axis.high - axis.low <= ends[1] - ends[0] + 2
 
 
-LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(GRAIN))
+LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(RESOLUTION))
 
 
 @given(st.lists(LEGS, min_size=1, max_size=6))
@@ -159,7 +159,9 @@ def test_no_profile_exceeds_the_limits_of_its_joint_nor_means_no_limit(legs: lis
 
 
 @given(
-    st.lists(st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(GRAIN)), min_size=2, max_size=6)
+    st.lists(
+        st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(RESOLUTION)), min_size=2, max_size=6
+    )
 )
 def test_joints_arrive_together(legs: list[Leg]) -> None:
     durations = [profile.duration_s for profile in together(legs)]
@@ -167,7 +169,7 @@ def test_joints_arrive_together(legs: list[Leg]) -> None:
 
 
 def test_a_joint_alone_uses_its_limits() -> None:
-    (profile,) = together([Leg(2000, 104, 53, GRAIN)])
+    (profile,) = together([Leg(2000, 104, 53, RESOLUTION)])
     assert profile[:2] == (53, 104)
 
 

@@ -289,7 +289,7 @@ class Model(RuleBasedStateMachine):
         return [name for name in self._up() if self.kept[name].asking]
 
     @rule(last=st.sampled_from(["", "a", "b", "c"]), with_d=st.booleans(), version=st.sampled_from([1, 1, 1, 2]))
-    def go_by(self, last: str, with_d: bool, version: int) -> None:
+    def set_children(self, last: str, with_d: bool, version: int) -> None:
         """A file that names the first of three that wait for each other, and another one or not; or other words."""
         names = [*(name for name in "abc" if name <= last), *("d" if with_d else "")]
         for name, child in self.kept.items():
@@ -301,7 +301,7 @@ class Model(RuleBasedStateMachine):
             if restarted:
                 self._start(child)
         self._settle()
-        self.real.go_by([_child(name, version) for name in names])
+        self.real.set_children([_child(name, version) for name in names])
 
     @precondition(lambda self: self._mute())
     @rule(data=st.data(), what=st.sampled_from(["up", "up", "up", "rubbish", "its objects cannot be made"]))
@@ -486,7 +486,7 @@ def test_what_the_process_before_was_asked_counts_for_nothing() -> None:
     model = Model()
     model.kept["a"] = Kept(1)
     model._settle()
-    model.real.go_by([_child("a", 1)])
+    model.real.set_children([_child("a", 1)])
     model.it_agrees()
     for _ in range(2):
         model._says("a", "up")

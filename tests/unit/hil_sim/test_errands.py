@@ -17,11 +17,11 @@ def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> Non
     errands.open()
     with ThreadPoolExecutor(1) as other:
         asking = other.submit(errands.ask, threading.get_ident)
-        assert ready([errands.bell], timeout_s=PATIENCE_S)
+        assert ready([errands.wake_read], timeout_s=PATIENCE_S)
         errands.run()
         assert asking.result(PATIENCE_S) == threading.get_ident()
         failing = other.submit(errands.ask, lambda: 1 // 0)
-        assert ready([errands.bell], timeout_s=PATIENCE_S)
+        assert ready([errands.wake_read], timeout_s=PATIENCE_S)
         errands.run()
         with pytest.raises(ZeroDivisionError):
             failing.result(PATIENCE_S)
@@ -34,7 +34,7 @@ def test_closing_informs_waiting_clients_and_refuses_later_ones() -> None:
     done: list[str] = []
     with ThreadPoolExecutor(1) as other:
         asking = other.submit(errands.ask, lambda: done.append("late"))
-        assert ready([errands.bell], timeout_s=PATIENCE_S)
+        assert ready([errands.wake_read], timeout_s=PATIENCE_S)
         errands.close()
         with pytest.raises(SimulationError, match="bus leg is closed"):
             asking.result(PATIENCE_S)

@@ -350,8 +350,8 @@ def ask(scene: Scene, name: str) -> Handle:
 def prepare(scene: Scene) -> Any:
     kind = scene.module.Counter
     print_of = target.fingerprint(kind, (), scene.old._parts.codec)
-    luggage = target.ProviderSnapshot(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
-    return ask(scene, "prepare_arrival")(luggage)
+    snapshot = target.ProviderSnapshot(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
+    return ask(scene, "prepare_arrival")(snapshot)
 
 
 def test_an_unfetched_prepared_provider_is_closed_when_it_expires(

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from math import isfinite, tau
 from typing import Final
 
-from trade_drivers.joints import Axis, Grain, Sample, Unfit
+from trade_drivers.joints import Axis, Resolution, Sample, Unfit
 from trade_drivers.robotfile import Joint
 
 STILL_RAD_S: Final = 0.01
@@ -15,10 +15,10 @@ _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 
 
-def grain_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Grain:
+def resolution_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Resolution:
     """Returns the resolution of a motor: positions in counts, speeds in counts per second, and so on."""
     rad = tau / (counts_per_rev * joint.gear)
-    return Grain(
+    return Resolution(
         rad=rad,
         rad_s=rad,
         rad_s2=rad,

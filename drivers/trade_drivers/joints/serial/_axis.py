@@ -7,7 +7,7 @@ from typing import ClassVar, Final, Generic, NamedTuple, Protocol, TypeVar
 from msgspec import Struct
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Axis, Goal, Grain, Sample
+from trade_drivers.joints import Axis, Goal, Resolution, Sample
 from trade_drivers.robotfile import Joint
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
@@ -73,17 +73,17 @@ class ServoAxis(Axis, Generic[_Health]):
         name: str,
         bus: str,
         joint: Joint,
-        grain: Grain,
+        resolution: Resolution,
         coupled: Sequence[str],
         *,
         model_number: int,
         full_effort_counts: int,
     ) -> None:
-        super().__init__(name, bus, joint, grain, coupled)
+        super().__init__(name, bus, joint, resolution, coupled)
         self.model_number = model_number
         """The model number of the model in the robot file."""
         self._full_effort_counts = full_effort_counts
-        self.own_range: tuple[int, int] = (0, int(2 * grain.centre) - 1)
+        self.own_range: tuple[int, int] = (0, int(2 * resolution.centre) - 1)
         """The positions that the device can hold, as its registers said last."""
         self.health: _Health | None = None
         self.health_due_ns = 0
@@ -128,7 +128,7 @@ class ServoAxis(Axis, Generic[_Health]):
     def outside(self, position: int) -> str:
         """Returns why the device cannot hold a position; empty if it can."""
         end = self.own_goal(position)
-        if abs(position - end) <= self.grain.arrived:
+        if abs(position - end) <= self.resolution.arrived:
             return ""
         register, here = self.ends[position > end], self.scale.angle_rad
         return (
@@ -152,7 +152,7 @@ class ServoAxis(Axis, Generic[_Health]):
 
         Outside its own range the device drives on to the end of that range, at the least speed that is not rest.
         """
-        speed = self.grain.still_velocity + 1 if self.outside(position) else self.speed_counts
+        speed = self.resolution.still_velocity + 1 if self.outside(position) else self.speed_counts
         return Goal(self.own_goal(position), self.accel_counts, speed)
 
     @property

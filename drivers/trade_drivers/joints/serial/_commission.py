@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.commissioning._commissioner import Bench, Found
-from trade_drivers.joints import Grain
+from trade_drivers.joints import Resolution
 from trade_drivers.joints.serial._axis import Register
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class ServoBench(Bench, Generic[_Wire]):
     """Address and size of values that differ between servos, since two with equal answers would look like one."""
     mute: ClassVar[str]
     """The problem of a servo that answers a ping but no read."""
-    grain: ClassVar[Grain]
+    resolution: ClassVar[Resolution]
     torque: ClassVar[Register]
     position: ClassVar[Register]
     homing: ClassVar[Register]
@@ -108,7 +108,7 @@ class ServoBench(Bench, Generic[_Wire]):
         )
 
     def angle_rad(self, device_id: int) -> float:
-        return (self.read(device_id, self.position) - self.grain.centre) * self.grain.rad
+        return (self.read(device_id, self.position) - self.resolution.centre) * self.resolution.rad
 
     def homing_counts(self, device_id: int) -> int:
         return self.read(device_id, self.homing)

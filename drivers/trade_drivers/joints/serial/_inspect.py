@@ -36,7 +36,7 @@ def check_ranges(axis: ServoAxis[Any]) -> None:
 
 def _check_turn(axis: ServoAxis[Any]) -> None:
     """Checks that the range fits into one turn, as position control requires."""
-    joint, last = axis.joint, int(2 * axis.grain.centre) - 1
+    joint, last = axis.joint, int(2 * axis.resolution.centre) - 1
     if axis.low >= 0 and axis.high <= last:
         return
     low, high = sorted((axis.scale.angle_rad(0), axis.scale.angle_rad(last)))

@@ -8,7 +8,7 @@ from typing import Final
 from trade.errors import DeviceError
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Sample
-from trade_drivers.joints.can import MotorAxis, grain_of
+from trade_drivers.joints.can import MotorAxis, resolution_of
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
@@ -36,7 +36,7 @@ class DriveAxis(MotorAxis):
     """One drive."""
 
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, grain_of(joint, rate_hz, joint.counts_per_rev or 1.0), coupled)
+        super().__init__(name, bus, joint, resolution_of(joint, rate_hz, joint.counts_per_rev or 1.0), coupled)
         self.identity: tuple[int, ...] = ()
         """The identity when it was attached."""
         self.state_now: State | None = None
@@ -214,7 +214,7 @@ class DriveAxis(MotorAxis):
         """Raises ``DeviceFault`` if it is beyond the drive's own range, to which some modes would drive it at once."""
         place = sample.position
         low, high = self.own_range or (place, place)
-        if not low - self.grain.arrived <= place <= high + self.grain.arrived:
+        if not low - self.resolution.arrived <= place <= high + self.resolution.arrived:
             end = self.scale.angle_rad(low if place < low else high)
             raise self.faulty(
                 f"it is at {self.scale.angle_rad(place):.3f} rad, outside its own range, which ends at {end:.3f} rad "

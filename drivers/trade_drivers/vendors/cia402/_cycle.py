@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Gate, Goal, Manner, Motion, Steps, Work, until
+from trade_drivers.joints import ControlMode, Gate, Goal, Motion, Steps, Work, until
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _jobs as jobs
 from trade_drivers.vendors.cia402 import _machine as machine
@@ -135,10 +135,10 @@ class DriveExchange(MotorExchange[DriveAxis]):
 
     def mode_for(self, job: Work[DriveAxis], axis: DriveAxis) -> int:
         """Returns the mode of operation for a job's commands to this drive."""
-        match job.manner if isinstance(job, Motion) else Manner.GOALS:
-            case Manner.POSITIONS if _all_follow(job.devices):
+        match job.control_mode if isinstance(job, Motion) else ControlMode.GOALS:
+            case ControlMode.POSITIONS if _all_follow(job.devices):
                 return table.CYCLIC_POSITION
-            case Manner.SPEEDS:
+            case ControlMode.SPEEDS:
                 return axis.turning_mode
             case _:
                 return table.PROFILE_POSITION
@@ -149,20 +149,20 @@ class DriveExchange(MotorExchange[DriveAxis]):
         match mode:
             case table.CYCLIC_POSITION:
                 speed, accel = (
-                    axis.joint.max_speed_rad_s / axis.grain.rad,
-                    axis.joint.max_accel_rad_s2 / axis.grain.rad,
+                    axis.joint.max_speed_rad_s / axis.resolution.rad,
+                    axis.joint.max_accel_rad_s2 / axis.resolution.rad,
                 )
                 return Following(axis.id, position, speed=speed, accel=accel, period_s=period_s)
             case table.CYCLIC_VELOCITY | table.PROFILE_VELOCITY_MODE:
                 blind_s = self._bus.watchdog_s + 2 * period_s
-                grain = axis.grain
+                resolution = axis.resolution
                 return Turning(
                     axis.id,
                     accel=axis.accel_counts,
                     period_s=period_s,
                     blind_s=blind_s,
-                    speed_unit=grain.rad_s / grain.rad,
-                    accel_unit=grain.rad_s2 / grain.rad,
+                    speed_unit=resolution.rad_s / resolution.rad,
+                    accel_unit=resolution.rad_s2 / resolution.rad,
                 )
             case _:
                 return None

@@ -149,7 +149,7 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
         )
     fastest = yield from _read(net, axis.id, table.MAX_PROFILE_VELOCITY)
     if 0 < fastest < axis.speed_counts:
-        limit = fastest * axis.grain.rad_s
+        limit = fastest * axis.resolution.rad_s
         problem = f"{axis.joint.max_speed_rad_s:.6g} is above the drive's own limit {limit:.4g} (607Fh)"
         raise Unfit(problem, ".max_speed_rad_s")
 
@@ -159,7 +159,7 @@ def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
     if state is not State.ENABLED:
         return
-    if abs((yield from net.read(axis.id, table.VELOCITY))) * axis.grain.rad_s <= STILL_RAD_S:
+    if abs((yield from net.read(axis.id, table.VELOCITY))) * axis.resolution.rad_s <= STILL_RAD_S:
         return
     if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
         yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)

@@ -32,7 +32,9 @@ class Drive(BusMotor[DriveAxis, DriveExchange]):
         axis = self._axes[0]
         fastest = axis.joint.max_speed_rad_s
         speed = fastest / 10 if speed_rad_s is None else speed_rad_s
-        within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
+        within(speed, axis.resolution.rad_s, fastest, f"{axis.name} speed", "rad/s")
         with admitted(f"{self._name}.home", self.resources, span(self._exchange.clock)) as terms:
-            self._finish(Homing(self._exchange, axis, terms, method=method, speed_counts=int(speed / axis.grain.rad_s)))
+            self._finish(
+                Homing(self._exchange, axis, terms, method=method, speed_counts=int(speed / axis.resolution.rad_s))
+            )
         return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)

@@ -84,7 +84,7 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
         )
     speed = yield from read_optional(net, axis.id, table.VELOCITY_UNIT)
     accel = yield from read_optional(net, axis.id, table.ACCELERATION_UNIT)
-    rad = axis.grain.rad
+    rad = axis.resolution.rad
     rad_s = rad if speed is None else _converted(axis, scale, table.VELOCITY_UNIT, speed)
     rad_s2 = rad if accel is None else _converted(axis, scale, table.ACCELERATION_UNIT, accel)
     for missing, unit, other, converted in (
@@ -94,7 +94,7 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
         if unit is None and not isclose(converted, rad):
             raise Unfit(f"it has a unit of its own in {other}, but no {missing}: that unit is unknown")
     still = max(1, round(STILL_RAD_S / rad_s))
-    axis.use(replace(axis.grain, rad_s=rad_s, rad_s2=rad_s2, still_velocity=still))
+    axis.use(replace(axis.resolution, rad_s=rad_s, rad_s2=rad_s2, still_velocity=still))
     check_least(axis, "one of the drive's own unit (60A9h, 60AAh)")
     if max(axis.speed_counts, axis.accel_counts) > _LARGEST:
         raise Unfit("its speed or acceleration does not fit into 32 bits of the drive's own unit (60A9h, 60AAh)")
@@ -157,7 +157,7 @@ def _converted(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> float:
         counted, first, second = _TURN, _MINUTE, _SECOND
     seconds = (_PER_SPEED if is_speed else _PER_ACCELERATION).get((first, second))
     if counted == _INCREMENT:
-        rad = axis.grain.rad * scale.counts_per_increment
+        rad = axis.resolution.rad * scale.counts_per_increment
     else:
         rad = _ANGLES.get(counted, 0.0) * scale.gear / axis.joint.gear
     if not rad or seconds is None:

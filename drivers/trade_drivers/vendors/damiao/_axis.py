@@ -6,7 +6,7 @@ from struct import error as BadLength  # noqa: N812 - what unpacking raises for 
 from typing import Final
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Grain, Ramp
+from trade_drivers.joints import Ramp, Resolution
 from trade_drivers.joints.can import MotorAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.damiao import _frames as frames
@@ -19,12 +19,12 @@ _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 
 
-def grain_of(joint: Joint, rate_hz: float) -> Grain:
+def resolution_of(joint: Joint, rate_hz: float) -> Resolution:
     """Returns the resolution, which is limited by that of the frames."""
     ranges = MODELS[joint.model]
     rad = 1 / (COUNTS_PER_RAD * joint.gear)
     position, velocity = 2 * ranges.position_rad / 0xFFFF, 2 * ranges.velocity_rad_s / 0xFFF
-    return Grain(
+    return Resolution(
         rad=rad,
         rad_s=rad,
         rad_s2=rad,
@@ -42,7 +42,7 @@ class DamiaoAxis(MotorAxis):
     within_turn = True
 
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        super().__init__(name, bus, joint, resolution_of(joint, rate_hz), coupled)
         self.ranges = MODELS[joint.model]
         self.master = joint.id + frames.MASTER
         self.status: int | None = None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Gate, Goal, Manner, Motion, Ramp, Steps, Work, next_measurement
+from trade_drivers.joints import ControlMode, Gate, Goal, Motion, Ramp, Steps, Work, next_measurement
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _jobs as jobs
@@ -107,7 +107,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             self.port.send_all([self._there(axis)])
 
     def _brake(self, axis: DamiaoAxis, course: Ramp, position: int) -> None:
-        if abs(course.position - position) > axis.grain.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
+        if abs(course.position - position) > axis.resolution.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
             axis.course = self._standing(axis, position)
             return
         course.accel = course.braking = axis.accel_counts
@@ -116,7 +116,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def making_way(self, job: Motion[DamiaoAxis]) -> Steps:
         for axis in job.devices:
-            axis.easing = 0.5 if job.manner is Manner.POSITIONS else 1.0
+            axis.easing = 0.5 if job.control_mode is ControlMode.POSITIONS else 1.0
         yield from ()
 
     def enabling(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:

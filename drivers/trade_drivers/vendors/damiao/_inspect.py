@@ -49,7 +49,7 @@ def _check_joint(axis: DamiaoAxis) -> None:
             f"{joint.max_speed_rad_s:.4g} is above {most:.4g}, the most a {joint.model} reports", ".max_speed_rad_s"
         )
     for key, value in ((".min_rad", joint.min_rad), (".max_rad", joint.max_rad)):
-        if abs(axis.scale.counts(value)) * axis.grain.rad * joint.gear > _WITHIN * ranges.position_rad:
+        if abs(axis.scale.counts(value)) * axis.resolution.rad * joint.gear > _WITHIN * ranges.position_rad:
             raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can report", key)
     if joint.serial_number is not None:
         raise Unfit("a Damiao motor reports no serial number here; leave this key out", ".serial_number")

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from trade_drivers.joints import Grain, Sample
+from trade_drivers.joints import Resolution, Sample
 from trade_drivers.joints.serial import Health, ServoAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
@@ -13,7 +13,7 @@ CYCLIC: Final = (table.PRESENT_LOAD.address, table.PRESENT_POSITION.end - table.
 """Address and size of the block read from each joint in each cycle: effort, velocity, position."""
 SLOW: Final = (table.TORQUE_ENABLE.address, table.TEMPERATURE.end - table.TORQUE_ENABLE.address)
 """Address and size of the slow block, read from one joint at a time: everything from torque to temperature."""
-GRAIN: Final = Grain(
+RESOLUTION: Final = Resolution(
     rad=table.RAD_PER_COUNT,
     rad_s=table.RAD_S_PER_COUNT,
     rad_s2=table.RAD_S2_PER_COUNT,
@@ -74,7 +74,13 @@ class DynamixelAxis(ServoAxis[DynamixelHealth]):
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:
         model = table.BY_MODEL_NAME[joint.model]
         super().__init__(
-            name, bus, joint, GRAIN, coupled, model_number=model.number, full_effort_counts=model.full_effort_counts
+            name,
+            bus,
+            joint,
+            RESOLUTION,
+            coupled,
+            model_number=model.number,
+            full_effort_counts=model.full_effort_counts,
         )
 
     def sampled(self, data: bytes, at_ns: int) -> Sample:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.vendors.dynamixel import _table as table
-from trade_drivers.vendors.dynamixel._axis import GRAIN
+from trade_drivers.vendors.dynamixel._axis import RESOLUTION
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._wire import Wire  # noqa: F401 - a parameter of the base class
@@ -32,7 +32,7 @@ class DynamixelBench(ServoBench["Wire"]):
     driver = "dynamixel"
     restless = (table.REALTIME_TICK.address, table.INPUT_VOLTAGE.end - table.REALTIME_TICK.address)
     mute = "it answers a ping but no read: its status return level (register 68) is 0; set it to 2 by the vendor's tool"
-    grain = GRAIN
+    resolution = RESOLUTION
     torque, position, homing = table.TORQUE_ENABLE, table.PRESENT_POSITION, table.HOMING_OFFSET
 
     def anybody(self) -> bool:

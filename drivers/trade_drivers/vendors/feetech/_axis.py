@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from trade_drivers.joints import Goal, Grain, Sample
+from trade_drivers.joints import Goal, Resolution, Sample
 from trade_drivers.joints.serial import Health, ServoAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.feetech import _table as table
@@ -13,7 +13,7 @@ CYCLIC: Final = (table.PRESENT_POSITION.address, table.PRESENT_LOAD.end - table.
 """Address and size of the block read from each joint in each cycle: position, speed, load."""
 SLOW: Final = (table.TORQUE.address, table.MOVING.end - table.TORQUE.address)
 """Address and size of the slow block, read from one joint at a time: everything from torque to the moving flag."""
-GRAIN: Final = Grain(
+RESOLUTION: Final = Resolution(
     rad=table.RAD_PER_COUNT,
     rad_s=table.RAD_S_PER_COUNT,
     rad_s2=table.RAD_S2_PER_COUNT,
@@ -67,7 +67,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
 
     def __init__(self, name: str, bus: str, joint: Joint, lead_s: float, coupled: Sequence[str] = ()) -> None:
         number = table.BY_MODEL_NAME[joint.model].number
-        super().__init__(name, bus, joint, GRAIN, coupled, model_number=number, full_effort_counts=table.FULL_LOAD)
+        super().__init__(name, bus, joint, RESOLUTION, coupled, model_number=number, full_effort_counts=table.FULL_LOAD)
         self._lead_s = lead_s
         self.unload = 0
         """The error bits for which the servo is set to switch its torque off."""
@@ -103,10 +103,10 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         """
         if self.sample is None:
             raise self.deaf(now_ns)
-        here, grain = self.sample.position, self.grain
-        speed_rad_s = aim.speed * grain.rad_s
-        lead_rad = speed_rad_s * self._lead_s + speed_rad_s**2 / (2 * aim.accel * grain.rad_s2)
-        lead = max(grain.near, round(lead_rad / grain.rad))
+        here, resolution = self.sample.position, self.resolution
+        speed_rad_s = aim.speed * resolution.rad_s
+        lead_rad = speed_rad_s * self._lead_s + speed_rad_s**2 / (2 * aim.accel * resolution.rad_s2)
+        lead = max(resolution.near, round(lead_rad / resolution.rad))
         return Goal(max(here - lead, min(here + lead, aim.position)), aim.accel, aim.speed)
 
     def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.vendors.feetech import _table as table
-from trade_drivers.vendors.feetech._axis import GRAIN
+from trade_drivers.vendors.feetech._axis import RESOLUTION
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire  # noqa: F401 - a parameter of the base class
@@ -34,7 +34,7 @@ class FeetechBench(ServoBench["Wire"]):
     driver = "feetech"
     restless = (table.PRESENT_POSITION.address, table.MOVING.end - table.PRESENT_POSITION.address)
     mute = "it reports its model and nothing else; check its cable"
-    grain = GRAIN
+    resolution = RESOLUTION
     torque, position, homing = table.TORQUE, table.PRESENT_POSITION, table.HOMING_OFFSET
 
     def model_of(self, number: int) -> str:

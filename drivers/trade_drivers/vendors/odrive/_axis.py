@@ -6,7 +6,7 @@ from struct import error as BadLength  # noqa: N812 - what unpacking raises for 
 from typing import Final, NamedTuple
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints.can import MotorAxis, grain_of
+from trade_drivers.joints.can import MotorAxis, resolution_of
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
 
@@ -34,7 +34,7 @@ class OdriveAxis(MotorAxis):
     """One axis."""
 
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, grain_of(joint, rate_hz, COUNTS_PER_TURN), coupled)
+        super().__init__(name, bus, joint, resolution_of(joint, rate_hz, COUNTS_PER_TURN), coupled)
         self.model = MODELS[joint.model]
         self.version: Version | None = None
         """The reported identity; None until it has answered."""

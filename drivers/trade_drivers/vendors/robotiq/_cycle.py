@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import MotionStopped, TradeError
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, Gate, NoAnswer, Refused
-from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
 from trade_drivers.vendors.robotiq._jobs import Motion
 
 if TYPE_CHECKING:
@@ -20,11 +20,11 @@ _TAKEN_NS: Final = 15_000_000
 """The time after a write in which the status may be outdated, as the device updates it 200 times a second."""
 
 
-class Exchange(BusCycle[Hand]):
+class Exchange(BusCycle[GripperDevice]):
     """The exchange with the grippers of one bus. Any thread may also call ``stop``."""
 
     def __init__(
-        self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] | None = None
+        self, wire: "Wire", bus: "SerialBus", hands: Sequence[GripperDevice], clock: Callable[[], int] | None = None
     ) -> None:
         super().__init__(bus, hands, clock)
         self.wire = wire
@@ -36,7 +36,9 @@ class Exchange(BusCycle[Hand]):
     def why_silent(self) -> str:
         return self.wire.intruder()
 
-    def stop(self, hands: Sequence[Hand], reason: str = "", *, grip: bool = False) -> StopTicket[Hand]:
+    def stop(
+        self, hands: Sequence[GripperDevice], reason: str = "", *, grip: bool = False
+    ) -> StopTicket[GripperDevice]:
         """Voids all permits for these grippers, and stops their fingers before anything else happens on the bus.
 
         With ``grip``, grippers at rest are left as they are, pressing on what they hold.
@@ -62,7 +64,7 @@ class Exchange(BusCycle[Hand]):
         """Ends all motions; held objects stay held."""
         self._halt(self.hands, reason, grip=True)
 
-    def end_motion(self, hand: Hand, reason: str) -> None:
+    def end_motion(self, hand: GripperDevice, reason: str) -> None:
         """Ends the motion of a gripper before its reset."""
         if hand.motion is not None:
             self._forget(hand.motion, MotionStopped(device=hand.name, reason=reason))
@@ -83,7 +85,7 @@ class Exchange(BusCycle[Hand]):
         finally:
             self._forget(motion, error)
 
-    def fail_motion(self, device: Hand, error_of: Callable[[Device], TradeError]) -> None:
+    def fail_motion(self, device: GripperDevice, error_of: Callable[[Device], TradeError]) -> None:
         if device.motion is not None:
             self._forget(device.motion, error_of(device))
 
@@ -92,29 +94,29 @@ class Exchange(BusCycle[Hand]):
         for hand in self.hands:
             hand.halting_since_ns = 0
 
-    def admit(self, hand: Hand) -> None:
+    def admit(self, hand: GripperDevice) -> None:
         """Accepts a checked gripper, and stops a motion that no client owns."""
         if hand.sample is not None and hand.sample.under_way and hand.motion is None:
             self._stand(hand)
 
     # --- exchanges
 
-    def read(self, hand: Hand) -> None:
+    def read(self, hand: GripperDevice) -> None:
         """Measures; raises ``NoAnswer``."""
         asked_ns = self.clock()  # not the arrival, as a frozen process would take old values for new
         self._exchanged(hand, lambda: hand.take(self.wire.read(hand.id), asked_ns))
 
-    def write(self, hand: Hand, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> None:
+    def write(self, hand: GripperDevice, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> None:
         """Writes and measures in one exchange; raises ``NoAnswer``."""
         asked_ns = self.clock()
         self._exchanged(hand, lambda: hand.take(self.wire.write(hand.id, values, gate, wait=wait), asked_ns))
 
-    def probe(self, hand: Hand) -> None:
+    def probe(self, hand: GripperDevice) -> None:
         """Checks that it answers and that no late answer is pending; raises ``NoAnswer``."""
         self._exchanged(hand, lambda: self.wire.probe(hand.id))
         hand.doubted = False
 
-    def _exchanged(self, hand: Hand, act: Callable[[], object]) -> None:
+    def _exchanged(self, hand: GripperDevice, act: Callable[[], object]) -> None:
         try:
             act()
         except NoAnswer:
@@ -123,7 +125,7 @@ class Exchange(BusCycle[Hand]):
 
     # --- parts of a cycle
 
-    def _measure(self, hand: Hand) -> None:
+    def _measure(self, hand: GripperDevice) -> None:
         if (hand.silent or hand.doubted) and self.clock() < hand.probe_at_ns:
             return
         with suppress(NoAnswer):
@@ -149,7 +151,7 @@ class Exchange(BusCycle[Hand]):
             hand.tell_moving()
         self.answer_stops(now_ns)
 
-    def _watch_halt(self, hand: Hand, now_ns: int) -> None:
+    def _watch_halt(self, hand: GripperDevice, now_ns: int) -> None:
         if hand.standing(now_ns, self.stale_after_ns):
             hand.halting_since_ns = 0
             return
@@ -159,7 +161,7 @@ class Exchange(BusCycle[Hand]):
         if commanded and seen and now_ns - hand.halting_since_ns <= HALT_NS:
             self._stand(hand)  # the stop was not received
 
-    def _halt(self, hands: Iterable[Hand], reason: str, *, grip: bool) -> None:
+    def _halt(self, hands: Iterable[GripperDevice], reason: str, *, grip: bool) -> None:
         for hand in hands:
             now_ns = self.clock()
             quiet = hand.at_rest if grip else hand.standing
@@ -169,7 +171,7 @@ class Exchange(BusCycle[Hand]):
             finally:
                 self.end_motion(hand, reason)
 
-    def _stand(self, hand: Hand) -> None:
+    def _stand(self, hand: GripperDevice) -> None:
         """Writes the stop, and watches until it is at rest; later measurements show whether it was received."""
         values = hand.halt_registers()
         now_ns = self.clock()

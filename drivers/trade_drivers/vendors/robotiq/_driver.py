@@ -16,7 +16,7 @@ from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
 from trade_drivers.vendors.robotiq._cycle import Exchange
 from trade_drivers.vendors.robotiq._gripper import RobotiqGripper
-from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
@@ -79,7 +79,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
         ConfigurationError: the port cannot be opened, or a gripper is absent, another device, or set wrongly.
     """
     _check(robot, bus)
-    hands = [Hand(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
+    hands = [GripperDevice(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
     where = f"{robot.where}: bus.{bus.name}"
     wire = wire_at(port, bus.baud, where)
     exchange = Exchange(wire, bus, hands)
@@ -125,7 +125,7 @@ def _check(robot: Robot, bus: SerialBus) -> None:
         _wrong(f"{where}.rate_hz", f"{problem}: at most {1 / cycle_s:.0f} Hz")
 
 
-def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> None:
+def _look_over(exchange: Exchange, hand: GripperDevice, bus: SerialBus, where: str) -> None:
     """Takes a gripper's first measurements; writes nothing."""
     key = f'{where}: gripper."{hand.gripper.name}"'
     for _ in attempts(exchange.clock, exchange.stale_after_ns):

@@ -8,14 +8,14 @@ from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._cycle import Exchange
-from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
 from trade_drivers.vendors.robotiq._jobs import Activate, ClearFault, GripperCommand, Move
 
 
 class RobotiqGripper(Gripper):
     """One gripper of a bus."""
 
-    def __init__(self, thread: BusThread[Exchange], hand: Hand) -> None:
+    def __init__(self, thread: BusThread[Exchange], hand: GripperDevice) -> None:
         self._thread = thread
         self._exchange = thread.exchange
         self._hand = hand

@@ -20,7 +20,7 @@ _REMEDY: Final = "remove the cause, then call activate(): it moves the fingers a
 _NOT_ACTIVATED: Final = "it is not activated"
 
 
-class Hand(BusDevice[Status]):
+class GripperDevice(BusDevice[Status]):
     """The state of one gripper."""
 
     def __init__(self, name: str, bus: str, gripper: Gripper) -> None:

@@ -8,7 +8,7 @@ from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._gate import Command, Terms
 from trade_drivers.bus._jobs import Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
-from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
 from trade_drivers.vendors.robotiq._table import Contact, Status
 
 if TYPE_CHECKING:
@@ -22,11 +22,11 @@ _NEAR_COUNTS: Final = 8
 _MOST_PER_CYCLE_S: Final = 0.1
 
 
-class GripperCommand(Command[Hand, "Exchange"]):
+class GripperCommand(Command[GripperDevice, "Exchange"]):
     """A command with exchanges within a retry budget."""
 
     @property
-    def hand(self) -> Hand:
+    def hand(self) -> GripperDevice:
         """The gripper."""
         return self.devices[0]
 
@@ -74,7 +74,7 @@ class ClearFault(GripperCommand):
 class Motion(GripperCommand):
     """A command that moves the fingers, and is watched until it ends."""
 
-    def __init__(self, exchange: "Exchange", hands: Sequence[Hand], terms: Terms) -> None:
+    def __init__(self, exchange: "Exchange", hands: Sequence[GripperDevice], terms: Terms) -> None:
         super().__init__(exchange, hands, terms)
         self._began_ns = self._watched_ns = 0
         self._position = -1
@@ -165,7 +165,7 @@ class Move(Motion):
     """Moves the fingers to a width, or until they meet an object."""
 
     def __init__(
-        self, exchange: "Exchange", hands: Sequence[Hand], registers: tuple[int, int, int], terms: Terms
+        self, exchange: "Exchange", hands: Sequence[GripperDevice], registers: tuple[int, int, int], terms: Terms
     ) -> None:
         super().__init__(exchange, hands, terms)
         self._registers = registers

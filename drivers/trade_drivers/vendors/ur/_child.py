@@ -5,7 +5,18 @@ import sys
 from contextlib import suppress
 from typing import Final, Literal
 
-from trade_drivers.vendors.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Pulse, Report, Sample, pair
+from trade_drivers.vendors.ur._messages import (
+    Channel,
+    Disconnected,
+    Done,
+    Failed,
+    HeartbeatAnswer,
+    Hello,
+    Order,
+    Report,
+    Sample,
+    pair,
+)
 
 _END_S: Final = 5.0
 
@@ -53,15 +64,15 @@ class Child:
         return self._numbers
 
     def send(self, order: Order) -> None:
-        """Sends it a message; raises ``Gone``."""
+        """Sends it a message; raises ``Disconnected``."""
         self._channel.send(order)
 
     def listen(self) -> None:
-        """Processes its messages; raises ``Gone``, with the reason if it reported one."""
+        """Processes its messages; raises ``Disconnected``, with the reason if it reported one."""
         try:
             self._take_in()
-        except Gone as gone:
-            raise Gone(self.problem or str(gone)) from None
+        except Disconnected as gone:
+            raise Disconnected(self.problem or str(gone)) from None
 
     def _take_in(self) -> None:
         for word in self._channel.waiting():
@@ -70,7 +81,7 @@ class Child:
                     self.problem = word.problem
                 case Sample():
                     self.samples.append(word)
-                case Pulse():
+                case HeartbeatAnswer():
                     self.running = word.running
                     self.pulses += 1
                 case Done():

@@ -13,20 +13,20 @@ from contextlib import suppress
 from typing import Any, Final
 
 from trade_drivers.vendors.ur._messages import (
-    Beat,
     Channel,
+    Disconnected,
     Done,
     Free,
-    Gone,
     Halt,
+    Heartbeat,
+    HeartbeatAnswer,
     Hello,
     MoveJoints,
     MoveLine,
     Order,
-    Pulse,
     Servo,
     Solve,
-    Take,
+    TakeControl,
 )
 
 _QUIET_S: Final = 0.15
@@ -59,7 +59,7 @@ class Child:
         self._channel.send(Hello())
         while True:
             order = self._channel.receive(_IDLE_S if self._robot is None else _QUIET_S)
-            signal.setitimer(signal.ITIMER_REAL, _TAKING_S if isinstance(order, Take) else _STUCK_S)
+            signal.setitimer(signal.ITIMER_REAL, _TAKING_S if isinstance(order, TakeControl) else _STUCK_S)
             if order is None and self._robot is None:
                 signal.setitimer(signal.ITIMER_REAL, 0.0)
                 continue
@@ -81,7 +81,7 @@ class Child:
             self._robot.stopScript()
 
     def _obey(self, order: Order) -> None:
-        if isinstance(order, Beat):
+        if isinstance(order, Heartbeat):
             self._beat()
             return
         late = 0 < order.expires_ns <= time.monotonic_ns()
@@ -96,11 +96,11 @@ class Child:
         if not self._streaming:
             self._robot.kickWatchdog()
         running = self._robot.getAsyncOperationProgressEx().isAsyncOperationRunning()
-        self._channel.send(Pulse(running))
+        self._channel.send(HeartbeatAnswer(running))
 
     def _carry_out(self, order: Order) -> str:
         """Executes an order; returns the problem, or an empty text."""
-        if isinstance(order, Take):
+        if isinstance(order, TakeControl):
             return self._take(order)
         if self._robot is None:
             return "it has no control"
@@ -108,7 +108,7 @@ class Child:
             return "its program does not run"
         return "" if self._command(order) else "the controller refused, or did not answer"
 
-    def _take(self, order: Take) -> str:
+    def _take(self, order: TakeControl) -> str:
         try:
             self._robot = self._library.RTDEControlInterface(self._host)
         except RuntimeError as problem:
@@ -156,7 +156,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     child = Child(sys.argv[2], Channel(socket.socket(fileno=int(sys.argv[1])), Order))
-    with suppress(Gone):
+    with suppress(Disconnected):
         child.run()
     signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
     child.halt()

@@ -13,7 +13,7 @@ from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._child import Child
 from trade_drivers.vendors.ur._dashboard import tell
 from trade_drivers.vendors.ur._link import Link
-from trade_drivers.vendors.ur._messages import Beat, Done, Gone, Halt, Order, Scale, Servo, Take
+from trade_drivers.vendors.ur._messages import Disconnected, Done, Halt, Heartbeat, Order, Scale, Servo, TakeControl
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import ArmCommand, Motion
@@ -82,7 +82,7 @@ class Exchange(BusCycle[ArmStatus]):
             raise PortLost("it is not open")
         try:
             states.listen()
-        except Gone as gone:
+        except Disconnected as gone:
             raise PortLost(f"the connection that states come by was lost: {gone}") from None
         finally:
             for sample in states.samples:
@@ -90,7 +90,7 @@ class Exchange(BusCycle[ArmStatus]):
             states.samples.clear()
         try:
             control.listen()
-        except Gone as gone:
+        except Disconnected as gone:
             self.drop_control(f"its control connection was lost: {gone}")
 
     def halt_all(self, reason: str) -> None:
@@ -156,7 +156,7 @@ class Exchange(BusCycle[ArmStatus]):
             yield
         hz, step_s = self._watchdog_hz, self.period_ns / 1e9
         done = yield from self._answered(
-            job, lambda number: Take(number=number, watchdog_hz=hz, step_s=step_s), until_ns
+            job, lambda number: TakeControl(number=number, watchdog_hz=hz, step_s=step_s), until_ns
         )
         if done.problem:
             self.drop_control(done.problem)
@@ -236,7 +236,7 @@ class Exchange(BusCycle[ArmStatus]):
     def _tell(self, child: Child, order: Order) -> None:
         try:
             child.send(order)
-        except Gone as gone:
+        except Disconnected as gone:
             if child is self.link.control:
                 self.drop_control(f"the process that commands it is gone: {gone}")
             raise self.limb.faulty(f"the command could not be sent: {gone}") from None
@@ -248,8 +248,8 @@ class Exchange(BusCycle[ArmStatus]):
         if self.taken and now_ns - self._beaten_ns >= _BEAT_NS:
             self._beaten_ns = now_ns
             try:
-                self._control.send(Beat())
-            except Gone as gone:
+                self._control.send(Heartbeat())
+            except Disconnected as gone:
                 self.drop_control(f"the process that commands it is gone: {gone}")
 
     def _step_jobs(self) -> None:
@@ -301,7 +301,7 @@ class Exchange(BusCycle[ArmStatus]):
             self._halt_number, self._halted_ns = self._control.number(), now_ns
             try:
                 self._control.send(Halt(number=self._halt_number, decel=limb.arm.max_accel_rad_s2))
-            except Gone as gone:
+            except Disconnected as gone:
                 self.drop_control(f"the process that commands it is gone: {gone}")
 
     def _end_program(self) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 
 from trade_drivers.bus._jobs import PortLost, PortOpening
 from trade_drivers.vendors.ur._child import Child
-from trade_drivers.vendors.ur._messages import Gone
+from trade_drivers.vendors.ur._messages import Disconnected
 
 _FIRST_S: Final = 10.0
 """Startup time of a reading process, which imports the library on a possibly busy machine."""
@@ -43,7 +43,7 @@ class Link:
         try:
             self.states.listen()
             self.control.listen()
-        except Gone as gone:
+        except Disconnected as gone:
             self.close()
             raise PortLost(f"its states cannot be read: {gone}") from None
         if self.states.samples and self.control.ready:

@@ -11,7 +11,7 @@ _LONGEST: Final = 4096
 Message = TypeVar("Message")
 
 
-class Gone(Exception):
+class Disconnected(Exception):
     """The other end is gone or does not read."""
 
 
@@ -22,11 +22,11 @@ class _Order(Struct, frozen=True, kw_only=True, tag=True, array_like=True):
     """Expiry by CLOCK_MONOTONIC, which all processes share; 0: it does not expire."""
 
 
-class Beat(_Order, frozen=True):
+class Heartbeat(_Order, frozen=True):
     """The driver is healthy: feed the robot's watchdog."""
 
 
-class Take(_Order, frozen=True):
+class TakeControl(_Order, frozen=True):
     """Take control: upload the script, arm the watchdog."""
 
     watchdog_hz: float
@@ -100,7 +100,7 @@ class Done(Struct, frozen=True, tag=True, array_like=True):
     """The angles of ``Solve``; empty if there are none."""
 
 
-class Pulse(Struct, frozen=True, tag=True, array_like=True):
+class HeartbeatAnswer(Struct, frozen=True, tag=True, array_like=True):
     """The answer to a beat."""
 
     running: bool
@@ -120,8 +120,8 @@ class Sample(Struct, frozen=True, tag=True, array_like=True):
     speed_fraction: float
 
 
-Order = Beat | Take | MoveJoints | MoveLine | Servo | Solve | Halt | Free | Scale
-Report = Hello | Failed | Done | Pulse | Sample
+Order = Heartbeat | TakeControl | MoveJoints | MoveLine | Servo | Solve | Halt | Free | Scale
+Report = Hello | Failed | Done | HeartbeatAnswer | Sample
 
 
 class Channel(Generic[Message]):
@@ -138,27 +138,27 @@ class Channel(Generic[Message]):
         self._decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(kind)  # pyright: ignore[reportArgumentType]
 
     def send(self, message: Struct) -> None:
-        """Sends a message, or raises ``Gone``; never waits."""
+        """Sends a message, or raises ``Disconnected``; never waits."""
         try:
             self.end.send(self._encoder.encode(message), socket.MSG_DONTWAIT)
         except OSError as problem:
-            raise Gone(str(problem)) from None
+            raise Disconnected(str(problem)) from None
 
     def receive(self, timeout_s: float) -> Message | None:
-        """Returns the next message, or None at the timeout; raises ``Gone``."""
+        """Returns the next message, or None at the timeout; raises ``Disconnected``."""
         self.end.settimeout(timeout_s)
         try:
             data = self.end.recv(_LONGEST)
         except (TimeoutError, BlockingIOError):
             return None
         except OSError as problem:
-            raise Gone(str(problem)) from None
+            raise Disconnected(str(problem)) from None
         if not data:
-            raise Gone("it has ended")
+            raise Disconnected("it has ended")
         return self._decoder.decode(data)
 
     def waiting(self) -> Iterator[Message]:
-        """Yields received messages without waiting; raises ``Gone`` after the last."""
+        """Yields received messages without waiting; raises ``Disconnected`` after the last."""
         while (message := self.receive(0.0)) is not None:
             yield message
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from trade_drivers.vendors.ur._clock_offset import Age
 from trade_drivers.vendors.ur._dashboard import DashboardError, probe
-from trade_drivers.vendors.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Sample, Scale
+from trade_drivers.vendors.ur._messages import Channel, Disconnected, Done, Failed, Hello, Order, Sample, Scale
 
 RATE_HZ: Final = 125.0
 _PROBE_S: Final = 1.0
@@ -87,7 +87,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     host, channel = sys.argv[2], Channel[Order](socket.socket(fileno=int(sys.argv[1])), Order)
-    with suppress(Gone):
+    with suppress(Disconnected):
         try:
             signal.setitimer(signal.ITIMER_REAL, _PROBED_S)
             probe(host, _PROBE_S)

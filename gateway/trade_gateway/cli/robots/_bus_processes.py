@@ -61,7 +61,7 @@ class BusProcesses:
         container, settings = self._container, self._container.settings
         folder = settings.state_dir or Path(tempfile.gettempdir())
         supervisor = Supervisor(lambda: container, self.news.put, folder / settings.system)
-        supervisor.go_by(children)
+        supervisor.set_children(children)
         container.register_functions(ChildServices(supervisor), "supervisor")
         return supervisor
 

@@ -172,7 +172,7 @@ class Gateway:
             self._supervisor = Supervisor(lambda: self._container, self.news.put, state / plan.settings.system)
             self._offer()
         if self._supervisor is not None:
-            self._supervisor.go_by(plan.children)
+            self._supervisor.set_children(plan.children)
 
     def _offer(self) -> None:
         if self._supervisor is not None:

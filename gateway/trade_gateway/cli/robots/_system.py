@@ -13,7 +13,7 @@ from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others
 from trade_gateway.cli.robots._system_diff import compared, snapshot, write
-from trade_gateway.cli.robots._system_up import Bringing, Report, check_hosts
+from trade_gateway.cli.robots._system_up import Report, SystemStarter, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
 
@@ -55,8 +55,8 @@ def up(
         _say_order(out, plan)
         return
     with leaving() as interrupted, Container(plan.settings) as member:
-        bringing = Bringing(plan, member, ssh_config=ssh_config, wait_s=wait, report=_reporter(out))
-        bringing.up(keep=keep, interrupted=interrupted)
+        starter = SystemStarter(plan, member, ssh_config=ssh_config, wait_s=wait, report=_reporter(out))
+        starter.up(keep=keep, interrupted=interrupted)
     out.say(f"[bold green]system {escape(plan.settings.system)} is up[/]; to end it: trade system down {file}")
 
 
@@ -70,7 +70,7 @@ def status(context: typer.Context, file: File, as_json: Json = False) -> None:
     """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
-        found = list(Bringing(plan, member, ssh_config=None, wait_s=0.0, report=_reporter(out)).status())
+        found = list(SystemStarter(plan, member, ssh_config=None, wait_s=0.0, report=_reporter(out)).status())
     if as_json:
         out.data(found)
     else:
@@ -97,8 +97,8 @@ def down(
     """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
-        bringing = Bringing(plan, member, ssh_config=None, wait_s=5.0, report=_reporter(out))
-        bringing.down(only_at_rest=not force)
+        starter = SystemStarter(plan, member, ssh_config=None, wait_s=5.0, report=_reporter(out))
+        starter.down(only_at_rest=not force)
 
 
 @app.command("diff")

@@ -50,7 +50,7 @@ class _Began(NamedTuple):
     started: Started
 
 
-class Bringing:
+class SystemStarter:
     """The containers of one file, as a container of this command sees them.
 
     Args:

@@ -10,7 +10,7 @@ from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._action import ANY, CANCEL, ENDS, STATUS, Refusal, Status, uuid
 from trade_gateway.ros.ros2._node import Node
-from trade_gateway.ros.ros2._services import Asked, Server
+from trade_gateway.ros.ros2._services import Server, ServiceRequest
 from trade_gateway.ros.ros2._topics import Topic
 
 _MOST_ENDED: Final = 32
@@ -28,7 +28,7 @@ class Pursued(Goal):
         self.stamp_ns: Final = time.time_ns()
         self.status = Status.ACCEPTED
         self.outcome: Outcome | None = None
-        self.waiting: Final[list[Asked]] = []
+        self.waiting: Final[list[ServiceRequest]] = []
         self.thread: threading.Thread | None = None
         self.of = ""
         """Its client; unknown until the goal begins."""
@@ -125,7 +125,7 @@ class Action:
 
     # --- requests of clients
 
-    def _accept(self, asked: Asked) -> None:
+    def _accept(self, asked: ServiceRequest) -> None:
         """S01: the goal can be canceled on arrival; only after that does this wait for the name of its sender."""
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
@@ -143,7 +143,7 @@ class Action:
             )
             goal.thread.start()
 
-    def _cancel(self, asked: Asked) -> None:
+    def _cancel(self, asked: ServiceRequest) -> None:
         info = asked.request()["goal_info"]
         goal_id, until_ns = info["goal_id"]["uuid"], _nanoseconds(info["stamp"])
         with self._lock:
@@ -156,7 +156,7 @@ class Action:
         self._tell_status()
         asked.answer({"return_code": _refusal(goal_id, known, ending), "goals_canceling": [g.info() for g in ending]})
 
-    def _result(self, asked: Asked) -> None:
+    def _result(self, asked: ServiceRequest) -> None:
         goal_id = asked.request()["goal_id"]["uuid"]
         with self._lock:
             goal = self._goals.get(goal_id)
@@ -167,7 +167,7 @@ class Action:
 
     # --- execution
 
-    def _pursue(self, goal: Pursued, before: list[Pursued], asked: Asked) -> None:
+    def _pursue(self, goal: Pursued, before: list[Pursued], asked: ServiceRequest) -> None:
         with self._lock:
             goal.status = max(goal.status, Status.EXECUTING)
             for other in before:

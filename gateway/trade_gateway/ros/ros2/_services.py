@@ -36,7 +36,7 @@ _AFTER_S: Final = 5.0
 _log: Final = logging.getLogger("trade")
 
 
-class Asked:
+class ServiceRequest:
     """A received request. It must be ended by one of its methods."""
 
     def __init__(
@@ -83,14 +83,14 @@ class Server:
     """
 
     def __init__(
-        self, node: Node, name: str, type_name: str, handle: Callable[[Asked], object], *, stops: bool = False
+        self, node: Node, name: str, type_name: str, handle: Callable[[ServiceRequest], object], *, stops: bool = False
     ) -> None:
         self._endpoint = node.service(Kind.SERVER, name, type_name)
         self._node = node
         self._type_name = type_name
         self._handle = handle
         self._stops = stops
-        self._mailbox: Mailbox[Asked] | AtOnce[Asked] = (
+        self._mailbox: Mailbox[ServiceRequest] | AtOnce[ServiceRequest] = (
             AtOnce(f"ros2 {name}", self._try, most=_MOST_STOPS, drop=self._late)
             if stops
             else Mailbox(f"ros2 {name}", self._try, most=_MOST_WAITING, longest_s=_LATE_S, drop=self._late)
@@ -107,12 +107,12 @@ class Server:
         return session.liveliness().declare_token(self._endpoint.token), queryable
 
     def _put(self, query: zenoh.Query) -> None:
-        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name, stops=self._stops))
+        self._mailbox.put(ServiceRequest(query, self._endpoint, self._node, self._type_name, stops=self._stops))
 
-    def _late(self, asked: Asked) -> None:
+    def _late(self, asked: ServiceRequest) -> None:
         asked.refuse("not executed: it waited too long behind other requests, or the service has ended")
 
-    def _try(self, asked: Asked) -> None:
+    def _try(self, asked: ServiceRequest) -> None:
         try:
             self._handle(asked)
         except Exception as failed:  # noqa: BLE001 - reported to the caller, whatever it is
@@ -120,7 +120,7 @@ class Server:
             asked.refuse(f"{type(failed).__name__}: {failed}")
 
 
-def answering(answer: Answer) -> Callable[[Asked], object]:
+def answering(answer: Answer) -> Callable[[ServiceRequest], object]:
     """Handles requests by a function that returns the response."""
     return lambda asked: asked.answer(answer(asked.request(), asked.who(), asked.came_at))
 

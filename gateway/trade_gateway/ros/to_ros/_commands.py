@@ -65,13 +65,13 @@ class CommandsToRos:
         if handle.effect == "actuate" and not stops:
             problem = "has no stop, so silence could not end a command's motion"
             raise ConfigurationError(where=handle.label, problem=problem)
-        taking = _Taking(entry, handle, asked, stops, self._nodes, self._say)
+        executor = _TopicExecutor(entry, handle, asked, stops, self._nodes, self._say)
         try:
-            taking.hears(self._graph.subscribe(place.name, entry.type, taking.heard))
+            executor.hears(self._graph.subscribe(place.name, entry.type, executor.heard))
         except BaseException:
-            taking.close()
+            executor.close()
             raise
-        return taking
+        return executor
 
 
 class _Commanded(NamedTuple):
@@ -84,7 +84,7 @@ class _Commanded(NamedTuple):
     """The number of stops that its node had requested before."""
 
 
-class _Taking:
+class _TopicExecutor:
     """Executes the messages of one topic, from one node at a time."""
 
     def __init__(
