@@ -99,7 +99,7 @@ check: $(UV) ## lint, formatting, types, import rules, spelling, plain English, 
 	@$(RUN) lint-imports
 	@$(RUN) codespell
 	@$(RUN) python -m tests.docs.plain_english
-	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
+	@$(UV) run --isolated --no-project --directory docs --with $(CURDIR) python -W error -c 'import trade, sys; \
 	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers", "opentelemetry"} & set(sys.modules); \
 	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
 
