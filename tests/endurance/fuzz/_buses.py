@@ -116,7 +116,7 @@ def _cia402_axis(data: bytes) -> DriveAxis:
     for number, piece in enumerate(_pieces(data), 1):
         axis.asked_ns = number
         axis.silent = bool(number % 5 == 0)
-        for take in (axis.take_status, axis.take_motion, axis.take_emergency):
+        for take in (lambda frame: axis.take_status(frame, 0), axis.take_motion, axis.take_emergency):
             take(piece)
         axis.take_heartbeat(piece, number)
     return axis
