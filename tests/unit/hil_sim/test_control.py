@@ -89,7 +89,7 @@ def test_it_closes_also_if_its_last_client_woke_it_up_before_the_bell(path: Path
     thread.join(20)
     server.close()
     assert not path.exists()
-    assert server._rope.fileno() == -1
+    assert server._wake_write.fileno() == -1
 
 
 def test_state_is_the_truth_about_every_device(control: SimControl, buses: list[DynamixelBus]) -> None:
