@@ -260,11 +260,10 @@ class Selector(selectors.SelectSelector):
         writing = any(key.events & selectors.EVENT_WRITE for key in keys)
         reading = [key.fd for key in keys if key.events & selectors.EVENT_READ]
         readable = set(self._files.wait(reading, 0.0 if writing else timeout))
-        found = [
-            (key, (key.events & selectors.EVENT_WRITE) | (selectors.EVENT_READ if key.fd in readable else 0))
-            for key in keys
+        ready = [
+            key.events & (selectors.EVENT_WRITE | (selectors.EVENT_READ if key.fd in readable else 0)) for key in keys
         ]
-        return [(key, events & key.events) for key, events in found if events & key.events]
+        return [(key, events) for key, events in zip(keys, ready, strict=True) if events]
 
 
 def _number_of(file: Any) -> int:

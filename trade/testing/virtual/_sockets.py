@@ -42,7 +42,8 @@ class Socket:
         self._timeout_s: float | None = socket.getdefaulttimeout()
         self._io_refs = 0
         """How many files of it are open, which read on after it was closed."""
-        self._closed = self._ended = False
+        self._closed = False
+        self._ended = False
         """Whether no more will come."""
         self._number = self._network.files.add(self)
 
@@ -92,7 +93,8 @@ class Socket:
         self._name = address
 
     def listen(self, _most: int = 128) -> None:
-        self._backlog = self._backlog or deque()
+        if self._backlog is None:  # a second call keeps those that wait
+            self._backlog = deque()
 
     # --- connections
 
