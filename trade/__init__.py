@@ -12,27 +12,26 @@ from msgspec import Meta
 from trade import errors
 from trade import records as _records
 from trade._calls.batch import Outcome
+from trade._calls.find_types import Acall as _Acall
+from trade._calls.find_types import Afind as _Afind
+from trade._calls.find_types import Find as _Find
+from trade._calls.find_types import FindRobot as _FindRobot
+from trade._calls.group_view import GroupView
 from trade._calls.handle import Bound, Handle, handle_of, start_call
 from trade._calls.pddl import pddl_domain
+from trade._calls.reachability import Reachability
 from trade._calls.run import Run
 from trade._container.container import Container
 from trade._container.default import aof_default as _aof_default
 from trade._container.default import close, container, serve, start
 from trade._container.default import of_default as _of_default
-from trade._container.group_view import GroupView
-from trade._container.hooking import Hook
-from trade._container.lookup import Acall as _Acall
-from trade._container.lookup import Afind as _Afind
-from trade._container.lookup import Find as _Find
-from trade._container.lookup import FindRobot as _FindRobot
-from trade._container.reachability import Reachability
 from trade._container.system import System
-from trade._container.tracing import LogReader, Trace
 from trade._context.call_context import CallContext, current_call, progress
 from trade._context.sessions import Session
 from trade._counters import Measure
 from trade._discovery.link_table import LinkInfo, NetworkInfo
 from trade._estop.broadcast import EstopReport
+from trade._hooks.api import Hook
 from trade._hooks.guard import Guard
 from trade._hooks.hook import HookEvent, HookInfo
 from trade._locks.lock import Lock
@@ -56,6 +55,7 @@ from trade._telemetry.call_model import CallDeviation, CallModel, CallProfile
 from trade._telemetry.load import LoadInfo
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
+from trade._tracing.api import LogReader, Trace
 
 __all__ = [
     "Bound",
@@ -176,7 +176,7 @@ __all__ = [
     "where",
 ]
 
-system = System(container)
+system = System(lambda: container()._parts)
 """The settings and controls of the default container."""
 
 

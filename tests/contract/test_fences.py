@@ -24,7 +24,7 @@ def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire
         mark = written_now()
         run = move.start(*shared.far[1:])
         wait_until(lambda: shared.exchange._inbox, "the move is admitted")
-        assert operator.locking.break_lock(device, "it is mine")
+        assert operator.lock_api.break_lock(device, "it is mine")
         gate.release()
         with pytest.raises((errors.LockLost, errors.MotionStopped)):
             run.result()
@@ -44,7 +44,7 @@ def test_S11_a_moving_device_gets_no_further_set_points_once_its_lock_is_lost(
     with lock.use():
         run = shared.started(planner, shared.slowly)
         shared.under_way()
-        assert operator.locking.break_lock(device, "it is mine")
+        assert operator.lock_api.break_lock(device, "it is mine")
         with pytest.raises(errors.TradeError):
             run.result()
     lock.release()
@@ -147,10 +147,10 @@ def test_S07_a_stop_needs_no_lock_and_only_the_owner_lets_it_move_again(
             run.result()
         shared.rests()
         with pytest.raises(errors.LockedByOther):
-            operator.locking.resume(device)
+            operator.lock_api.resume(device)
         with pytest.raises(errors.Stopped):
             shared.asked(planner, shared.far)
-        assert planner.locking.resume(device) == [shared.resource]
+        assert planner.lock_api.resume(device) == [shared.resource]
         assert shared.moves_back(planner)
 
 
@@ -168,7 +168,7 @@ def test_S08_a_foreign_stop_latches_until_a_client_resumes(
     with pytest.raises(errors.Stopped):
         shared.move()
     assert not shared.ordered(mark)
-    assert operator.locking.resume(where(group=shared.resource)) == [shared.resource]
+    assert operator.lock_api.resume(where(group=shared.resource)) == [shared.resource]
     assert shared.moves_back(planner)
 
 

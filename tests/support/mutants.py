@@ -168,10 +168,10 @@ def _ordinary(patch: Patch) -> None:
 
 def _first_of_several(patch: Patch) -> None:
     """A constraint that several services meet means one of them."""
-    from trade._container.lookup import Lookup
+    from trade._calls.client import CallClient
 
-    matches = Lookup._await_matches
-    patch(Lookup, "_await_matches", lambda self, *which: matches(self, *which)[:1])
+    matches = CallClient._await_matches
+    patch(CallClient, "_await_matches", lambda self, *which: matches(self, *which)[:1])
 
 
 def _discovery_never(patch: Patch) -> None:

@@ -3,96 +3,108 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Final, Protocol
+from pathlib import Path
+from typing import Final
 
 from trade._audit.events import open_audit
 from trade._calls.caller import Caller
-from trade._calls.handle import CallHost, Handle, handle_codec
+from trade._calls.client import CallClient
+from trade._calls.handle import handle_codec
 from trade._calls.local_path import MARK, LocalPath
+from trade._calls.sessions import Sessions
 from trade._calls.target_cache import Targets
-from trade._container.connect import join
 from trade._container.policy_reload import begin_watching
+from trade._container.registration import Registration
 from trade._container.shutdown import Shutdown
+from trade._context.call_context import running
 from trade._context.outgoing import handed_down
 from trade._counters import Measure
 from trade._discovery.announcer import Announcer
 from trade._discovery.dialer import Dialer
+from trade._discovery.join import join
 from trade._discovery.listener import RegistryListener
-from trade._estop.controller import LIMIT_S, EstopController, check_limit, is_stop
-from trade._hooks import hook
+from trade._estop.controller import EstopController, is_stop
+from trade._federation.federation import Federation
+from trade._hooks.api import HookApi
 from trade._hooks.guard import Guards
 from trade._hooks.hook import CallCopies, Hooks
-from trade._locks import api
 from trade._locks.api import LockApi
 from trade._locks.inherited import InheritedLock
 from trade._locks.remote_locks import RemoteLocks
-from trade._migration import factory
+from trade._migration.api import MigrationApi
 from trade._migration.delivered_code import CodeStore
 from trade._migration.factory import ProviderFactory
 from trade._migration.quiesce import Quiescer
 from trade._migration.source import MigrationSource
 from trade._migration.target import MigrationTarget
-from trade._notifications import notification
+from trade._notifications.api import NotificationApi
 from trade._notifications.events import EventLog
 from trade._notifications.notifier import Notifier
 from trade._notifications.states import States
+from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._registry.constraints import where
+from trade._registry.listing import containers_of
 from trade._registry.registry import Change, Record, Registry
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder
+from trade._security.authorizer import Authorizer
 from trade._services.dispatcher import Dispatcher
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
 from trade._settings import Settings
-from trade._stop_line import GroupStop, RelayedEstop, StopLines, StopLineService, StopReport, session_for, together
-from trade._streams import source as _streams
+from trade._stop_line import RelayedEstop, StopApi, StopLines, StopLineService
+from trade._streams.api import StreamApi
 from trade._streams.source import Streams
 from trade._streams.subscriptions import Subscriptions
+from trade._table import Table
 from trade._telemetry.load import LoadMeter, resident_bytes
 from trade._telemetry.otlp import open_export
 from trade._telemetry.prometheus import open_metrics
 from trade._telemetry.spans import Spans, new_spans
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
+from trade._tracing.api import TraceApi
 from trade._transport.base import Transport
 from trade._transport.credentials import keep_secret, user_secret
 from trade._transport.host_socket import host_sockets, listen_on_host
 from trade._transport.local_greeting import Passport
 from trade._transport.zenoh import ZenohTransport
-from trade.errors import AccessDenied, TradeError
+from trade.errors import AccessDenied, ConfigurationError, TradeError
 
 _logger = logging.getLogger("trade")
 
 
-class Host(
-    hook.HookHost,
-    api.LockHost,
-    factory.FactoryHost,
-    notification.NotificationHost,
-    _streams.StreamHost,
-    CallHost,
-    Protocol,
-):
-    """The container, as its components see it."""
-
-    def close(self) -> None: ...
-
-
 class Components:
-    """The components of one container, and which of them owns which data."""
+    """The components of one container, and which of them owns which data.
 
-    def __init__(self, home: Host, settings: Settings, transport: Transport | None) -> None:
-        self._home = home
-        self._settings = settings
-        self._access = home.access
-        self._address = home.address
-        self._session = str(home.address)
+    Args:
+        container: whose components they are.
+        address: its address.
+        settings: its settings.
+        transport: carries everything, if it is given.
+        on_terminate: called when a client has ended the container.
+    """
+
+    def __init__(
+        self,
+        container: object,
+        address: Address,
+        settings: Settings,
+        transport: Transport | None,
+        on_terminate: Callable[[], None],
+    ) -> None:
+        self._container = container
+        self._address = address
+        self._session = str(address)
+        self._on_terminate = on_terminate
+        self.settings: Final = settings
+        self.access: Final = Authorizer(settings.policy, certified=settings.tls is not None)
         self.session_end: Final = Event[str]()
         """Emitted with the name of each session that ends."""
         self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
@@ -111,16 +123,17 @@ class Components:
             self._build_stop_line(leaving)
             self._build_measures(leaving)
             self._build_states()
+            self._build_federation()
             self._leaving = leaving.pop_all()
 
     def _build_transport(self, leaving: contextlib.ExitStack, transport: Transport | None) -> None:
-        self.audit = open_audit(self._settings, self._address, leaving)
+        self.audit = open_audit(self.settings, self._address, leaving)
         self._given = transport is not None
         """Whether the transport was given: then it carries everything."""
-        self.events = EventLog(self._home.name)
-        self._certificate = None if self._given else self._settings.certificate()
+        self.events = EventLog(self._address.container)
+        self._certificate = None if self._given else self.settings.certificate()
         self.transport = transport or join(
-            self._settings,
+            self.settings,
             self._certificate,
             leaving,
             lambda until: self.events.note("certificate_ends", self._address.identity, until),
@@ -128,18 +141,19 @@ class Components:
         leaving.callback(self.transport.close)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
-        own_pair = not self._given and self._settings.tls is None and self._settings.credentials is None
+        own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
         self._secret = user_secret()[1] if own_pair else ""
         """The secret of this user on this host, if the container's links use it."""
         self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
         if isinstance(self.transport, ZenohTransport):
-            self.dialer = Dialer(self.transport.links, self._settings.check_may_dial, self._settings.connect)
+            self.dialer = Dialer(self.transport.links, self.settings.check_may_dial, self.settings.connect)
             leaving.callback(self.dialer.close)
 
     def _build_calls(self, leaving: contextlib.ExitStack) -> None:
-        home, address = self._home, self._address
-        self.codec = handle_codec(lambda handle: handle.key, home.handle)
-        self.registry = Registry(address, self._access.may_offer, self._access.may_have_stops)
+        address = self._address
+        self.registry = Registry(address, self.access.may_offer, self.access.may_have_stops)
+        self.client = CallClient(address, self.settings.system, self.registry, self.dialer, self.access)
+        self.codec = handle_codec(lambda handle: handle.key, self.client.handle)
         self.local_path = self._local_path()
         self.caller = Caller(self.transport, address, self.local_path)
         leaving.callback(self.caller.close)
@@ -147,12 +161,13 @@ class Components:
         leaving.callback(self.scheduler.close)
         notified = Scheduler("trade-notifications", self.transport.clock)
         leaving.callback(notified.close)
-        self.notifier = Notifier(home, notified, address.epoch, lambda record: Handle(home, record.key, record))
+        self.notifier = Notifier(self.client, notified)
         leaving.callback(self.notifier.close)
+        self.sessions = Sessions(address, self.transport, self.session_ended)
 
     def _local_path(self) -> LocalPath | None:
         """The local path to others; None if it is switched off, or the transport was given."""
-        settings = self._settings
+        settings = self.settings
         if not settings.local_path or self._given:
             return None
         password = "" if settings.tls is not None else "\n".join(settings.credentials or user_secret())
@@ -160,25 +175,26 @@ class Components:
 
     def _build_locks(self, leaving: contextlib.ExitStack) -> None:
         address = self._address
-        self.inherited = InheritedLock(self._settings.lock, address) if self._settings.lock else None
+        self.inherited = InheritedLock(self.settings.lock, address) if self.settings.lock else None
         if self.inherited is not None:
             handed_down[address] = self.inherited
             leaving.callback(handed_down.pop, address)
         self.event_loop = AsyncLoop()
         leaving.callback(self.event_loop.close)
-        self.lock_api = LockApi(self._home, self.transport.clock)
-        self.locks = LockTable(address.epoch, self._home.name, self.transport.clock, self.audit)
+        self.lock_api = LockApi(self.client, self.transport.clock)
+        self.locks = LockTable(address.epoch, self._address.container, self.transport.clock, self.audit)
         leaving.callback(self.locks.close)
         self.remote_locks = RemoteLocks(self.locks, address.epoch)
 
     def _build_services(self, leaving: contextlib.ExitStack) -> None:
-        address, access = self._address, self._access
+        address, access = self._address, self.access
         self.announcer = Announcer(self.transport, address)
         leaving.callback(self.announcer.close)
         self.providers = Providers(
             self.announcer, self.registry, address, self.codec, self.event_loop, self.locks, access, self.audit
         )
         self.targets = Targets(access, self.registry, self.providers, self.caller, self.codec, self.audit)
+        self.client.begin_calls(self.targets)
         self.registry.changes.subscribe(self.targets.changed)  # before all other subscribers: they may make calls
 
     def _build_notifications_and_hooks(self, leaving: contextlib.ExitStack) -> None:
@@ -186,36 +202,41 @@ class Components:
         self.events.occurred.subscribe(lambda occurred: self.notifier.occurred(*occurred))
         self.session_end.subscribe(self.notifier.session_ended)
         copies = CallCopies(self.codec)
-        self.guards = Guards(self._home, copies, self.providers.prepare_again)
+        self.guards = Guards(self.client, copies, self.providers.prepare_again)
         leaving.callback(self.guards.pool.close)
         self.providers.prepare = self.guards.apply
         self.hooks = Hooks(
-            self._home,
+            self.client,
             copies,
             self.scheduler,
-            self._settings.hook_limit_s,
+            self.settings.hook_limit_s,
             self.providers.service,
             lambda: self.registry.select(where.local),
             self._denied_hook,
         )
         self.registry.changes.subscribe(self.hooks.changed)
         self.session_end.subscribe(self.hooks.session_ended)
+        self.notification_api = NotificationApi(self.client, self.notifier)
+        self.hook_api = HookApi(self.client, self.notification_api)
 
     def _build_telemetry(self, leaving: contextlib.ExitStack) -> None:
-        exported = open_export(self._settings, self._address, leaving)
+        exported = open_export(self.settings, self._address, leaving)
         self.spans = new_spans(self._address, self._session, self.locks, exported)
-        self.trace(self._settings.trace)
+        self.trace(self.settings.trace)
+        self.trace_api = TraceApi(self.client)
 
     def _build_streams(self, leaving: contextlib.ExitStack) -> None:
-        home = self._home
-        self.streams = Streams(home, self.transport, self.providers.service, self.scheduler, self.caller.new_id)
+        self.streams = Streams(self.client, self.transport, self.providers.service, self.scheduler, self.caller.new_id)
         self.registry.changes.subscribe(self.streams.changed)
         self.session_end.subscribe(self.streams.session_ended)
         leaving.callback(self.streams.close)
-        self.subscriptions = Subscriptions(home, self.transport, self.scheduler, self.codec, self.registry.removed)
+        self.subscriptions = Subscriptions(
+            self.client, self.transport, self.scheduler, self.codec, self.registry.removed
+        )
         self.registry.changes.subscribe(self.subscriptions.changed)
         self.session_end.subscribe(self.subscriptions.session_ended)
         leaving.callback(self.subscriptions.close)
+        self.stream_api = StreamApi(self.client, self.subscriptions, self.scheduler)
 
     def _build_estop(self, leaving: contextlib.ExitStack) -> None:
         self.estop = EstopController(
@@ -224,8 +245,8 @@ class Components:
             self.registry,
             self.locks,
             self.providers,
-            self._settings,
-            self._access,
+            self.settings,
+            self.access,
             self.audit,
         )
         leaving.callback(self.estop.close)
@@ -233,25 +254,35 @@ class Components:
         self.locks.stop_with(self.deadman.stop)
 
     def _build_migration(self, leaving: contextlib.ExitStack) -> None:
-        home, address, access = self._home, self._address, self._access
+        address, access = self._address, self.access
         self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-        state_dir = self._settings.state_dir
-        kept = None if state_dir is None else state_dir / self._settings.system / "code"
-        code = CodeStore(kept, self._settings.code, address.container)
-        self.factory = ProviderFactory(home, self.providers, self.withdrawn, self._settings.instantiable, code)
+        self.registration = Registration(self.client, self.providers, self.withdrawn, self.deadman)
+        state_dir = self.settings.state_dir
+        kept = None if state_dir is None else state_dir / self.settings.system / "code"
+        code = CodeStore(kept, self.settings.code, address.container)
+        self.factory = ProviderFactory(
+            self._container,
+            address,
+            self.registration.register,
+            self.providers,
+            self.withdrawn,
+            self.settings.instantiable,
+            code,
+        )
         leaving.callback(self.factory.close)
         quiescer = Quiescer(self.locks, address)
         self.migration_source = MigrationSource(
-            home, self.providers, self.factory, self.withdrawn, quiescer, access, self.codec
+            self.client, self.providers, self.factory, self.withdrawn, quiescer, access, self.codec
         )
         self.migration_target = MigrationTarget(
             address, self.providers, self.factory, quiescer, access, self.codec, self.scheduler
         )
         leaving.callback(self.migration_target.close)
+        self.migration_api = MigrationApi(self.client)
 
     def _build_dispatch(self, leaving: contextlib.ExitStack) -> None:
         self.dispatcher = Dispatcher(
-            self.transport, self._address, self.providers, self.event_loop, self._access, self.audit
+            self.transport, self._address, self.providers, self.event_loop, self.access, self.audit
         )
         leaving.callback(self.dispatcher.close)
         self.local_server: LocalServer | None = None
@@ -260,8 +291,8 @@ class Components:
 
     def _take_local_calls(self, passport: Passport) -> None:
         try:
-            listening = listen_on_host(self._settings.system, MARK, self._address.epoch)
-            host_sockets(self._settings.system, MARK)  # this removes those of ended processes
+            listening = listen_on_host(self.settings.system, MARK, self._address.epoch)
+            host_sockets(self.settings.system, MARK)  # this removes those of ended processes
         except (OSError, TradeError) as bad:
             _logger.warning("no local path here: %s. Calls from this host take the transport, which is slower", bad)
             return
@@ -270,27 +301,28 @@ class Components:
             self.dispatcher.pools.append(self.local_server)
 
     def _build_stop_line(self, leaving: contextlib.ExitStack) -> None:
-        self.stop_lines = StopLines(self._settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
+        self.stop_lines = StopLines(self.settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
+        self.stop_api = StopApi(self.client, self.stop_lines)
         self.stop_line: StopLineService | None = None
         """Its service of the stop line; None on a transport without a host."""
         if self.dialer is not None:
             self.stop_line = StopLineService(
-                self._address, self._settings, self._access, self.audit, self.estop, self.stop_for
+                self._address, self.settings, self.access, self.audit, self.estop, self.stop_api.stop_for
             )
             leaving.callback(self.stop_line.close)
             self.registry.changes.subscribe(self._mind_stops)
-            if self._settings.bridge:
+            if self.settings.bridge:
                 self.stop_line.listen_on_host()
 
     def _build_states(self) -> None:
         self.states = States(
-            self._home.name,
+            self._address.container,
             self.events,
             self.registry,
             self.dialer,
             self._links,
             self._certificate,
-            self._settings.bridge,
+            self.settings.bridge,
             self.caller.answers,
             self.spans,
             self.trace,
@@ -300,12 +332,29 @@ class Components:
         self.hooks.suspended.subscribe(lambda hook: suspended(hook.name, hook.last_error, hook.called))
         self.streams.notify = self.states.listener_changed
 
-    def _build_measures(self, leaving: contextlib.ExitStack) -> None:
-        self.load_meter = LoadMeter(self._home.name, lambda: list(self.dispatcher.pools), self.providers.waiting)
-        self.shutdown = Shutdown(
-            self._home.name, self.deadman.rest, self.locks.resources, lambda: self.load_meter.running, self._home.close
+    def _build_federation(self) -> None:
+        self.federation = Federation(
+            self.client,
+            self.providers,
+            self.locks,
+            self.remote_locks,
+            self.lock_api.lease_client,
+            self.estop,
+            self.event_loop,
         )
-        self.metrics_port = open_metrics(self._settings, self.audit.calls, self._measures, leaving)
+
+    def _build_measures(self, leaving: contextlib.ExitStack) -> None:
+        self.load_meter = LoadMeter(
+            self._address.container, lambda: list(self.dispatcher.pools), self.providers.waiting
+        )
+        self.shutdown = Shutdown(
+            self._address.container,
+            self.deadman.rest,
+            self.locks.resources,
+            lambda: self.load_meter.running,
+            self._on_terminate,
+        )
+        self.metrics_port = open_metrics(self.settings, self.audit.calls, self._measures, leaving)
 
     def appear(self, own: object, estops: object) -> None:
         """Announces the container to others, with the middleware's own services. Closes everything on failure.
@@ -318,12 +367,12 @@ class Components:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
             self.providers.add(estops, (DOMAIN,), name=ESTOP_PROVIDER)
-            self.estop.begin(estops, self.stop_lines.estop, partial(RelayedEstop, self._home, self.registry))
+            self.estop.begin(estops, self.stop_lines.estop, partial(RelayedEstop, self.client))
             self._leaving.callback(self.announcer.appear().close)
             self.watch = RegistryListener(
                 self.transport,
                 self.registry,
-                self._home.address,
+                self._address,
                 self._lost,
                 self.session_ended,
                 self.locks.session_back,
@@ -331,54 +380,9 @@ class Components:
                 self.estop.learn,
             )
             self._leaving.callback(self.watch.close)
-            if self._home.access.path is not None:
-                begin_watching(self._home.access, self.scheduler, self.audit, self.recheck_access)
+            if self.access.path is not None:
+                begin_watching(self.access, self.scheduler, self.audit, self.recheck_access)
             undone.pop_all()
-
-    def stop_for(self, who: str, group: str, limit_s: float, known: Sequence[str] = ()) -> StopReport:
-        """Calls the stop services of a group that are known here, in a session of the client that asks.
-
-        Args:
-            who: the client.
-            group: what to stop, with all groups beneath it.
-            limit_s: how long to wait, in seconds.
-            known: the keys of services that the client stops itself.
-        """
-        until = time.monotonic() + limit_s
-        with session_for(self._address, who).use():
-            return GroupStop(self._home, self.registry, group, None, known).wait(until, lambda: True)
-
-    def stop(self, group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
-        """Calls all stop services of a group at once, and waits until what they stop is at rest (S07).
-
-        It needs no lock and no existing link: it also asks containers on the stop line, and each container that it sees
-        stops what only that one sees. A service that any of them stopped is stopped. Read the report:
-        `StopReport.complete`. This is software, not safety-rated.
-
-        Args:
-            group: such as ``rosie.left``, with all groups beneath it.
-            reason: why, for the record.
-            limit_s: how long to try, in seconds; also if nothing is found, and a container may be missing.
-
-        Raises:
-            ConfigurationError: the group or the limit is not valid.
-        """
-        check_limit(limit_s, "stop")
-        until, wanted = time.monotonic() + limit_s, where(group=group)
-        beside = self.stop_lines.stop(group, reason, limit_s)
-        begun = GroupStop(self._home, self.registry, group, reason)
-
-        def ready() -> bool:
-            found = bool(self.registry.select(wanted)) or bool(begun.report().stopped)
-            return found or (beside.over() and (bool(beside.report().stopped) or self._sees_all()))
-
-        report = begun.wait(until, ready)
-        return together(group, [report, beside.report() if report.complete else beside.wait()])
-
-    def _sees_all(self) -> bool:
-        """Whether no container is known to be missing: each has listed its services, and each dialled one is linked."""
-        listed = all(state.heard.complete for state in self.registry.containers() if state.address != self._address)
-        return listed and not (self.dialer is not None and self.dialer.unlinked())
 
     # --- handling events
 
@@ -436,7 +440,7 @@ class Components:
     def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Passes a release request to the holder of a lock; called by the lock services."""
         owner = Address(*holder.session.split("/")[:3])
-        self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
+        self.client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
 
     def trace(self, on: bool) -> bool:
         """Switches the tracing of calls on or off. Returns whether it was on."""
@@ -476,11 +480,11 @@ class Components:
         return [pool.taken for pool in list(self.dispatcher.pools)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
-        return self._home.access.denied(who, "instrument", record.key.domain, record.label)
+        return self.access.denied(who, "instrument", record.key.domain, record.label)
 
     def recheck_access(self) -> None:
         """Applies a changed policy: locks that it no longer allows are lost."""
-        access = self._home.access
+        access = self.access
         self.targets.recheck_access()
         self.dispatcher.hear(access.callers())
         self.registry.recheck_access()
@@ -492,6 +496,37 @@ class Components:
             if denied is not None:
                 self.locks.lose(info.token.number, str(denied))
 
+    # --- its set-up
+
+    @property
+    def reach(self) -> Dialer:
+        """Its links; raises ConfigurationError on a transport without links."""
+        self.client.check_open()
+        if self.dialer is None:
+            raise ConfigurationError(problem="this container's transport cannot change its links while it runs")
+        return self.dialer
+
+    def load_policy(self, path: Path | str) -> None:
+        """Loads another access policy, or the same file again; calls under way continue.
+
+        A container that was started with a policy (`Settings.policy`) reads it again when its files change; so it does
+        with a policy that is loaded here.
+
+        Services that the policy no longer allows leave the registry, and locks that it no longer allows are lost.
+
+        Raises:
+            ConfigurationError: the policy is wrong; the message says where. The earlier policy stays in force.
+        """
+        self.client.check_open()
+        self.access.load(Path(path))
+        self.audit.changed("policy loaded", str(path), running.get())
+        self.recheck_access()
+
+    def containers(self) -> Table[ContainerInfo]:
+        """The containers of the system, this one included."""
+        self.client.check_open()
+        return containers_of(self.registry)
+
     # --- ending
 
     @property
@@ -502,12 +537,14 @@ class Components:
 
     def close(self) -> None:
         """Closes all components."""
+        self.client.close()
         self.dispatcher.leave()
         self.targets.close()
         self._leaving.close()
 
     def abandon(self) -> None:
         """Closes nothing but connections, in a forked child."""
+        self.client.close()
         self.targets.close()
         for local in (self.local_path, self.local_server):
             if local is not None:

@@ -29,8 +29,7 @@ class Shutdown:
         self._rest = rest
         self._resources = resources
         self._running = running
-        self.close = close
-        """Closes it; a program that exists for its container replaces this with its own end, which closes it, too."""
+        self._close = close
         self._first = threading.Lock()
 
     def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]:
@@ -51,7 +50,7 @@ class Shutdown:
         until = time.monotonic() + _ANSWERED_S
         while self._running() and time.monotonic() < until:
             time.sleep(_LOOK_EVERY_S)
-        self.close()
+        self._close()
 
 
 def _uses(resources: Sequence[Resource]) -> list[str]:

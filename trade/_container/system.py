@@ -1,77 +1,21 @@
-"""The middleware's own services about a container, in group ``trade`` of every container."""
+"""The controls of a container; ``trade.system`` has those of the default one."""
 
 import contextlib
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Literal
 
 from trade._calls.handle import Handle
-from trade._discovery.dialer import Dialer
-from trade._migration.delivered_code import CodeStore, pack
-from trade._notifications.events import EventLog
+from trade._container.assembly import Components
+from trade._migration.delivered_code import pack
 from trade._protocol.container_info import ContainerInfo
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, ServiceKey
-from trade._registry.constraints import Constraint, where
+from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, ServiceKey
+from trade._registry.constraints import where
 from trade._remote.ssh import Started, start
-from trade._services.decorator import service
 from trade._services.withdrawn import WithdrawnInfo
-from trade._settings import Settings
 from trade._table import Table
-from trade._telemetry.load import LoadInfo, LoadMeter
+from trade._telemetry.load import LoadInfo
 from trade.errors import ConfigurationError, LinkStays, NoSuchService, TooManyServices
-
-
-class _Withdrawn(Protocol):
-    def take_off(self, key: ServiceKey) -> str: ...
-    def put_back(self, provider: str, groups: str | Sequence[str] | None) -> list[ServiceKey]: ...
-    def infos(self) -> list[WithdrawnInfo]: ...
-
-
-class _Making(Protocol):
-    @property
-    def code(self) -> CodeStore: ...
-    def find(self, class_path: str) -> type: ...
-    def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object: ...
-    def offer(
-        self, made: object, groups: Sequence[str], args: Sequence[Any] | Mapping[str, Any]
-    ) -> tuple[Handle, ...]: ...
-    def terminate(self, service: Handle) -> None: ...
-
-
-class _Arriving(Protocol):
-    def bring_back(
-        self, class_path: str, args: Sequence[Any] | Mapping[str, Any], groups: tuple[str, ...], state: Any
-    ) -> list[ServiceKey]: ...
-
-
-class _Terminating(Protocol):
-    def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]: ...
-
-
-class _Member(Protocol):
-    """The container that is controlled."""
-
-    address: Final[Address]
-    events: Final[EventLog]
-    meter: LoadMeter
-
-    @property
-    def reach(self) -> Dialer: ...
-    @property
-    def withdrawn(self) -> _Withdrawn: ...
-    @property
-    def making(self) -> _Making: ...
-    @property
-    def arriving(self) -> _Arriving: ...
-    @property
-    def terminating(self) -> _Terminating: ...
-    @property
-    def settings(self) -> Settings: ...
-    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def containers(self) -> Table[ContainerInfo]: ...
-    def load_policy(self, path: str) -> None: ...
 
 
 class System:
@@ -80,31 +24,31 @@ class System:
     None of them disturbs calls under way. Each is also a service in group ``trade`` of every container.
     """
 
-    def __init__(self, member: Callable[[], _Member]) -> None:
-        self._member = member
+    def __init__(self, components: Callable[[], Components]) -> None:
+        self._components = components
 
     def set_discovery(self, on: bool) -> None:
         """Switches discovery: links to all containers of this system that broadcast; existing links stay.
 
         It searches where the container listens: on this host, or on its networks.
         """
-        member = self._member()
-        was = member.reach.discovers
-        member.reach.set_discovery(on)
+        parts = self._components()
+        was = parts.reach.discovers
+        parts.reach.set_discovery(on)
         self._note_switched("discovery", was=was, on=on)
 
     def set_broadcast(self, on: bool) -> None:
         """Switches broadcasting: answers the discovery of other containers of this system."""
-        member = self._member()
-        was = member.reach.broadcasts
-        member.reach.set_broadcast(on)
+        parts = self._components()
+        was = parts.reach.broadcasts
+        parts.reach.set_broadcast(on)
         self._note_switched("broadcast", was=was, on=on)
 
     def _note_switched(self, what: Literal["discovery", "broadcast"], *, was: bool, on: bool) -> None:
         if was is not on:
-            member = self._member()
-            clock = member.handle(ServiceKey(member.address, DOMAIN, PROVIDER, CLOCK)).record
-            member.events.note(what, member.address.container, "on" if on else "off", clock)
+            parts = self._components()
+            clock = parts.client.handle(ServiceKey(parts.client.address, DOMAIN, PROVIDER, CLOCK)).record
+            parts.events.note(what, parts.client.address.container, "on" if on else "off", clock)
 
     def connect(self, endpoint: str) -> None:
         """Links to the container at an endpoint, and again whenever the link is lost.
@@ -116,7 +60,7 @@ class System:
             CannotConnect: no container there accepts this one.
             ConfigurationError: no endpoint, or a network, with neither system id nor credentials (S21).
         """
-        self._member().reach.connect(endpoint)
+        self._components().reach.connect(endpoint)
 
     def disconnect(self, endpoint: str) -> None:
         """Stops dialling an endpoint.
@@ -129,15 +73,15 @@ class System:
         """
         if any(info.name == endpoint for info in self.containers()):
             raise LinkStays(to=endpoint)
-        self._member().reach.disconnect(endpoint)
+        self._components().reach.disconnect(endpoint)
 
     def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
-        return self._member().containers()
+        return self._components().containers()
 
     def load(self) -> LoadInfo:
         """The load of this container, its process and its host."""
-        return self._member().meter.read()
+        return self._components().load_meter.read()
 
     def deregister(self, service: Handle) -> str:
         """Withdraws the provider of a service of this container, which keeps the object to register it again.
@@ -148,12 +92,12 @@ class System:
         Raises:
             ConfigurationError: it is not registered here, or is the middleware's own.
         """
-        member = self._member()
+        parts = self._components()
         home = service.key.address
-        if home != member.address:
+        if home != parts.client.address:
             problem = f"it belongs to another container, or to an earlier epoch; call deregister of {home.container}"
             raise ConfigurationError(where=service.label, problem=problem)
-        return member.withdrawn.take_off(service.key)
+        return parts.withdrawn.take_off(service.key)
 
     def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
         """Offers an object again that was deregistered through this container.
@@ -168,12 +112,12 @@ class System:
         Raises:
             ConfigurationError: no such provider was deregistered, or a malformed group.
         """
-        member = self._member()
-        return tuple(member.handle(key) for key in member.withdrawn.put_back(provider, groups))
+        parts = self._components()
+        return tuple(map(parts.client.handle, parts.withdrawn.put_back(provider, groups)))
 
     def withdrawn(self) -> list[WithdrawnInfo]:
         """The providers that `register` can offer again, by name."""
-        return self._member().withdrawn.infos()
+        return self._components().withdrawn.infos()
 
     def instantiate(
         self,
@@ -200,11 +144,12 @@ class System:
             CannotInstantiate: its module or its constructor raised, or it does not take the state.
             ConfigurationError: it has no services, or a group is malformed; the object is closed again.
         """
-        member = self._member()
-        making, named = member.making, (groups,) if isinstance(groups, str) else tuple(groups)
+        parts = self._components()
+        factory, named = parts.factory, (groups,) if isinstance(groups, str) else tuple(groups)
         if state is not None:
-            return tuple(member.handle(key) for key in member.arriving.bring_back(class_path, args, named, state))
-        return making.offer(making.make(making.find(class_path), args), named, args)
+            keys = parts.migration_target.bring_back(class_path, args, named, state)
+            return tuple(map(parts.client.handle, keys))
+        return factory.offer(factory.make(factory.find(class_path), args), named, args)
 
     def add_code(self, archive: bytes) -> str:
         """Keeps an archive of modules in this container, which imports from it now and after a restart.
@@ -221,7 +166,7 @@ class System:
         Raises:
             CodeRefused: ``Settings.code`` does not list the hash, or it cannot be kept; nothing was imported.
         """
-        return self._member().making.code.add(archive)
+        return self._components().factory.code.add(archive)
 
     def send_code(self, container: str, path: Path, *, deadline_s: float = 60.0) -> str:
         """Brings a wheel or a folder of modules to another container, which must list its hash: `trade code PATH`.
@@ -239,7 +184,7 @@ class System:
             ConfigurationError: it cannot be read, has no modules, has compiled ones, or is too large.
         """
         archive = pack(path)
-        taking = self._member().find(where(name="add_code", group=DOMAIN, container=container))
+        taking = self._components().client.find(where(name="add_code", group=DOMAIN, container=container))
         sha256: str = taking.with_(deadline_s=deadline_s)(archive)
         return sha256
 
@@ -275,17 +220,17 @@ class System:
             CannotStart: with the reason, and what to do.
             ConfigurationError: the host or a variable is not valid.
         """
-        member = self._member()
+        parts = self._components()
 
         def joined(started: Started) -> ContainerInfo | None:
             with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
-                member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
+                parts.client.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
             return next((info for info in self.containers() if info.epoch == started.epoch), None)
 
         return start(
             host,
             name,
-            system=member.settings.system,
+            system=parts.settings.system,
             joined=joined,
             wait_s=wait_s,
             allow=allow,
@@ -304,7 +249,7 @@ class System:
             ConfigurationError: this container did not create it, or it has ended.
             DeviceFault: it could not be stopped; it is offered as before.
         """
-        self._member().making.terminate(service)
+        self._components().factory.terminate(service)
 
     def terminate_container(self, reason: str = "", *, only_at_rest: bool = False, who: str = "itself") -> list[str]:
         """Ends this container: its motion stops, and its services are withdrawn. Does not wait for its end.
@@ -322,7 +267,7 @@ class System:
         Raises:
             InUse: a resource is locked or moves, with ``only_at_rest``.
         """
-        return self._member().terminating.begin(reason, who, only_at_rest=only_at_rest)
+        return self._components().shutdown.begin(reason, who, only_at_rest=only_at_rest)
 
     def load_policy(self, path: str) -> None:
         """Loads another access policy, or the same file again; calls under way continue.
@@ -333,66 +278,4 @@ class System:
         Raises:
             ConfigurationError: the policy is wrong; the message says where. The earlier policy stays in force.
         """
-        self._member().load_policy(path)
-
-
-class SystemServices:
-    """The services of every container about itself."""
-
-    def __init__(self, system: System) -> None:
-        self._system = system
-
-    @service(effect="read")
-    def clock(self) -> int:
-        """The monotonic clock of this container, in nanoseconds; the basis of every expiry."""
-        return time.monotonic_ns()
-
-    @service(effect="read")
-    def containers(self) -> list[ContainerInfo]:
-        """The containers that this one knows, itself included."""
-        return self._system.containers()
-
-    @service(effect="read")
-    def load(self) -> LoadInfo:
-        """The load of this container, its process and its host."""
-        return self._system.load()
-
-    @service
-    def deregister(self, service: Handle) -> str:
-        """Withdraws the provider of a service of this container; returns the name to register it with again."""
-        return self._system.deregister(service)
-
-    @service
-    def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
-        """Offers an object again that was deregistered through this container, in other groups if given."""
-        return self._system.register(provider, groups)
-
-    @service(effect="read")
-    def withdrawn(self) -> list[WithdrawnInfo]:
-        """The providers that can be registered again, by name."""
-        return self._system.withdrawn()
-
-    @service
-    def set_discovery(self, on: bool) -> None:
-        """Switches discovery: links to all containers of the system that broadcast."""
-        self._system.set_discovery(on)
-
-    @service
-    def set_broadcast(self, on: bool) -> None:
-        """Switches broadcasting: answers the discovery of other containers of the system."""
-        self._system.set_broadcast(on)
-
-    @service
-    def connect(self, endpoint: str) -> None:
-        """Links to the container at an endpoint; CannotConnect if no container there accepts this one."""
-        self._system.connect(endpoint)
-
-    @service
-    def disconnect(self, endpoint: str) -> None:
-        """Stops dialling an endpoint; LinkStays if its link exists, which stays until one of its containers ends."""
-        self._system.disconnect(endpoint)
-
-    @service
-    def load_policy(self, path: str) -> None:
-        """Loads another access policy, or the same file again; a wrong one leaves the earlier one in force."""
-        self._system.load_policy(path)
+        self._components().load_policy(path)

@@ -1,17 +1,11 @@
 """The service that a hook or a guard calls: a handle, or the only service that matches a constraint at that time."""
 
-from typing import Final, Protocol, cast
+from typing import Final, cast
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade._registry.registry import Record
-
-
-class CalleeHost(Protocol):
-    """The functions of a container that a callee uses."""
-
-    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
-    def services(self, constraint: Constraint | None = ..., /) -> list[Handle]: ...
 
 
 class Callee:
@@ -23,12 +17,12 @@ class Callee:
         self.text: Final = which.label if isinstance(which, Handle) else f"the service with {which}"
         """The service as text."""
 
-    def now(self, home: CalleeHost) -> Handle | None:
+    def now(self, client: CallClient) -> Handle | None:
         """The service as it is now; None if no service matches. Raises TooManyServices."""
         if self.constraint is None:
             return self.handle
-        found = home.services(self.constraint)
-        return found[0] if len(found) == 1 else home.find(self.constraint, wait_s=0) if found else None
+        found = client.services(self.constraint)
+        return found[0] if len(found) == 1 else client.find(self.constraint, wait_s=0) if found else None
 
     def follows(self, record: Record) -> bool:
         """Whether it may be this service, which has just joined."""

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Final, NamedTuple, cast
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext
 from trade._context.interceptor import ServedCall
 from trade._hooks.callee import Callee, callee_of
-from trade._hooks.hook import CallCopies, HookEvent, HookHost, as_the_container
+from trade._hooks.hook import CallCopies, HookEvent, as_the_container
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, as_constraint, services_at
 from trade._registry.registry import Record
@@ -123,7 +124,7 @@ class Guard(AbstractContextManager["Guard"]):
         def run() -> None:
             try:
                 with as_the_container(context, marker, chain, time.monotonic_ns() + int(left_s * 1e9)):
-                    answer.give(lambda: self._ask(called, context, left_s, guards.home))
+                    answer.give(lambda: self._ask(called, context, left_s, guards.client))
             finally:
                 with self._lock:
                     self._running -= 1
@@ -141,10 +142,10 @@ class Guard(AbstractContextManager["Guard"]):
             return self.limit_s
         return max(0.0, min(self.limit_s, (context.expires_ns - time.monotonic_ns()) / 1e9))
 
-    def _ask(self, called: HookEvent, context: CallContext, left_s: float, home: HookHost) -> Any:
+    def _ask(self, called: HookEvent, context: CallContext, left_s: float, client: CallClient) -> Any:
         if self._service is None:
             return self._check(called)
-        service = self._service.now(home)
+        service = self._service.now(client)
         if service is None:
             return f"no service matches {self._service.constraint}, its check"
         asked = service.with_(deadline_s=left_s).start(called)
@@ -157,20 +158,20 @@ class _GuardedService(NamedTuple):
 
     guard: Guard
     handle: Handle
-    home: "Guards"
+    guards: "Guards"
 
     def require(self, call: ServedCall) -> None:
         """Raises CallRefused unless the call may run."""
-        self.guard.decide(self.home.copies.event(call, self.handle), call.context, self.home)
+        self.guard.decide(self.guards.copies.event(call, self.handle), call.context, self.guards)
 
 
 class Guards:
     """Owns the guards of one container: those of ``@service(guard=...)``, and those that programs add."""
 
-    def __init__(self, home: HookHost, copies: CallCopies, recheck: Callable[[], None]) -> None:
+    def __init__(self, client: CallClient, copies: CallCopies, recheck: Callable[[], None]) -> None:
         self.copies: Final = copies
         self.pool: Final = ThreadPool()
-        self.home: Final = home
+        self.client: Final = client
         self._recheck = recheck
         self._lock = threading.Lock()
         self._added: tuple[Guard, ...] = ()
@@ -227,7 +228,7 @@ class Guards:
             found = [guard for guard in self._added if guard.means(record)]
             own = _own(service)
             if found or own or service.guards:
-                handle = self.home.handle(record.key)
+                handle = self.client.handle(record.key)
                 service.guards = tuple(_GuardedService(guard, handle, self) for guard in (*own, *found))
 
     def _end(self, guard: Guard) -> None:

@@ -5,17 +5,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import msgspec
 from msgspec import Struct
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext, running
 from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.outgoing import holding
 from trade._context.sessions import speaking
-from trade._hooks.callee import Callee, CalleeHost
+from trade._hooks.callee import Callee
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint
@@ -88,15 +89,6 @@ class HookInfo(Struct, frozen=True, kw_only=True):
     last_error: str
 
 
-class HookHost(CalleeHost, Protocol):
-    """The functions of a container that hooks use."""
-
-    @property
-    def name(self) -> str: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def require_call(self, who: str, handle: Handle) -> None: ...
-
-
 Denied = Callable[[str, Record], "AccessDenied | None"]
 """Why an identity may not instrument a service; None if it may."""
 
@@ -137,14 +129,14 @@ class AttachedHook:
             return self.target.key == record.key
         return self.target.matches(record)
 
-    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
+    def tell(self, client: CallClient, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
         """Call the hook within this time and its own. Whatever its outcome, the watched call continues."""
         allowed_s = min(self.limit_s, left_s)
         if allowed_s <= 0:
             self.skipped += 1
             return
         try:
-            call = self.call.now(home)
+            call = self.call.now(client)
             if call is None:
                 self.skipped, self.last_error = self.skipped + 1, f"no service matches {self.call.constraint}"
                 return
@@ -152,7 +144,7 @@ class AttachedHook:
             if call.label in chain:
                 self.skipped += 1
                 return
-            home.require_call(self.identity, call)
+            client.require_call(self.identity, call)
             call.with_(deadline_s=allowed_s).start(called).result(allowed_s)
             self.fired += 1
             self._in_a_row = 0
@@ -215,14 +207,14 @@ class HookInterceptor(Interceptor):
 
     def __init__(
         self,
-        home: HookHost,
+        client: CallClient,
         copies: CallCopies,
         scheduler: Scheduler,
         limit_s: float,
         handle: Handle,
         hooks: Sequence[AttachedHook],
     ) -> None:
-        self._home = home
+        self._client = client
         self._copies = copies
         self._scheduler = scheduler
         self._limit_s = limit_s
@@ -264,7 +256,7 @@ class HookInterceptor(Interceptor):
         with as_the_container(context, context.service, context.chain, context.expires_ns):
             for hook in hooks:
                 if not hook.suspended:
-                    hook.tell(self._home, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
+                    hook.tell(self._client, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
 
 
 def _error_text(service: ServedService, error: BaseException) -> str:
@@ -298,7 +290,7 @@ class Hooks:
 
     def __init__(
         self,
-        home: HookHost,
+        client: CallClient,
         copies: CallCopies,
         scheduler: Scheduler,
         limit_s: float,
@@ -306,7 +298,7 @@ class Hooks:
         records: Callable[[], list[Record]],
         denied: Denied,
     ) -> None:
-        self._home = home
+        self._client = client
         self._copies = copies
         self._scheduler = scheduler
         self._limit_s = limit_s
@@ -341,12 +333,12 @@ class Hooks:
             ConfigurationError: the hook is to run before a stop service, its limit is out of range, or there are too
                 many hooks.
         """
-        require_limit(limit_s, self._home.name)
+        require_limit(limit_s, self._client.name)
         own_s = self._limit_s if limit_s is None else limit_s
         hook = AttachedHook(name, side, target, call, own_s, owner, identity, self.suspended.emit)
         with self._lock:
             if (owner, name) not in self._attached and len(self._attached) >= _MOST:
-                raise ConfigurationError(where=self._home.name, problem=f"{_MOST} hooks are attached here already")
+                raise ConfigurationError(where=self._client.name, problem=f"{_MOST} hooks are attached here already")
             meant = [record for record in self._records() if _hookable(record) and hook.means(record)]
             stops = [record for record in meant if record.info.effect == "stop" and side == "before"]
             if stops and isinstance(target, Handle):
@@ -421,8 +413,8 @@ class Hooks:
         if self._spans is not None and traceable(record.key):
             yield SpanRecorder(self._spans)
         if hooks:
-            handle = self._home.handle(record.key)
-            yield HookInterceptor(self._home, self._copies, self._scheduler, self._limit_s, handle, hooks)
+            handle = self._client.handle(record.key)
+            yield HookInterceptor(self._client, self._copies, self._scheduler, self._limit_s, handle, hooks)
 
     def _concerns(self, hook: AttachedHook, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None
@@ -436,7 +428,7 @@ class Hooks:
                 target=hook.target.label if isinstance(hook.target, Handle) else str(hook.target),
                 call=hook.call.text,
                 owner=hook.owner,
-                container=self._home.name,
+                container=self._client.name,
                 services=tuple(sorted(hook.services.values())),
                 fired=hook.fired,
                 skipped=hook.skipped,

@@ -3,15 +3,13 @@
 import contextlib
 import logging
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._hooks.callee import Callee
 from trade._hooks.hook import AttachedHook, HookInfo, Hooks, Side
-from trade._notifications.services import NotificationServicesHost
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint
-from trade._registry.registry import Registry
-from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, ConfigurationError
 
@@ -19,13 +17,11 @@ _logger = logging.getLogger("trade")
 
 
 class HookServices:
-    """The wire side of `Hooks`."""
+    """Attaches, lists and detaches hooks in this container for all clients."""
 
-    def __init__(self, hooks: Hooks, registry: Registry, home: NotificationServicesHost, access: Authorizer) -> None:
+    def __init__(self, hooks: Hooks, client: CallClient) -> None:
         self._hooks = hooks
-        self._known = registry
-        self._watched = home
-        self._hook_access = access
+        self._client = client
         hooks.suspended.subscribe(self._notify_hook_owner)
 
     @service
@@ -46,7 +42,7 @@ class HookServices:
                 where="attach_hook", problem="it needs a handle or a constraint, of each of the two"
             )
         if call is not None:
-            self._known.wait_until_known([call.key])  # calls under way do not wait for it
+            self._client.registry.wait_until_known([call.key])  # calls under way do not wait for it
         return self._hooks.attach(name, side, target, Callee(which), asked.session, asked.caller, limit_s or None)
 
     @service
@@ -55,7 +51,7 @@ class HookServices:
         asked, found = served_call(), self._hooks.named(name)
         for hook in found:
             if hook.identity != asked.caller:
-                self._hook_access.require(asked.caller, "administer", DOMAIN, f"hook {name}")
+                self._client.access.require(asked.caller, "administer", DOMAIN, f"hook {name}")
             self._hooks.detach(hook.owner, name)
         return bool(found)
 
@@ -74,5 +70,5 @@ class HookServices:
     def _notify_hook_owner(self, hook: AttachedHook) -> None:
         owner = Address(*hook.owner.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # the owner has gone
-            suspended = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
+            suspended = self._client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
             suspended.start(hook.name, hook.call.text, hook.last_error)

@@ -3,9 +3,9 @@
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
-from trade._calls.everywhere import Everywhere
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._calls.run import Run
 from trade._context.outgoing import Claim
@@ -14,7 +14,6 @@ from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, as_constraint, group_at, under
 from trade._resources.grants import LockInfo, LockRequest
-from trade._security.authorizer import Authorizer
 from trade._table import Table
 from trade._transport.wait_clock import WaitClock
 from trade.errors import (
@@ -57,25 +56,12 @@ class LockOverview(NamedTuple):
         return any(address.container == container for address in self.silent)
 
 
-class LockHost(Protocol):
-    """The part of a container that the lock methods use."""
-
-    access: Final[Authorizer]
-
-    @property
-    def address(self) -> Address: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def services(self, constraint: Constraint | None = None, /) -> list[Handle]: ...
-    def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None: ...
-    def everywhere(self, name: str) -> Everywhere: ...
-
-
 class LockApi:
-    """The lock methods of one container; ``container.locking``."""
+    """The lock methods of one container; ``container.lock_api``."""
 
-    def __init__(self, home: LockHost, clock: WaitClock) -> None:
-        self._home = home
-        self.lease_client: Final = LeaseClient(home, clock)
+    def __init__(self, client: CallClient, clock: WaitClock) -> None:
+        self._client = client
+        self.lease_client: Final = LeaseClient(client, clock)
 
     def lock(
         self,
@@ -147,7 +133,7 @@ class LockApi:
         """
 
         def look() -> list[Handle]:
-            handles = selected(which, self._home.services)
+            handles = selected(which, self._client.services)
             if not partial:
                 require_whole(which, handles)
             return handles
@@ -162,14 +148,14 @@ class LockApi:
             return bool(found)
 
         def settled() -> bool:
-            return arrived() or not self._home.services(which)
+            return arrived() or not self._client.services(which)
 
         try:
-            self._home.await_services(which, settled, min(wait_s, _SETTLE_S))
+            self._client.await_services(which, settled, min(wait_s, _SETTLE_S))
             if not found:
-                self._home.await_services(which, arrived, wait_s)
+                self._client.await_services(which, arrived, wait_s)
         except NoSuchService:
-            if not self._home.services(which):
+            if not self._client.services(which):
                 raise
             return look()  # a part of it exists, and the error names the missing ones
         return found
@@ -188,7 +174,7 @@ class LockApi:
     def known(self) -> LockOverview:
         """The known locks of the system, and the containers that did not answer."""
         runs: list[tuple[Address, Run]] = []
-        present = self._home.everywhere("locks")
+        present = self._client.everywhere("locks")
         found, silent = list[LockInfo](), list(present.silent)
         for handle in present.handles:
             with contextlib.suppress(TradeError):  # it left meanwhile
@@ -240,7 +226,7 @@ class LockApi:
         """
 
         def found() -> list[Handle]:
-            return [handle for handle in self._home.services(which) if handle.effect == "actuate"]
+            return [handle for handle in self._client.services(which) if handle.effect == "actuate"]
 
         def whole() -> bool:
             with contextlib.suppress(IncompleteGroup):
@@ -249,13 +235,13 @@ class LockApi:
             return False
 
         try:
-            self._home.await_services(which, lambda: bool(found()), wait_s)
+            self._client.await_services(which, lambda: bool(found()), wait_s)
         except NoSuchService:
-            if not self._home.services(which):
+            if not self._client.services(which):
                 raise
             return  # the matching services do not actuate; the next step raises that error
         with contextlib.suppress(NoSuchService):
-            self._home.await_services(which, whole, min(wait_s, _SETTLE_S))
+            self._client.await_services(which, whole, min(wait_s, _SETTLE_S))
 
     def break_lock(self, which: Constraint | str | Iterable[Handle], reason: str) -> list[LockInfo]:
         """Takes the locks on these services away from their owners; motion under them stops.
@@ -267,7 +253,7 @@ class LockApi:
             AccessDenied: the policy does not let this container administer one of them.
         """
         meant = _meant(which, "break_lock")
-        handles = selected(meant, self._home.services)
+        handles = selected(meant, self._client.services)
         self._require("administer", handles, meant)
         wanted = resources_of(handles)
         broken: list[LockInfo] = []
@@ -281,16 +267,16 @@ class LockApi:
         groups = _groups_of(which) if isinstance(which, Constraint) else []
         for handle in handles:
             what = f"{groups[0]} (of it {handle.label})" if len(groups) == 1 else handle.label
-            self._home.access.require(self._home.address.identity, verb, handle.key.domain, what)
+            self._client.access.require(self._client.address.identity, verb, handle.key.domain, what)
 
     def _everywhere(self, name: str, which: Constraint | Iterable[Handle], *rest: str) -> list[str]:
         verb = "resume" if name == "resume" else "lock"
-        wanted = resources_of(selected(which, self._home.services, verb))
+        wanted = resources_of(selected(which, self._client.services, verb))
         runs = [self._service(address, name).start(names, *rest) for address, names in wanted.items()]
         return [text for run in runs for text in run.result()]
 
     def _service(self, address: Address, name: str) -> Handle:
-        return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
+        return self._client.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
 
 
 def _meant(which: Constraint | str | Iterable[Handle], function: str) -> Constraint | list[Handle]:

@@ -6,10 +6,11 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final, NoReturn, Protocol
+from typing import Any, Final, NoReturn
 
 from msgspec import structs
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 from trade._locks.lock import Lock, apart
@@ -26,19 +27,11 @@ _BEATS: Final = 4
 """Renewals within one lease."""
 
 
-class LeaseHost(Protocol):
-    """The part of a container that renewing leases uses."""
-
-    @property
-    def address(self) -> Address: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-
-
 class LeaseClient:
     """All locks of a container, and the thread that renews them."""
 
-    def __init__(self, home: LeaseHost, clock: WaitClock) -> None:
-        self._home = home
+    def __init__(self, client: CallClient, clock: WaitClock) -> None:
+        self._client = client
         self.clock: Final = clock
         self._locks: list[Lock] = []
         self._changed = threading.Condition()
@@ -49,7 +42,7 @@ class LeaseClient:
 
     @property
     def owner(self) -> Address:
-        return self._home.address
+        return self._client.address
 
     def over(self) -> bool:
         """Whether its container closes or is closed."""
@@ -111,7 +104,7 @@ class LeaseClient:
         return ask.bind(list(names), terms)
 
     def _service(self, address: Address, name: str) -> Handle:
-        return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
+        return self._client.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
 
     # --- giving back
 

@@ -4,9 +4,9 @@ import importlib
 import logging
 import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from trade._calls.handle import Handle
 from trade._migration.delivered_code import CodeStore
@@ -27,36 +27,42 @@ class _Made(NamedTuple):
     args: Arguments
 
 
-class FactoryHost(Protocol):
-    """The container in which created objects are registered."""
-
-    @property
-    def address(self) -> Address: ...
-    def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
-
-
-_hosts: Final[dict[int, FactoryHost]] = {}
+_hosts: Final[dict[int, object]] = {}
 """The open containers of the process that host objects of others, in this order."""
 
 
-def first_host() -> FactoryHost | None:
+def first_host() -> object | None:
     """The first open container of the process that hosts objects of others; None if none does."""
     return next(iter(list(_hosts.values())), None)
 
 
 class ProviderFactory:
-    """Owns the objects created here: each is closed when a client terminates it, or with the container."""
+    """Owns the objects created here: each is closed when a client terminates it, or with the container.
+
+    Args:
+        container: hosts the objects; code of theirs uses it by default.
+        own: its address.
+        register: registers a created object in groups.
+        providers: of the container.
+        withdrawn: of the container.
+        allowed: patterns of the classes that may be created.
+        code: what was sent here for import.
+    """
 
     def __init__(
         self,
-        home: FactoryHost,
+        container: object,
+        own: Address,
+        register: Callable[[object, Sequence[str]], tuple[Handle, ...]],
         providers: Providers,
         withdrawn: Withdrawn,
         allowed: Sequence[str],
         code: CodeStore,
     ) -> None:
         self.code: Final = code
-        self._home = home
+        self._container = container
+        self._own = own
+        self._register = register
         self._providers = providers
         self._withdrawn = withdrawn
         self._allowed = tuple(allowed)
@@ -64,8 +70,8 @@ class ProviderFactory:
         self._made: dict[int, _Made] = {}
 
     def host(self) -> None:
-        """Let code of others in this process use this container by default."""
-        _hosts.setdefault(id(self), self._home)
+        """Lets code of others in this process, such as drivers of other packages, use this container by default."""
+        _hosts.setdefault(id(self), self._container)
 
     def find(self, class_path: str) -> type:
         """The class of a path, in the module that defines it; only modules of allowed classes are imported.
@@ -75,7 +81,7 @@ class ProviderFactory:
             NoSuchClass: the class does not exist.
             CannotInstantiate: its module cannot be imported.
         """
-        where = self._home.address.container
+        where = self._own.container
         if not any(fnmatchcase(class_path, pattern) for pattern in self._allowed):
             raise NotInstantiable(class_path=class_path, container=where, allowed=self._allowed)
         if not _PATH.fullmatch(class_path):
@@ -101,13 +107,13 @@ class ProviderFactory:
         try:
             return kind(**args) if isinstance(args, Mapping) else kind(*args)
         except Exception as error:
-            where = self._home.address.container
+            where = self._own.container
             raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_error_text(error)) from error
 
     def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
         """Register a created object; close it if that fails."""
         try:
-            handles = self._home.register(made, groups)
+            handles = self._register(made, groups)
         except BaseException:
             end(made)
             raise
@@ -135,7 +141,7 @@ class ProviderFactory:
     def terminate(self, service: Handle) -> None:
         """See `System.terminate`."""
         key, offered = service.key, None
-        if key.address == self._home.address:
+        if key.address == self._own:
             offered = self._providers.offer(f"{key.domain}/{key.provider}") or self._withdrawn.offer(key.provider)
         made = None if offered is None else self._made.get(id(offered.provider))
         if made is None:

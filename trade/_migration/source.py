@@ -8,8 +8,9 @@ import contextlib
 import logging
 import threading
 from collections.abc import Generator, Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import running
 from trade._migration.factory import Arguments, ProviderFactory, path_of
@@ -17,7 +18,7 @@ from trade._migration.quiesce import Frozen, Quiescer, is_stateful, restore, sav
 from trade._migration.target import Prepared, ProviderSnapshot, fingerprint
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
-from trade._registry.constraints import Constraint, where
+from trade._registry.constraints import where
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._services.registration import Offer
@@ -42,23 +43,12 @@ _ARRIVE_S: Final = 5.0
 _ASK_S: Final = 2.0
 
 
-class MigrationHost(Protocol):
-    """The container that the provider leaves."""
-
-    @property
-    def address(self) -> Address: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def has(self, key: ServiceKey) -> bool: ...
-    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
-    def services(self, constraint: Constraint | None = ..., /) -> list[Handle]: ...
-
-
 class MigrationSource:
     """Moves providers of one container to other containers, and saves or restores their state."""
 
     def __init__(
         self,
-        home: MigrationHost,
+        client: CallClient,
         providers: Providers,
         making: ProviderFactory,
         withdrawn: Withdrawn,
@@ -66,7 +56,7 @@ class MigrationSource:
         access: Authorizer,
         codec: Codec,
     ) -> None:
-        self._home = home
+        self._client = client
         self._providers = providers
         self._making = making
         self._withdrawn = withdrawn
@@ -102,7 +92,7 @@ class MigrationSource:
     def _offer(self, service: Handle, who: str) -> Offer:
         """The registration of a service's provider; raises ServiceGone, AccessDenied, ConfigurationError."""
         key = service.key
-        if key.address != self._home.address:
+        if key.address != self._client.address:
             problem = f"it belongs to another container, or to an earlier boot; ask {key.address.container}"
             raise ConfigurationError(where=service.label, problem=problem)
         if key.domain == DOMAIN:
@@ -123,7 +113,7 @@ class MigrationSource:
         place = _place(service.key)
         with self._lock:
             if place in self._away:
-                own = self._home.address
+                own = self._client.address
                 owner = own.who
                 raise LockedByOther(resources=(place,), owner=owner, purpose="moving it, or its state, already")
             self._away.add(place)
@@ -162,7 +152,7 @@ class MigrationSource:
                 self._hand_over(service, offer, keys, prepared.ticket, name)
             finally:
                 running.reset(free)
-        return [self._home.handle(key) for key in keys]
+        return [self._client.handle(key) for key in keys]
 
     def _require_free(self, service: Handle, offer: Offer) -> None:
         """S20: hardware is bound to its host, unless its driver declares that other hosts can reach it."""
@@ -174,9 +164,9 @@ class MigrationSource:
     def _target(self, to: str) -> Handle:
         """`PREPARE` of the container of that name; of several matches, of the one whose host is least busy."""
         asked = where(name=PREPARE, group=DOMAIN, container=to)
-        found = [one for one in self._home.services(asked) if one.key.address != self._home.address]
+        found = [one for one in self._client.services(asked) if one.key.address != self._client.address]
         if not found:
-            raise NoSuchService(constraint=f"{asked}, other than {self._home.address.container} itself")
+            raise NoSuchService(constraint=f"{asked}, other than {self._client.address.container} itself")
         return found[0] if len(found) == 1 else min(found, key=self._load)
 
     def _load(self, there: Handle) -> tuple[float, float]:
@@ -215,7 +205,7 @@ class MigrationSource:
                 if not self._is_offered(keys, ticket):
                     problem = "it was not offered there in time"
             except TradeError as error:
-                here = self._home.address.container
+                here = self._client.address.container
                 raise MigrationUnknown(
                     provider=service.label, container=here, to=there.container, withdrawn=name
                 ) from error
@@ -228,10 +218,10 @@ class MigrationSource:
 
     def _is_offered(self, keys: list[ServiceKey], ticket: str) -> bool:
         """Whether the target offers it; if not, it never will. Raises TradeError if the target cannot be asked."""
-        return self._home.has(keys[0]) or self._ask(keys[0].address, "arrived", _ASK_S, ticket)
+        return self._client.has(keys[0]) or self._ask(keys[0].address, "arrived", _ASK_S, ticket)
 
     def _ask(self, there: Address, name: str, deadline_s: float, *args: object) -> Any:
-        return self._home.handle(ServiceKey(there, DOMAIN, PROVIDER, name)).with_(deadline_s=deadline_s)(*args)
+        return self._client.handle(ServiceKey(there, DOMAIN, PROVIDER, name)).with_(deadline_s=deadline_s)(*args)
 
 
 def _require_time(service: Handle, there: Handle) -> None:

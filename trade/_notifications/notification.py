@@ -6,15 +6,15 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from msgspec import Struct
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.sessions import Session
 from trade._notifications.events import StateEvent
 from trade._notifications.triggers import Action, Target, TriggerSpec, text_of
-from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade._threads.scheduler import Scheduler
 from trade._transport.wait_clock import WaitClock
@@ -95,15 +95,6 @@ class Notification(ABC):
         return f"<Notification {self._text}>"
 
 
-class NotificationHost(Protocol):
-    """The functions of a container that a notification uses."""
-
-    @property
-    def name(self) -> str: ...
-    def find(self, constraint: Constraint, /, *, wait_s: float = ...) -> Handle: ...
-    def require_call(self, who: str, handle: Handle) -> None: ...
-
-
 class Owner(Struct, frozen=True):
     """The owner of a notification."""
 
@@ -125,7 +116,7 @@ class ActiveNotification(Notification):
         if_: Target | None,
         when: Target | None,
         owner: Owner,
-        home: NotificationHost,
+        client: CallClient,
         ended: Callable[["ActiveNotification"], None],
         failed: Callable[["ActiveNotification", str], None],
     ) -> None:
@@ -135,7 +126,7 @@ class ActiveNotification(Notification):
         self._call = call
         self._if = if_
         self._when = when
-        self._home = home
+        self._client = client
         self._tell_ended = ended
         self._tell_failed = failed
         self.detached = False
@@ -174,7 +165,7 @@ class ActiveNotification(Notification):
             call=text_of(self._call),
             condition=", ".join(f"{word} {text_of(what)}" for word, what in conditions if what is not None),
             owner=self.owner.session,
-            container=self._home.name,
+            container=self._client.name,
             state=self._state.value,
             fired=self._fired,
             failures=self._failures,
@@ -189,7 +180,7 @@ class ActiveNotification(Notification):
     def detach(self) -> None:
         if not self.owner.identity:
             problem = (
-                f"it runs in container {self._home.name}, which requested it, and ends with that; "
+                f"it runs in container {self._client.name}, which requested it, and ends with that; "
                 "request it with host= another container"
             )
             raise ConfigurationError(where=repr(self), problem=problem)
@@ -292,9 +283,9 @@ class ActiveNotification(Notification):
             handle = target.handle
             if handle is None:
                 assert target.constraint is not None  # noqa: S101
-                handle = self._home.find(target.constraint, wait_s=0)
+                handle = self._client.find(target.constraint, wait_s=0)
             if self.owner.identity:
-                self._home.require_call(self.owner.identity, handle)
+                self._client.require_call(self.owner.identity, handle)
             return handle(*given, *target.args, **target.kwargs)
 
     def _failed(self, part: str, target: Target, error: BaseException) -> None:

@@ -4,9 +4,9 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from trade._calls.handle import Handle
+from trade._calls.client import CallClient
 from trade._notifications.events import StateEvent
-from trade._notifications.notification import ActiveNotification, NotificationHost, NotificationInfo, Owner
+from trade._notifications.notification import ActiveNotification, NotificationInfo, Owner
 from trade._notifications.triggers import OF_CHANGES, Target, TriggerSpec
 from trade._registry.registry import Change, Record
 from trade._threads.scheduler import Scheduler
@@ -19,13 +19,9 @@ _MOST: Final = 10_000
 class Notifier:
     """Owns the notifications of one container, for itself and for others."""
 
-    def __init__(
-        self, home: NotificationHost, scheduler: Scheduler, epoch: str, handle: Callable[[Record], Handle]
-    ) -> None:
-        self._home = home
+    def __init__(self, client: CallClient, scheduler: Scheduler) -> None:
+        self._client = client
         self._scheduler = scheduler
-        self._epoch = epoch
-        self._handle = handle
         self._lock = threading.Lock()
         self._notifications: dict[str, ActiveNotification] = {}
         self._of_changes: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
@@ -53,15 +49,15 @@ class Notifier:
         with self._lock:
             if owner.identity and len(self._notifications) >= _MOST:
                 problem = f"{len(self._notifications)} notifications are active here already"
-                raise ConfigurationError(where=self._home.name, problem=problem)
+                raise ConfigurationError(where=self._client.name, problem=problem)
             self._count += 1
-            name = f"{self._epoch}.{self._count}"
+            name = f"{self._client.address.epoch}.{self._count}"
             notification = ActiveNotification(
-                name, terms, call, if_, when, owner, self._home, self._forget, self._failed
+                name, terms, call, if_, when, owner, self._client, self._forget, self._failed
             )
             self._notifications[name] = notification
             for record in existing:
-                notification.add(self._handle(record))
+                notification.add(self._client.handle_of(record))
             again = notification.begin(self._scheduler)
             if terms.occasion in OF_CHANGES:
                 self._of_changes[name] = (notification, again)
@@ -93,7 +89,7 @@ class Notifier:
         for notification, again in active:
             concerned = _concerned(notification, change)
             for record in concerned:
-                notification.add(self._handle(record))
+                notification.add(self._client.handle_of(record))
             if concerned:
                 again(now)
 

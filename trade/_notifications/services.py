@@ -4,8 +4,8 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from typing import Protocol
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._context.sessions import Session
@@ -14,22 +14,10 @@ from trade._notifications.notifier import Notifier
 from trade._notifications.triggers import OF_SERVICES, Action, TriggerSpec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.registry import Record, Registry
-from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, NoSuchNotification
 
 _logger = logging.getLogger("trade")
-
-
-class NotificationServicesHost(Protocol):
-    """The container that offers the services."""
-
-    @property
-    def address(self) -> Address: ...
-    @property
-    def name(self) -> str: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def open_session(self, client: str) -> Session: ...
 
 
 class Guests:
@@ -56,16 +44,12 @@ class Guests:
 
 
 class NotificationServices:
-    """The wire side of a `Notifier`."""
+    """Keeps notifications in this container for owners in others, and lists, ends and detaches them."""
 
-    def __init__(
-        self, notifier: Notifier, registry: Registry, home: NotificationServicesHost, access: Authorizer
-    ) -> None:
+    def __init__(self, notifier: Notifier, client: CallClient, open_session: Callable[[str], Session]) -> None:
         self._notifier = notifier
-        self._records = registry
-        self._home = home
-        self._rights = access
-        self._guests = Guests(home.open_session)
+        self._client = client
+        self._guests = Guests(open_session)
         notifier.failed = self._notify_owner
         notifier.ended = self._guests.leave
 
@@ -73,10 +57,11 @@ class NotificationServices:
     def notify(self, terms: TriggerSpec, call: Action, if_: Action | None = None, when: Action | None = None) -> str:
         """Make a call when an event occurs, for the caller, who must then have the right to make it; returns the id."""
         asked, given = served_call(), (call, if_, when)
-        self._records.wait_until_known(one.handle.key for one in given if one is not None and one.handle is not None)
+        handles = (one.handle for one in given if one is not None)
+        self._client.registry.wait_until_known(handle.key for handle in handles if handle is not None)
         owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
         try:
-            return placed(self._notifier, self._records, terms, call, if_, when, owner).id
+            return placed(self._notifier, self._client.registry, terms, call, if_, when, owner).id
         finally:
             self._notifier.tidy(asked.session)
 
@@ -110,14 +95,14 @@ class NotificationServices:
 
     def _mine_or_administered(self, notification: str) -> ActiveNotification | None:
         active, asked = self._notifier.get(notification), served_call()
-        if active is not None and (active.owner.identity or self._home.address.identity) != asked.caller:
-            self._rights.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
+        if active is not None and (active.owner.identity or self._client.address.identity) != asked.caller:
+            self._client.access.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
         return active
 
     def _notify_owner(self, active: ActiveNotification, error: str) -> None:
         owner = Address(*active.owner.session.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # the owner has gone
-            failed = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
+            failed = self._client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
             failed.start(active.id, str(active.terms), error)
 
 

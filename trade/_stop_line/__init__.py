@@ -4,6 +4,7 @@ Each container listens on it; any client that may reach the container may ask it
 docs/wire-protocol.md, "The stop line", describes its messages.
 """
 
+from trade._stop_line.api import StopApi
 from trade._stop_line.client import LineCall, StopLines
 from trade._stop_line.elsewhere import elsewhere
 from trade._stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
@@ -15,6 +16,7 @@ __all__ = [
     "GroupStopServices",
     "LineCall",
     "RelayedEstop",
+    "StopApi",
     "StopLineService",
     "StopLines",
     "StopReport",

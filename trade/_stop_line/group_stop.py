@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from msgspec import Struct, structs
 
-from trade._calls.handle import CallHost, Handle
+from trade._calls.client import CallClient
 from trade._calls.run import Run
 from trade._context.call_context import served_call
 from trade._context.sessions import Session, client_name
@@ -56,18 +56,15 @@ class GroupStop:
     Each container is asked at once for what is not known here, and a little later for what has not confirmed here.
 
     Args:
-        home: the container that calls.
-        registry: of that container.
+        client: makes the calls.
         group: what to stop, with all groups beneath it.
         reason: why, for the record of other containers; None: they are not asked.
         known: the keys of services that the caller stops itself.
     """
 
-    def __init__(
-        self, home: CallHost, registry: Registry, group: str, reason: str | None, known: Iterable[str] = ()
-    ) -> None:
-        self._home = home
-        self._registry = registry
+    def __init__(self, client: CallClient, group: str, reason: str | None, known: Iterable[str] = ()) -> None:
+        self._client = client
+        self._registry = client.registry
         self._group = group
         self._reason = reason
         self._known = frozenset(known)
@@ -107,7 +104,7 @@ class GroupStop:
 
     def _start(self, record: Record, *args: object) -> "Run[Any] | str":
         try:
-            run = Handle(self._home, record.key, record).start(*args)
+            run = self._client.handle_of(record).start(*args)
         except Exception as error:  # noqa: BLE001 - after any error, the others still have to stop
             return _said(error)
         run.add_done_callback(lambda _: self._changed.notify_all())

@@ -8,11 +8,11 @@ from typing import Final
 
 import msgspec
 
-from trade._calls.handle import CallHost, Handle
+from trade._calls.client import CallClient
+from trade._calls.handle import Handle
 from trade._estop.broadcast import EstopReport, all_of, as_seen_here
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import where
-from trade._registry.registry import Registry
 
 ESTOP: Final = "estop"
 _RELAYS: Final = 4
@@ -25,16 +25,15 @@ class RelayedEstop:
     Each is asked in a thread of its own: a link that takes nothing holds up neither the others nor the e-stop itself.
     """
 
-    def __init__(self, home: CallHost, registry: Registry, estop_id: str, reason: str, limit_s: float) -> None:
+    def __init__(self, client: CallClient, estop_id: str, reason: str, limit_s: float) -> None:
         self._id = estop_id
         self._until = time.monotonic() + limit_s
         self._reports: list[EstopReport] = []
         self._changed = threading.Condition()
-        others = [record for record in registry.select(where(name=ESTOP, group=DOMAIN)) if not record.local]
+        others = [record for record in client.registry.select(where(name=ESTOP, group=DOMAIN)) if not record.local]
         self._left = len(others[:_RELAYS])
         for record in others[:_RELAYS]:
-            handle = Handle(home, record.key, record)
-            words = (handle, (reason, estop_id, limit_s))
+            words = (client.handle_of(record), (reason, estop_id, limit_s))
             threading.Thread(target=self._ask, args=words, name="trade-estop-ask", daemon=True).start()
 
     def _ask(self, handle: Handle, words: Sequence[object]) -> None:

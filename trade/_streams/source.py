@@ -8,13 +8,14 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Final, Protocol
+from typing import Final
 
 from msgspec import Struct, structs
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import ServiceKey
 from trade._protocol.messages import EMPTY_ARGUMENTS, encode_message
 from trade._protocol.samples import STEPS_HZ, stream_key
 from trade._registry.registry import Change
@@ -40,17 +41,6 @@ _MOST_RATES: Final = 64
 
 Listener = tuple[str, str]
 """Session and name."""
-
-
-class StreamHost(Protocol):
-    """The functions of a container that streams use."""
-
-    @property
-    def address(self) -> Address: ...
-    @property
-    def name(self) -> str: ...
-    def handle(self, key: ServiceKey) -> Handle: ...
-    def require_call(self, who: str, handle: Handle) -> None: ...
 
 
 class ListenerInfo(Struct, frozen=True, kw_only=True):
@@ -235,13 +225,13 @@ class Streams:
 
     def __init__(
         self,
-        home: StreamHost,
+        client: CallClient,
         transport: Transport,
         services: Callable[[ServiceKey], LocalService | None],
         scheduler: Scheduler,
         new_id: Callable[[], int],
     ) -> None:
-        self._home = home
+        self._client = client
         self._transport = transport
         self._services = services
         self._scheduler = scheduler
@@ -261,12 +251,14 @@ class Streams:
         """
         key = handle.key
         service = self._services(key)
-        if key.address != self._home.address:
-            raise ConfigurationError(where=handle.label, problem=f"it is not a service of container {self._home.name}")
+        if key.address != self._client.address:
+            raise ConfigurationError(
+                where=handle.label, problem=f"it is not a service of container {self._client.name}"
+            )
         if service is None:
             raise ServiceGone(service=handle.label)
         check_sampled(handle)
-        self._home.require_call(wish.identity, handle)
+        self._client.require_call(wish.identity, handle)
         source, again = self._source(key)
         until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
         in_key = float(f"{wish.hz:g}")  # smaller differences are one rate
@@ -294,8 +286,8 @@ class Streams:
         now_ns = time.monotonic_ns()
         return [
             ListenerInfo(
-                container=self._home.name,
-                service=self._home.handle(key).label,
+                container=self._client.name,
+                service=self._client.handle(key).label,
                 session=session,
                 identity=wish.identity,
                 hz=wish.hz,
@@ -324,7 +316,7 @@ class Streams:
 
     def _denied(self, who: str, key: ServiceKey) -> bool:
         try:
-            self._home.require_call(who, self._home.handle(key))
+            self._client.require_call(who, self._client.handle(key))
         except (AccessDenied, ServiceGone):
             return True
         return False

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Final
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed, result_decoder
 from trade._context.sessions import Session
@@ -21,7 +22,6 @@ from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._protocol.messages import Malformed
 from trade._protocol.samples import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._registry.registry import Change
-from trade._streams.source import StreamHost
 from trade._streams.stream import If, Stream
 from trade._threads.scheduler import Scheduler
 from trade._transport.base import Channel, ChannelClosed, Transport
@@ -42,14 +42,14 @@ class _Subscription:
 
     def __init__(
         self,
-        home: StreamHost,
+        client: CallClient,
         stream: Stream,
         transport: Transport,
         keep: int,
         scheduler: Scheduler,
         malformed: Callable[[Malformed], None],
     ) -> None:
-        self._home = home
+        self._client = client
         self._stream = stream
         self._transport = transport
         self._keep = keep
@@ -80,7 +80,7 @@ class _Subscription:
 
     def _ask(self) -> None:
         stream = self._stream
-        self._home.require_call(self._home.address.identity, stream.source)
+        self._client.require_call(self._client.address.identity, stream.source)
         with self._speaking():
             self._function("listen")(stream.name, stream.source, stream.hz, stream.on_change)
             passing = self._passing_hz()
@@ -109,7 +109,7 @@ class _Subscription:
 
     def _function(self, name: str) -> Handle:
         key = ServiceKey(self._stream.source.key.address, DOMAIN, PROVIDER, name)
-        return self._home.handle(key).with_(deadline_s=_DEADLINE_S)
+        return self._client.handle(key).with_(deadline_s=_DEADLINE_S)
 
     def _speaking(self) -> AbstractContextManager[object]:
         opened_by = self._stream.opened_by
@@ -158,13 +158,13 @@ class Subscriptions:
 
     def __init__(
         self,
-        home: StreamHost,
+        client: CallClient,
         transport: Transport,
         scheduler: Scheduler,
         codec: Codec,
         removed: Callable[[ServiceKey], bool],
     ) -> None:
-        self._home = home
+        self._client = client
         self._transport = transport
         self._scheduler = scheduler
         self._codec = codec
@@ -180,7 +180,7 @@ class Subscriptions:
     ) -> Stream:
         """Open a stream: subscribes before it requests, so that no sample is missed. Raises the source's errors."""
         stream = Stream(
-            f"{self._home.address.epoch}.s{next(self._numbers)}",
+            f"{self._client.address.epoch}.s{next(self._numbers)}",
             source,
             hz,
             result_decoder(self._codec, source.record.info),
@@ -192,9 +192,9 @@ class Subscriptions:
         )
         try:
             newest = max(keep, _RING)
-            ear = _Subscription(self._home, stream, self._transport, newest, self._scheduler, self._note_malformed)
+            ear = _Subscription(self._client, stream, self._transport, newest, self._scheduler, self._note_malformed)
         except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self._home.address) from None
+            raise container_closed(self._client.address) from None
         with self._lock:
             self._subscriptions[stream.name] = (stream, ear)
         try:
@@ -203,7 +203,7 @@ class Subscriptions:
             with self._lock:
                 self._subscriptions.pop(stream.name, None)
             if isinstance(error, ChannelClosed):
-                raise container_closed(self._home.address) from None
+                raise container_closed(self._client.address) from None
             raise
         return stream
 
@@ -241,7 +241,7 @@ class Subscriptions:
     def close(self) -> None:
         """End all. Idempotent."""
         for stream, _ in self._all():
-            stream.end(container_closed(self._home.address))
+            stream.end(container_closed(self._client.address))
 
     def _all(self) -> list[tuple[Stream, _Subscription]]:
         with self._lock:

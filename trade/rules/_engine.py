@@ -161,7 +161,7 @@ class _ActiveRule:
 
     def _holds(self, about: Handle | None) -> tuple[bool, Handle | None]:
         try:
-            return holds(self._engine.container, self.rule.if_, about)
+            return holds(self._engine.container.client, self.rule.if_, about)
         except Exception as error:  # noqa: BLE001 - a condition that fails does not hold, and is reported
             self._fail(f"{type(error).__name__}: {error}")
             return False, about
@@ -182,7 +182,7 @@ class _ActiveRule:
         self._recent.append((began, way[-1].service))
         past = self._engine.causes.begin(way)
         try:
-            steps = done(self._engine.container, self.rule.do, about, dry_run=self._engine.dry_run)
+            steps = done(self._engine.container.client, self.rule.do, about, dry_run=self._engine.dry_run)
         finally:
             past.ended_ns = time.monotonic_ns()
         self._fired += 1
@@ -363,14 +363,14 @@ def _rehearsed(container: Container, name: str, rule: Rule) -> DryRun:
         now = []
     if rule.if_ is not None:
         try:
-            held, about = holds(container, rule.if_, about)
+            held, about = holds(container.client, rule.if_, about)
             now.append("the condition holds" if held else "the condition does not hold")
         except Exception as error:  # noqa: BLE001 - part of the result
             held = False
             now.append(f"the condition cannot be asked: {type(error).__name__}: {error}")
         fires = fires and held
     unknown = about is None and (rule.when.of_services or rule.if_ is not None)
-    steps = () if unknown else done(container, rule.do, about, dry_run=True)
+    steps = () if unknown else done(container.client, rule.do, about, dry_run=True)
     return DryRun(
         rule=name,
         occasion=str(rule.when),

@@ -4,14 +4,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from msgspec import Struct
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
-from trade._calls.picking import Pick
-from trade._protocol.keys import Address
-from trade._registry.constraints import Constraint
 from trade.errors import ConfigurationError
 from trade.rules._file import SERVICE, Condition, Selection, Step, filled
 
@@ -79,18 +77,6 @@ def turns(way: Way) -> int:
 _LONGEST_RESULT: Final = 200
 
 
-class RuleHost(Protocol):
-    """The functions of a container that rules use."""
-
-    @property
-    def address(self) -> Address: ...
-    @property
-    def name(self) -> str: ...
-    def find(self, constraint: Constraint, /, *, wait_s: float = ..., pick: Pick | None = ...) -> Handle: ...
-    def services(self, constraint: Constraint | None = ..., /) -> list[Handle]: ...
-    def require_call(self, who: str, handle: Handle) -> None: ...
-
-
 class StepResult(Struct, frozen=True, kw_only=True):
     """The result of one step. Arguments are not repeated: they are in the file, and may be secret."""
 
@@ -140,38 +126,38 @@ def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: 
     )
 
 
-def done(home: RuleHost, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
+def done(client: CallClient, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
     """Run steps one after the other, up to one that fails; after that, only those with ``always``.
 
     In a dry run each step is checked, and nothing is called.
     """
-    do: Callable[[RuleHost, Step, Handle | None], StepResult] = _rehearse if dry_run else _do
+    do: Callable[[CallClient, Step, Handle | None], StepResult] = _rehearse if dry_run else _do
     all_done: list[StepResult] = []
     failed = False
     for step in steps:
         if failed and not step.always:
             continue
         try:
-            did = do(home, step, about)
+            did = do(client, step, about)
         except Exception as error:  # noqa: BLE001 - every error of a service is recorded
             did, failed = StepResult(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
         all_done.append(did)
     return tuple(all_done)
 
 
-def _do(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
+def _do(client: CallClient, step: Step, about: Handle | None) -> StepResult:
     if step.wait_for is not None:
-        found = home.find(step.wait_for.constraint(about), wait_s=step.s)
+        found = client.find(step.wait_for.constraint(about), wait_s=step.s)
         return StepResult(step=str(step), service=found.label, container=found.container)
-    handle = _called(home, step, about)
+    handle = _called(client, step, about)
     result = _call(handle.with_(deadline_s=step.deadline_s), step.args, about)
     text = repr(result)[:_LONGEST_RESULT]
     return StepResult(step=str(step), service=handle.label, container=handle.container, result=text)
 
 
-def _rehearse(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
+def _rehearse(client: CallClient, step: Step, about: Handle | None) -> StepResult:
     if step.wait_for is not None:
-        found = home.services(step.wait_for.constraint(about))
+        found = client.services(step.wait_for.constraint(about))
         there = found[0] if found else None
         return StepResult(
             step=str(step),
@@ -179,17 +165,17 @@ def _rehearse(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
             container=there.container if there else "",
             result="exists" if there else "would wait for it",
         )
-    handle = _called(home, step, about)
-    home.require_call(home.address.identity, handle)
+    handle = _called(client, step, about)
+    client.require_call(client.address.identity, handle)
     return StepResult(step=str(step), service=handle.label, container=handle.container, result="would be called")
 
 
-def _called(home: RuleHost, step: Step, about: Handle | None) -> Handle:
+def _called(client: CallClient, step: Step, about: Handle | None) -> Handle:
     if step.call == SERVICE:
         assert about is not None  # noqa: S101 - checked with the file
         return about
     assert isinstance(step.call, Selection)  # noqa: S101
-    return home.find(step.call.constraint(about), wait_s=0, pick=step.pick)
+    return client.find(step.call.constraint(about), wait_s=0, pick=step.pick)
 
 
 def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None) -> Any:
@@ -197,14 +183,14 @@ def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None
     return handle(**given) if isinstance(given, dict) else handle(*given)
 
 
-def holds(home: RuleHost, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
+def holds(client: CallClient, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
     """Whether a rule's condition holds, and the service for its steps: the event's, else the condition's.
 
     Raises the errors of finding and calling the service.
     """
     if condition is None:
         return True, about
-    handle = home.find(condition.service.constraint(about), wait_s=0)
+    handle = client.find(condition.service.constraint(about), wait_s=0)
     if handle.effect != "read":
         problem = f"{handle.label} does not only read, so it is no condition"
         raise ConfigurationError(where=str(condition), problem=problem)

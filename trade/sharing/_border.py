@@ -14,11 +14,11 @@ from msgspec import structs
 
 from trade._calls.handle import Handle, handle_codec
 from trade._container.container import Container
-from trade._container.federating import Exposed, MemberSystem, inside, shown
 from trade._context.call_context import CallContext, running
 from trade._context.outgoing import Claim, holding
 from trade._context.sessions import speaking
 from trade._estop.deadman import NO_CLIENT
+from trade._federation.federation import Exposed, MemberSystem, inside, shown
 from trade._locks.api import LEASE_S
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._locks.remote_locks import SharedResource, Wanted
@@ -95,7 +95,7 @@ class BorderDirection:
         self._remote = remote
         self._groups = tuple(groups)
         self._names = home.settings.system, remote.settings.system
-        self._guests = GuestSessions(remote.federating, home, self._names[1])
+        self._guests = GuestSessions(remote.federation, home, self._names[1])
         self._offered: dict[Exposed, _Offered] = {}
         self._origins: dict[Exposed, Exposed] = {}
         """From places in the remote system to places at home."""
@@ -116,8 +116,8 @@ class BorderDirection:
         self._reconcile()
         self._thread.start()
         self._leaving.callback(self._end_thread)
-        self._home.estopping.subscribe(self._estop)
-        self._leaving.callback(self._home.estopping.unsubscribe, self._estop)
+        self._home.federation.estop.subscribe(self._estop)
+        self._leaving.callback(self._home.federation.estop.unsubscribe, self._estop)
 
     def share(self, groups: Sequence[str]) -> None:
         """Replace the list of groups."""
@@ -144,7 +144,7 @@ class BorderDirection:
         """Make the services offered remotely equal to those at home that are in the list."""
         there = {
             place: self._described(info)
-            for place, info in self._home.federating.offers().items()
+            for place, info in self._home.federation.offers().items()
             if self._is_shared(place, info)
         }
         for place, offered in list(self._offered.items()):
@@ -156,7 +156,7 @@ class BorderDirection:
                 if known is None:
                     self._offer(place, info)
                 elif structs.replace(info, revision=known.info.revision) != known.info:
-                    self._remote.federating.update(known.provider, info)
+                    self._remote.federation.update(known.provider, info)
                     known.info = info
             except TradeError as refused:
                 self._complain(place, str(refused))
@@ -177,7 +177,7 @@ class BorderDirection:
             place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place)
         )
         offered = _Offered(info)
-        offered.place = self._remote.federating.pass_on(offered.provider, info, home)
+        offered.place = self._remote.federation.pass_on(offered.provider, info, home)
         self._origins[offered.place] = place
         self._offered[place] = offered
         self._refused.pop(place, None)
@@ -196,7 +196,7 @@ class BorderDirection:
         """Stop the motion of the other system's clients first: afterwards they could not stop it."""
         del self._offered[place]
         with contextlib.suppress(ConfigurationError, ChannelClosed):  # it was done before, or everything is gone
-            self._remote.federating.withdraw(offered.provider)
+            self._remote.federation.withdraw(offered.provider)
         self._guests.leave(place)
         self._origins.pop(offered.place, None)
 
@@ -243,7 +243,7 @@ class BorderDirection:
         calls = () if call.behalf is None else call.behalf.calls
         behalf = Behalf(tuple(names[1:]), calls, ())
         there = structs.replace(call, session=names[0], behalf=behalf, ongoing=None, permit=None)
-        locks = self._remote.borrowed.shown(call)
+        locks = self._remote.federation.remote_locks.shown(call)
         with ExitStack() as after:
             after.callback(running.reset, running.set(there))
             after.callback(holding.reset, holding.set(locks))
@@ -258,7 +258,12 @@ class BorderDirection:
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
             return Lock(
-                self._home.locking.lease_client, request, lambda: Selection(asked), on_lost, on_request, Claim()
+                self._home.federation.lease_client,
+                request,
+                lambda: Selection(asked),
+                on_lost,
+                on_request,
+                Claim(),
             ).acquire()
 
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:
@@ -279,7 +284,7 @@ class BorderDirection:
     def _estop(self, estop: Estop) -> str:
         """Called by home: an e-stop applies on both sides, and is cleared on each. Returns what has not confirmed."""
         try:
-            problem = self._remote.estopping.carry(estop, self._names[0])
+            problem = self._remote.federation.estop.carry(estop, self._names[0])
         except ChannelClosed:
             problem = "the gateway has no link there"
         return f"in system {self._names[1]}: {problem}" if problem else ""

@@ -1,5 +1,6 @@
 """The system that a command connects to."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -33,14 +34,18 @@ def choice_of(context: typer.Context) -> SystemChoice:
     return found
 
 
-def visitor_of(choice: SystemChoice, name: str | None = None) -> Container:
+def visitor_of(
+    choice: SystemChoice, name: str | None = None, *, on_terminate: Callable[[], None] | None = None
+) -> Container:
     """Opens a short-lived container; the containers that it calls keep the audit records."""
-    return Container(replace(choice.settings(name), audit=None, metrics=""))
+    return Container(replace(choice.settings(name), audit=None, metrics=""), on_terminate=on_terminate)
 
 
-def visitor(context: typer.Context, name: str | None = None) -> Container:
+def visitor(
+    context: typer.Context, name: str | None = None, *, on_terminate: Callable[[], None] | None = None
+) -> Container:
     """Opens a short-lived container for this command."""
-    return visitor_of(choice_of(context), name)
+    return visitor_of(choice_of(context), name, on_terminate=on_terminate)
 
 
 def visitor_among_others(context: typer.Context) -> Container:

@@ -150,7 +150,7 @@ class ClientApi:
             ) from None
         args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
         kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}
-        begin = partial(self._container.begin, handle, args, kwargs, body.deadline_s)
+        begin = partial(self._container.client.begin, handle, args, kwargs, body.deadline_s)
         with client.speaking():
             if handle.effect == "stop":
                 client.stopping(admitted, handle, begin)

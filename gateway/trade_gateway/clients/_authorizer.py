@@ -75,7 +75,7 @@ class ClientAuthorizer:
         if handle.key.domain == _OWN:
             rule = "the HTTP gateway forwards no calls to the middleware's own services"
             raise AccessDenied(who=who, verb="call", what=handle.label, rule=rule)
-        self._container.require_call(who, handle)
+        self._container.client.require_call(who, handle)
 
     def needs_approval(self, who: str, handle: Handle, ask_first: Collection[str] = ()) -> bool:
         """Whether a call of an identity needs a person's approval, by the policy or because its group is listed.

@@ -102,7 +102,7 @@ def _sources(labels: list[str]) -> str:
 
 def _locks(asker: Asker, gaps: Gaps) -> Answer:
     wanted = resources(matching(asker.container, gaps))
-    known = asker.container.locking.known()
+    known = asker.container.lock_api.known()
     held = [info for info in known.locks if not gaps or not wanted.isdisjoint(info.resources)]
     shown = [
         f"{info.holder.owner} has {', '.join(info.resources)}"

@@ -33,7 +33,7 @@ def _why(asker: Asker, gaps: Gaps) -> Answer:
     reasons += _stops(asker, [handle for handle in found if handle.effect == "actuate"], wanted)
     bad = {f"{(handle.groups or (handle.label,))[0]} is {handle.health}" for handle in found}
     reasons += sorted(text for text in bad if not text.endswith(f" is {HEALTHY}"))
-    known = asker.container.locking.known()
+    known = asker.container.lock_api.known()
     held = [info for info in known.locks if not wanted.isdisjoint(info.resources)]
     reasons += [f"{', '.join(info.resources)} {info.holder.purpose}" for info in held if not info.token.number]
     reasons += [f"{info.holder.owner} has locked {', '.join(info.resources)}" for info in held if info.token.number]
@@ -103,7 +103,7 @@ def _movers(asker: Asker, gaps: Gaps) -> Answer:
 
 def _held(asker: Asker, wanted: set[str]) -> str:
     """Who has locked these, as an addition to a sentence."""
-    locks = asker.container.locking.known().locks
+    locks = asker.container.lock_api.known().locks
     owners = sorted({info.holder.owner for info in locks if not wanted.isdisjoint(info.resources)})
     return f". Now only {said(owners)} can, under a lock" if owners else ""
 
@@ -117,7 +117,7 @@ def _loss(asker: Asker, gaps: Gaps) -> Answer:
     handles = others(asker.container)
     gone = sorted({handle.label for handle in handles if handle.key.address.epoch in lost})
     left = {handle.label for handle in handles if handle.key.address.epoch not in lost}
-    known = asker.container.locking.known()
+    known = asker.container.lock_api.known()
     there_used = resources(handle for handle in handles if handle.key.address.epoch in lost)
     sessions = {f"{info.identity}/{info.name}" for info in there.containers}
     locks = sorted(

@@ -89,7 +89,7 @@ class Watch:
             self._put(CALLS, ended_s, _call(span, ended_s - span.took_s))
 
     def _look_at_locks(self) -> None:
-        known, used = self._container.locking.known(), self._used()
+        known, used = self._container.lock_api.known(), self._used()
         shown = [info for info in known.locks if self._about(info.resources) or used & set(info.resources)]
         locks = [_lock(info, self._began(info)) for info in shown]
         locks += [lock for lock in self._locks or () if known.still(lock.container)]

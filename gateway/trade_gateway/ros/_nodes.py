@@ -150,7 +150,7 @@ class Guest:
             raise Cancelled(service=handle.label)
 
         def start() -> Run:
-            return self._container.begin(handle, (), args, deadline_s)
+            return self._container.client.begin(handle, (), args, deadline_s)
 
         with client.speaking():
             if handle.effect == "stop":

@@ -1,6 +1,7 @@
 """The gateway's guests: its containers in other systems, which share groups as its file says."""
 
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
@@ -57,11 +58,11 @@ class Guests:
             self._guests.pop(name).close()
 
 
-def opened(settings: Settings) -> Container:
+def opened(settings: Settings, on_terminate: Callable[[], None] | None = None) -> Container:
     """Opens a container; retries while the one before still has its addresses. Raises ConfigurationError."""
     for _ in range(_TRIES - 1):
         try:
-            return Container(settings)
+            return Container(settings, on_terminate=on_terminate)
         except TradeError:
             threading.Event().wait(_AGAIN_S)
-    return Container(settings)
+    return Container(settings, on_terminate=on_terminate)

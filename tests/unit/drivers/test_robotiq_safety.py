@@ -169,7 +169,7 @@ def test_S09_an_ended_call_names_its_estop_and_after_a_plain_stop_it_does_not(
         run.result()
     assert "until it is moved again" not in str(ended.value)
     operator.estop_clear([report.id])
-    operator.locking.resume(HAND_SERVICES)
+    operator.lock_api.resume(HAND_SERVICES)
     run = service(planner, "open").start(SLOW_M_S)
     hand.under_way()
     gripper.stop()

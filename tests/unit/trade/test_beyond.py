@@ -7,7 +7,7 @@ import pytest
 
 from tests.unit.trade.joint_with_policy import Neck
 from trade import Container
-from trade._container.reachability import beyond
+from trade._calls.reachability import beyond
 from trade._discovery.dialer import Dialer
 from trade._transport.addresses import Attempt
 from trade.errors import NoSuchService

@@ -301,7 +301,7 @@ def test_a_renewal_is_one_call_to_each_container_however_many_locks(
     moves = [known(here, there, f"robot.j{number}") for number in range(5)]
     locks = [here.lock([move], lease_s=LONG_S).acquire() for move in moves]
     with heard.exactly(urgent=1, put=1):
-        here.locking.lease_client._renew(locks)
+        here.lock_api.lease_client._renew(locks)
         wait_until(lambda: heard.kinds[Kind.PUT] == 1, "it has been answered")
     for lock in locks:
         lock.release()

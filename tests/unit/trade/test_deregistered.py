@@ -112,6 +112,6 @@ def test_what_is_deregistered_while_it_is_looked_up_is_not_called_afterwards(
     with contextlib.suppress(ServiceGone):
         handle()
     assert calls
-    assert handle.key not in caller._known
+    assert handle.key not in caller.client._known
     with pytest.raises(ServiceGone):
         handle()

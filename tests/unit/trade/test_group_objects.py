@@ -68,7 +68,7 @@ def offer(system: MemorySystem, me: Container) -> Offer:
 
     def offer(provider: object, *groups: str, container: str = "edge") -> None:
         handles = system.container(container).register(provider, *groups)
-        wait_until(lambda: all(me.has(handle.key) for handle in handles))
+        wait_until(lambda: all(me.client.has(handle.key) for handle in handles))
 
     return offer
 

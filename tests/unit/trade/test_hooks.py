@@ -12,8 +12,8 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, Handle, HookEvent, Secret, Settings, current_call, errors, service, where
-from trade._container.hooking import Hook
 from trade._context.call_context import CallContext
+from trade._hooks.api import Hook
 from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from trade.testing import memory_system
@@ -96,7 +96,7 @@ def plan(there: Container, here: Container, planner: Planner) -> Handle:
 @pytest.fixture
 def watch(here: Container, there: Container, observer: Observer) -> Callable[[str], Handle]:
     handles = here.register(observer, "eye")
-    wait_until(lambda: all(there.has(handle.key) for handle in handles))  # it calls them
+    wait_until(lambda: all(there.client.has(handle.key) for handle in handles))  # it calls them
     return lambda name: here.find(where(name=name, group="eye"))
 
 

@@ -40,8 +40,8 @@ def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot,
 
 def test_S14_a_dead_owner_is_noticed_and_what_it_moved_stops(robot: Robot) -> None:
     robot.me.lock(WHOLE, lease_s=60).acquire()
-    with robot.me.locking.lease_client._changed:
-        locks = list(robot.me.locking.lease_client._locks)
+    with robot.me.lock_api.lease_client._changed:
+        locks = list(robot.me.lock_api.lease_client._locks)
     with locks[0].use():
         robot.find("a", "go_on")(0.1)
     robot.system.kill("me")
@@ -86,7 +86,7 @@ def test_S12_a_short_lease_is_renewed_in_time_beside_a_long_one(robot: Robot) ->
 
 
 def test_renewals_continue_after_one_to_a_container_that_left(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    keeper, gone = robot.me.locking.lease_client, []
+    keeper, gone = robot.me.lock_api.lease_client, []
     real = keeper._service
 
     def service_of(address: Address, name: str) -> Handle:
@@ -106,7 +106,7 @@ def test_renewals_continue_after_one_to_a_container_that_left(robot: Robot, monk
 
 def test_a_renewal_that_was_under_way_says_nothing_of_what_was_taken_since(robot: Robot) -> None:
     """It asks for the number of a part that was given back, and taken again under another one."""
-    keeper, lock = robot.me.locking.lease_client, robot.me.lock([robot.find("a")], lease_s=60).acquire()
+    keeper, lock = robot.me.lock_api.lease_client, robot.me.lock([robot.find("a")], lease_s=60).acquire()
     [(address, token)] = lock.granted.items()
     keeper._renewed(address, [(lock, token.number - 1)], 0.0, _Answered([]))
     assert lock.held

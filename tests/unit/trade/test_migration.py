@@ -163,7 +163,7 @@ def test_a_provider_moves_to_the_least_busy_of_several_matching_containers(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, busy: list[tuple[float | None, float, float]]
 ) -> None:
     for number, (host, own, calls) in enumerate(busy, 1):
-        meter = scene.memory.container(f"new-{number}", instantiable=["migrants_there:*"]).meter
+        meter = scene.memory.container(f"new-{number}", instantiable=["migrants_there:*"])._parts.load_meter
         reported = structs.replace(meter.read(), host_cpu_percent=host, cpu_percent=own, calls_per_s=calls)
         monkeypatch.setattr(meter, "read", lambda reported=reported: reported)
     scene.memory.settle()

@@ -58,7 +58,7 @@ def counts(planners: Planners) -> list[int]:
 
 def load(memory: MemorySystem, monkeypatch: pytest.MonkeyPatch, name: str, **values: Any) -> None:
     """What a container reports of its load."""
-    meter = memory.container(name).meter
+    meter = memory.container(name)._parts.load_meter
     reported = structs.replace(meter.read(), in_flight=0, queued=0, host_cpu_percent=0.0, **values)
     monkeypatch.setattr(meter, "read", lambda: reported)
 
@@ -131,7 +131,7 @@ def test_the_least_busy_is_called(
 ) -> None:
     quiet = {"in_flight": 0, "queued": 0, "host_cpu_percent": 0.0, "calls_per_s": 0.0, "cores": 4}
     for name, values in zip(NAMES, busy, strict=True):
-        meter = memory.container(name).meter
+        meter = memory.container(name)._parts.load_meter
         reported = structs.replace(meter.read(), **{**quiet, **values})
         monkeypatch.setattr(meter, "read", lambda reported=reported: reported)
     for _ in range(5):
@@ -146,7 +146,7 @@ def test_a_container_that_does_not_report_its_load_comes_last(
         raise OSError("no /proc")
 
     for name in ("one", "three"):
-        monkeypatch.setattr(memory.container(name).meter, "read", broken)
+        monkeypatch.setattr(memory.container(name)._parts.load_meter, "read", broken)
     for _ in range(5):
         here.call("mind.plan", "tea", pick="least_busy")
     assert counts(planners) == [0, 5, 0]
@@ -218,7 +218,7 @@ def test_all_gone_is_the_error_of_the_last_one(here: Container, memory: MemorySy
         memory.container(name).deregister(planners[name])
     memory.settle()
     with pytest.raises(ServiceGone):
-        here._lookup._picker.call(handles, ("tea",), {})
+        here.client._picker.call(handles, ("tea",), {})
     with pytest.raises(NoSuchService):
         here.find("mind.plan", pick="any", wait_s=0)
 

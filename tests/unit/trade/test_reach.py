@@ -187,7 +187,7 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch, listen: list[str]
 ) -> None:
-    from trade._container import connect
+    from trade._discovery import join
     from trade._transport.endpoints import Endpoint, free_endpoint
 
     taken = next(
@@ -196,7 +196,7 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
         if connection.status == psutil.CONN_LISTEN
     )
     endpoints = map(Endpoint.read, [f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", free_endpoint()])
-    monkeypatch.setattr(connect, "with_free_port", lambda _: next(endpoints))
+    monkeypatch.setattr(join, "with_free_port", lambda _: next(endpoints))
     with Container(Settings.read(container="second", listen=listen)) as second:
         assert {info.name for info in second.containers()} == {"here", "second"}
 

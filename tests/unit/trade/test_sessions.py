@@ -170,7 +170,7 @@ def test_what_moves_is_stopped_before_its_services_are_withdrawn(robot: Robot, h
     joint, home = robot.joints["a"], robot.system.container("a")
     robot.find("a", "go_on")(1.0)
     seen: list[bool] = []
-    joint.stop, stop = lambda: (seen.append(home.has(key)), stop())[1], joint.stop  # type: ignore[method-assign]
+    joint.stop, stop = lambda: (seen.append(home.client.has(key)), stop())[1], joint.stop  # type: ignore[method-assign]
     key = robot.find("a", "go_on").key
     home.alter(joint)
     withdraw: Callable[[], object] = lambda: home.deregister(joint)  # noqa: E731

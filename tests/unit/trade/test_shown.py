@@ -50,7 +50,7 @@ def me(system: MemorySystem) -> Container:
     """A container that knows a head in another one."""
     handles = system.container("edge").register(Head(), "rosie.head")
     me = system.container("me")
-    wait_until(lambda: all(me.has(handle.key) for handle in handles))
+    wait_until(lambda: all(me.client.has(handle.key) for handle in handles))
     return me
 
 

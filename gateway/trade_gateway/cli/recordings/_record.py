@@ -83,8 +83,11 @@ def record(
     from trade_gateway.cli.recordings import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
-    with leaving() as ending, visitor(context, name) as container, room.Recorder(container, wanted, ending) as recorder:
-        container.terminating.close = ending.set
+    with (
+        leaving() as ending,
+        visitor(context, name, on_terminate=ending.set) as container,
+        room.Recorder(container, wanted, ending) as recorder,
+    ):
         if name is not None:
             refuse_twice(container, "trade record")
         if file is not None:

@@ -46,8 +46,7 @@ def container(
         settings = replace(settings, instantiable=tuple(allow))
     if code:
         settings = replace(settings, code=tuple(code))
-    with leaving() as asked_to_leave, Container(settings) as running:
-        running.terminating.close = asked_to_leave.set
+    with leaving() as asked_to_leave, Container(settings, on_terminate=asked_to_leave.set) as running:
         refuse_twice(running, "trade container")
         settle()
         if as_json:

@@ -100,8 +100,7 @@ class Gateway:
         self._named = named
         """The contents of the files that the gateway file names."""
         self._guests = Guests()
-        self._container = Container(plan.settings)
-        self._container.terminating.close = leave
+        self._container = Container(plan.settings, on_terminate=leave)
         self._running: Settings | None = plan.settings
         """The settings of the open container."""
         self._supervisor: Supervisor | None = None
@@ -159,8 +158,7 @@ class Gateway:
         if reopen or plan.settings != self._running:
             self._running = None
             self._leave_networks()
-            self._container = opened(plan.settings)
-            self._container.terminating.close = self._leave
+            self._container = opened(plan.settings, self._leave)
             self._offer()
             self._running = plan.settings
         self._guests.apply(self._container, plan)

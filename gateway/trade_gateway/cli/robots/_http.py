@@ -83,7 +83,7 @@ def http(
     choice: SystemChoice = context.obj
     with (
         leaving() as asked_to_leave,
-        Container(choice.settings(name)) as container,
+        Container(choice.settings(name), on_terminate=asked_to_leave.set) as container,
         opened.HttpGateway(
             container,
             listen=listen,
@@ -97,7 +97,6 @@ def http(
         ) as standing,
     ):
         refuse_twice(container, "trade http")
-        container.terminating.close = asked_to_leave.set
         settle()
         _say_ready(out, container, standing.url)
         while not asked_to_leave.wait(_LOOK_EVERY_S):

@@ -37,8 +37,11 @@ def hub(
         detach_now(out, settings)
         return
     allow_many_links()
-    with leaving() as asked_to_leave, Notifier() as notifier, Container(settings) as running:
-        running.terminating.close = asked_to_leave.set
+    with (
+        leaving() as asked_to_leave,
+        Notifier() as notifier,
+        Container(settings, on_terminate=asked_to_leave.set) as running,
+    ):
         settle()
         if as_json:
             out.data(ready(running))

@@ -49,9 +49,8 @@ def ros(
     with (
         Notifier() as notifier,
         leaving() as asked_to_leave,
-        Container(choice.settings(name)) as container,
+        Container(choice.settings(name), on_terminate=asked_to_leave.set) as container,
     ):
-        container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade ros")
         if container.access.policy is None:
             complain("there is no policy: every ROS node may call what the file maps; see docs/ros.md")

@@ -151,9 +151,9 @@ def up(
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(whole, sim_log)) if sim else None
         ports: dict[str, str] = simulation.ports if simulation else named_ports
-        container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
-        container.making.host()  # drivers of other packages may look for services
-        container.terminating.close = asked_to_leave.set
+        settings = choice_of(context).settings(name or robot.name)
+        container = stack.enter_context(Container(settings, on_terminate=asked_to_leave.set))
+        container.make_default()  # drivers of other packages may look for services
         refuse_twice(container, "trade up")
         if left_out:
             out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")

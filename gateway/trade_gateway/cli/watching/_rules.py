@@ -55,10 +55,9 @@ def run(
     with (
         leaving() as asked_to_leave,
         hangups() as hangup,
-        Container(settings) as container,
+        Container(settings, on_terminate=asked_to_leave.set) as container,
         Rules(container, file, audit=audit, dry_run=dry_run, tell=firings.put) as rules,
     ):
-        container.terminating.close = asked_to_leave.set
         container.register_functions(RuleFile(container, file), "rule_file")
         refuse_twice(container, "trade rules run")
         seen = _contents(file)

@@ -127,7 +127,7 @@ class Watched:
 
     def _of_locks(self, at: float) -> Iterator[Event]:
         uses = {use for handle in self._container.services(self._meant) for use in handle.resources}
-        known = self._container.locking.known()
+        known = self._container.lock_api.known()
         found = {(", ".join(info.resources), info.holder.owner): info for info in known.locks}
         found = {key: info for key, info in found.items() if not uses.isdisjoint(info.resources)}
         found |= {key: info for key, info in self._locks.items() if known.still(info.container)}

@@ -1,17 +1,19 @@
 """Federation, a container's side: it lists its system's providers, and offers those of another system."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from msgspec import structs
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
-from trade._container.proxy import Speaking, passed_on_service
-from trade._locks.remote_locks import SharedResource
+from trade._estop.controller import EstopController
+from trade._federation.proxy import Speaking, passed_on_service
+from trade._locks.lease_client import LeaseClient
+from trade._locks.remote_locks import RemoteLocks, SharedResource
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, Address, ServiceKey
 from trade._protocol.messages import ProviderInfo, ServiceInfo
-from trade._registry.registry import Registry
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade._services.event_loop import AsyncLoop
@@ -46,16 +48,36 @@ class MemberSystem(NamedTuple):
     """Returns the resource of a name here for a name there."""
 
 
-class Federating:
-    """Offers providers of another system, and lists those of this one; ``container.federating``."""
+class Federation:
+    """Offers providers of another system, and lists those of this one; ``container.federation``.
+
+    Args:
+        client: of the container.
+        providers: what the container offers.
+        locks: of its resources.
+        remote_locks: the locks in other systems behind its grants.
+        lease_client: renews its own locks.
+        estop: its e-stops.
+        event_loop: of its coroutine functions.
+    """
 
     def __init__(
-        self, address: Address, registry: Registry, providers: Providers, locks: LockTable, event_loop: AsyncLoop
+        self,
+        client: CallClient,
+        providers: Providers,
+        locks: LockTable,
+        remote_locks: RemoteLocks,
+        lease_client: LeaseClient,
+        estop: EstopController,
+        event_loop: AsyncLoop,
     ) -> None:
-        self._address = address
-        self._registry = registry
+        self._address = client.address
+        self._registry = client.registry
         self._providers = providers
         self._locks = locks
+        self.remote_locks: Final = remote_locks
+        self.lease_client: Final = lease_client
+        self.estop: Final = estop
         self._event_loop = event_loop
 
     # --- showing

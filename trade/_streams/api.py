@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Final, cast
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
-from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
 from trade._notifications.triggers import Action, Target, What, target_of
 from trade._protocol.samples import Value
@@ -25,11 +25,11 @@ _MOST_KEPT = 100_000
 _AGAIN: Final = ". trade.joined(where(...), call=listen, existing=True) can open another stream when it is back"
 
 
-class Streaming:
+class StreamApi:
     """The streams of this container."""
 
-    def __init__(self, lookup: Lookup, subscriptions: Subscriptions, scheduler: Scheduler) -> None:
-        self._lookup = lookup
+    def __init__(self, client: CallClient, subscriptions: Subscriptions, scheduler: Scheduler) -> None:
+        self._client = client
         self._subscriptions = subscriptions
         self._scheduler = scheduler
 
@@ -71,21 +71,21 @@ class Streaming:
             problem = f"if_ must be a function of the value, not {if_!r}"
             raise ConfigurationError(where="trade.stream", problem=problem)
         pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
-        source = which if isinstance(which, Handle) else self._lookup.find(which)
+        source = which if isinstance(which, Handle) else self._client.find(which)
         check_sampled(source)
-        client = speaking.get()
-        opened_by = client if client is not None and client.owner == self._lookup.home.address else None
+        session = speaking.get()
+        opened_by = session if session is not None and session.owner == self._client.address else None
         stream = self._subscriptions.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
         if pushed is not None:
-            _Push(self._lookup, stream, pushed, self._scheduler)
+            _Push(self._client, stream, pushed, self._scheduler)
         return stream
 
 
 class _Push:
     """Calls a target with each value of a stream, one at a time."""
 
-    def __init__(self, lookup: Lookup, stream: Stream, target: Target, scheduler: Scheduler) -> None:
-        self._lookup = lookup
+    def __init__(self, client: CallClient, stream: Stream, target: Target, scheduler: Scheduler) -> None:
+        self._client = client
         self._stream = stream
         self._target = target
         self._problem = ""
@@ -117,7 +117,7 @@ class _Push:
             handle = target.handle
             if handle is None:
                 assert target.constraint is not None  # noqa: S101
-                handle = self._lookup.find(target.constraint, wait_s=0)
+                handle = self._client.find(target.constraint, wait_s=0)
             handle(value, *target.args, **target.kwargs)
 
     def _failed(self, error: BaseException) -> None:

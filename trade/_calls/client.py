@@ -1,29 +1,30 @@
-"""Lookup: finds services by constraints, and calls them."""
+"""The call client of a container: it finds services by constraints, and calls them."""
 
 import asyncio
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final, ParamSpec, Protocol, TypeVar, cast, overload
+from typing import Any, Final, cast
 
 from trade._calls import batch
 from trade._calls.everywhere import Everywhere, answers, everywhere
-from trade._calls.handle import Bound, CallHost, Handle, service_of
+from trade._calls.group_view import GroupView, Members
+from trade._calls.handle import Bound, Handle, service_of
 from trade._calls.picking import Pick, Picker, narrowed, required
-from trade._container.group_view import GroupView, Members
-from trade._container.reachability import Reachability, beyond, look_around
-from trade._context.call_context import patience_s
+from trade._calls.reachability import Reachability, beyond, look_around
+from trade._calls.run import Run
+from trade._calls.target import container_closed
+from trade._calls.target_cache import Target, Targets
+from trade._context.call_context import patience_s, running
+from trade._context.outgoing import new_request
 from trade._discovery.dialer import Dialer
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import Address, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, group_at, service_at, services_at, where
 from trade._registry.registry import Change, Record, Registry
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services
-from trade._security.authorizer import Authorizer
+from trade._security.authorizer import Authorizer, verb_of
 from trade._table import Table
+from trade._threads import fork_guard
 from trade.errors import ConfigurationError
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
-_Provider = TypeVar("_Provider")
 
 _WAIT_S: Final = 2.0
 """How long a call waits for a service that matches."""
@@ -37,97 +38,125 @@ _COLUMNS: Final = {
 }
 
 
-class Find(Protocol):
-    """The types of `Lookup.find`: type checkers cannot see them through a function that delegates to it."""
+class CallClient:
+    """Finds and calls services of the whole system for one container. It is the home of the container's handles.
 
-    @overload
-    def __call__(
-        self,
-        which: Constraint | str,
-        *,
-        group: str | None = None,
-        container: str | None = None,
-        wait_s: float = 2.0,
-        pick: Pick | None = None,
-    ) -> Handle: ...
-    @overload
-    def __call__(
-        self,
-        which: Callable[..., _Provider],  # a class; type[...] would leave out interfaces
-        *,
-        group: str | None = None,
-        container: str | None = None,
-        wait_s: float = 2.0,
-        follow: bool = False,
-    ) -> _Provider: ...
-
-
-class FindRobot(Protocol):
-    """The types of `Lookup.robot`."""
-
-    @overload
-    def __call__(self, group: str, *, wait_s: float = 2.0, follow: bool = False) -> GroupView: ...
-    @overload
-    def __call__(
-        self, group: str, kind: Callable[..., _Provider], *, wait_s: float = 2.0, follow: bool = False
-    ) -> _Provider: ...
-
-
-class Afind(Protocol):
-    """The types of `Container.afind`."""
-
-    @overload
-    async def __call__(
-        self,
-        which: Constraint | str,
-        *,
-        group: str | None = None,
-        container: str | None = None,
-        wait_s: float = 2.0,
-        pick: Pick | None = None,
-    ) -> Handle: ...
-    @overload
-    async def __call__(
-        self,
-        which: Callable[..., _Provider],
-        *,
-        group: str | None = None,
-        container: str | None = None,
-        wait_s: float = 2.0,
-        follow: bool = False,
-    ) -> _Provider: ...
-
-
-class Acall(Protocol):
-    """The types of `Lookup.acall`."""
-
-    @overload
-    async def __call__(
-        self, which: Constraint | str, /, *args: Any, pick: Pick | None = None, **kwargs: Any
-    ) -> Any: ...
-    @overload
-    async def __call__(self, which: Callable[_P, _R], /, *args: _P.args, **kwargs: _P.kwargs) -> _R: ...
-
-
-class Lookup:
-    """Finds and calls the services of the whole system."""
+    Args:
+        address: the container.
+        system: the name of its system.
+        registry: the services that it knows.
+        dialer: its links; None on a transport without links.
+        access: the policy, as it applies there.
+    """
 
     def __init__(
-        self,
-        home: CallHost,
-        registry: Registry,
-        dialer: Dialer | None,
-        access: Authorizer,
-        system: str,
-        check_open: Callable[[], None],
+        self, address: Address, system: str, registry: Registry, dialer: Dialer | None, access: Authorizer
     ) -> None:
-        self.home: Final = home
-        self._registry = registry
-        self._dialer = dialer
-        self._access = access
+        self.address: Final = address
+        self.registry: Final = registry
+        self.dialer: Final = dialer
+        self.access: Final = access
         self._system = system
-        self._check_open = check_open
-        self._picker = Picker(home.address, self.handle)
+        self._picker = Picker(address, self.handle)
+        self._closed = False
+
+    def begin_calls(self, targets: Targets) -> None:
+        """Makes calls possible.
+
+        Args:
+            targets: where calls of its handles go.
+        """
+        self._targets = targets
+        self._known = targets.known
+
+    @property
+    def name(self) -> str:
+        """The name of its container."""
+        return self.address.container
+
+    @property
+    def closed(self) -> bool:
+        """Whether its container was closed."""
+        return self._closed
+
+    def close(self) -> None:
+        """Refuses everything from now on."""
+        self._closed = True
+
+    def check_open(self) -> None:
+        """Raises ConfigurationError if its container was closed, or this process was forked from the container's."""
+        fork_guard.refuse_after_fork()
+        if self._closed:
+            raise container_closed(self.address)
+
+    # --- handles
+
+    def handle(self, key: ServiceKey) -> Handle:
+        """A handle of a service whose key is known."""
+        return Handle(self, key, self.registry.get(key))
+
+    def handle_of(self, record: Record) -> Handle:
+        """A handle of a service whose registry entry is known."""
+        return Handle(self, record.key, record)
+
+    def has(self, key: ServiceKey) -> bool:
+        """Whether the registry has the service now."""
+        return self.registry.get(key) is not None
+
+    def record(self, handle: Handle) -> Record:
+        """The registry entry of a service, or the last known one; raises ServiceGone if it has none."""
+        record = self.registry.get(handle.key) or handle.last_record
+        if record is None:
+            raise self._targets.gone(handle)
+        return record
+
+    def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
+        """The right over its group that callers of a service need, and the roles that have it by the policy here."""
+        key, policy = handle.key, self.access.policy
+        verb = verb_of(key.domain, key.name, handle.record.info.effect)
+        return verb, policy.roles_with(verb, key.domain) if policy is not None and verb else ()
+
+    def require_call(self, who: str, handle: Handle) -> None:
+        """Raises AccessDenied if a client for whom this container acts may not call that service."""
+        key, record = handle.key, handle.record
+        self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+
+    # --- calls of handles
+
+    def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """Calls a service and waits, as ``handle(...)`` does."""
+        outer = running.get()
+        if outer is not None and outer.ongoing is not None:
+            return self._begin(handle, args, kwargs, deadline_s, here=True).result()
+        target = self._known.get(handle.key)
+        if target is not None:
+            return target.call(args, kwargs, deadline_s)
+        request = new_request(deadline_s)
+        return self._look_up(handle).invoke(args, kwargs, request)
+
+    def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
+        """Calls a service without waiting, as ``handle.start(...)`` does."""
+        return self._begin(handle, args, kwargs, deadline_s, here=False)
+
+    def _begin(
+        self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None, *, here: bool
+    ) -> Run:
+        """Calls a service without waiting; a call inside another one ends with that."""
+        request, run, outer = new_request(deadline_s), Run(handle), running.get()
+        target = self._known.get(handle.key) or self._look_up(handle)
+        alone = outer is None or outer.cancelled or target.is_stop  # a cancelled call may still read and stop
+        ongoing = None if outer is None or alone else outer.ongoing
+        forget = _nothing if ongoing is None else run.end_with(ongoing)
+        try:
+            target.begin(args, kwargs, request, run, here=here)
+        except BaseException:
+            forget()
+            raise
+        return run
+
+    def _look_up(self, handle: Handle) -> Target:
+        self.check_open()
+        return self._targets.look_up(handle)
 
     # --- looking up
 
@@ -137,10 +166,9 @@ class Lookup:
         Args:
             which: a constraint, or a group as text; by default all services.
         """
-        self._check_open()
+        self.check_open()
         wanted = where() if which is None else as_constraint(which, "trade.services", services_at)
-        found = (Handle(self.home, record.key, record) for record in self._registry.select(wanted))
-        return Table(found, _COLUMNS)
+        return Table(map(self.handle_of, self.registry.select(wanted)), _COLUMNS)
 
     def find(
         self,
@@ -171,7 +199,7 @@ class Lookup:
             NoSuchService: none within ``wait_s`` seconds.
             TooManyServices: more than one.
         """
-        self._check_open()
+        self.check_open()
         if pick is not None:
             return self._picked(which, where(group=group, container=container), pick, "trade.find", wait_s)[0]
         if isinstance(which, type):
@@ -186,7 +214,7 @@ class Lookup:
             matches = exact if len(exact) == 1 else matches
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
-        return Handle(self.home, matches[0].key, matches[0])
+        return self.handle_of(matches[0])
 
     def robot(self, group: str, kind: type | None = None, *, wait_s: float = 2.0, follow: bool = False) -> GroupView:
         """A robot, or any other group, as an object: ``rosie.head.move_to([0.3, -0.2])``, ``rosie.neck.pan.limits()``.
@@ -206,7 +234,7 @@ class Lookup:
             NoSuchService: no service of that group within ``wait_s`` seconds.
             ConfigurationError: it is no group, or ``kind`` is no class.
         """
-        self._check_open()
+        self.check_open()
         if not isinstance(kind, type | None):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise ConfigurationError(where="trade.robot", problem=f"kind must be a class, not {kind!r}")
         beneath = as_constraint(group, "trade.robot", group_at)
@@ -229,7 +257,7 @@ class Lookup:
         matches: list[Record] = []
 
         def found() -> bool:
-            matches[:] = self._registry.select(constraint)
+            matches[:] = self.registry.select(constraint)
             return bool(matches)
 
         self.await_services(constraint, found, wait_s)
@@ -237,9 +265,9 @@ class Lookup:
 
     def _members(self, wait_s: float, *, follow: bool) -> Members:
         members = Members(
-            self._registry.select,
+            self.registry.select,
             self.await_services,
-            lambda record: Handle(self.home, record.key, record),
+            self.handle_of,
             wait_s=wait_s,
             follow=follow,
         )
@@ -251,7 +279,7 @@ class Lookup:
                 if known is not None and change.left:
                     known.forget(record.key for record in change.left)
 
-            weakref.finalize(members, self._registry.changes.subscribe(changed)).atexit = False
+            weakref.finalize(members, self.registry.changes.subscribe(changed)).atexit = False
         return members
 
     def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
@@ -266,22 +294,22 @@ class Lookup:
             NoSuchService: the condition does not hold within ``wait_s`` seconds.
         """
         wait_s = patience_s(wait_s)
-        if self._registry.wait_for(ready, wait_s):
+        if self.registry.wait_for(ready, wait_s):
             return
-        apart = self._unanswered(wait_s) if len(self._registry.containers()) == 1 else ()
-        hidden = self._access.hidden(self.home.address.identity, asked_for(constraint, "group"))
+        apart = self._unanswered(wait_s) if len(self.registry.containers()) == 1 else ()
+        hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
         others = self.beyond() if wait_s > 0 else ()
-        raise no_such_service(constraint, self._registry.select(where()), wait_s, apart, hidden, others)
+        raise no_such_service(constraint, self.registry.select(where()), wait_s, apart, hidden, others)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Endpoints without a container; the reasons, at half a second each, only if the caller does not wait."""
-        if wait_s > 0 or self._dialer is None:
+        if wait_s > 0 or self.dialer is None:
             return self.reachability(limit_s=0).unanswered
-        return tuple(f"{endpoint} ({self._dialer.source})" for endpoint in self._dialer.configured)
+        return tuple(f"{endpoint} ({self.dialer.source})" for endpoint in self.dialer.configured)
 
     def beyond(self, *, wait_s: float = 0.0) -> list[str]:
         """What others see and this container does not, as sentences; waits that long for links, in seconds."""
-        return beyond(self._registry, self._dialer, self.handle, wait_s)
+        return beyond(self.registry, self.dialer, self.handle, wait_s)
 
     def reachability(self, *, limit_s: float = 3.0) -> Reachability:
         """The containers that it has found: without them, an empty answer of the system means nothing.
@@ -292,12 +320,8 @@ class Lookup:
             limit_s: how long to wait for that, in seconds; also if no container is found. Finding the reason for each
                 missing link takes up to 3 s more.
         """
-        self._check_open()
-        return look_around(self._registry, self._dialer, self.home.address, self._system, limit_s)
-
-    def handle(self, key: ServiceKey) -> Handle:
-        """A handle of a service whose key is known."""
-        return Handle(self.home, key, self._registry.get(key))
+        self.check_open()
+        return look_around(self.registry, self.dialer, self.address, self._system, limit_s)
 
     # --- calling
 
@@ -316,14 +340,14 @@ class Lookup:
         """
         if pick is None:
             return self.find(which)(*args, **kwargs)
-        self._check_open()
+        self.check_open()
         return self._picker.call(self._picked(which, where(), pick, "trade.call", _WAIT_S), args, kwargs)
 
     def _picked(self, which: object, more: Constraint, pick: object, named: str, wait_s: float) -> list[Handle]:
         """The services that match, the best one first."""
         wanted = narrowed(as_constraint(which, named, service_at) & more, chosen := required(pick, named))
         matches = self._picker.order(self._await_matches(wanted, wait_s), chosen)
-        return [Handle(self.home, record.key, record) for record in matches]
+        return list(map(self.handle_of, matches))
 
     def call_all(
         self, which: Constraint | str | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
@@ -393,11 +417,15 @@ class Lookup:
 
     def everywhere(self, name: str, *, container: str = "*") -> Everywhere:
         """One of the middleware's own services in all present containers."""
-        self._check_open()
-        return everywhere(self.home, self._registry, name, container)
+        self.check_open()
+        return everywhere(self, self.registry, name, container)
 
     def _bound(
         self, which: Constraint | str | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> list[Bound]:
-        self._check_open()
+        self.check_open()
         return batch.bound(self.services(which) if isinstance(which, Constraint | str) else which, args, kwargs)
+
+
+def _nothing() -> None:
+    pass

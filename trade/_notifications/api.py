@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Final
 
-from trade._container.lookup import Lookup
+from trade._calls.client import CallClient
 from trade._context.sessions import speaking
 from trade._notifications.events import EventKind
 from trade._notifications.notification import Notification, NotificationInfo, Owner
@@ -14,19 +14,17 @@ from trade._notifications.services import Hosted, placed
 from trade._notifications.triggers import OF_CHANGES, TriggerSpec, What, action_of, epoch_s, target_of
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, as_constraint, services_at, where
-from trade._registry.registry import Registry
 from trade.errors import NoSuchNotification
 
 POLL_S: Final = 1.0
 
 
-class Notifying:
+class NotificationApi:
     """The notifications of this container, here and in others."""
 
-    def __init__(self, lookup: Lookup, notifier: Notifier, registry: Registry) -> None:
-        self._lookup = lookup
+    def __init__(self, client: CallClient, notifier: Notifier) -> None:
+        self._client = client
         self._notifier = notifier
-        self._registry = registry
 
     # --- of services
 
@@ -182,7 +180,7 @@ class Notifying:
 
     def notifications(self) -> list[NotificationInfo]:
         """All notifications in the system."""
-        found = [info for infos in self._lookup.ask_all("notifications") for info in infos]
+        found = [info for infos in self._client.ask_all("notifications") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def cancel_notification(self, notification: str) -> None:
@@ -192,7 +190,7 @@ class Notifying:
             NoSuchNotification: none has that id, or it has ended.
             AccessDenied: it is another client's, and the policy does not let this container administer the system.
         """
-        if not any(self._lookup.ask_all("cancel_notification", notification)):
+        if not any(self._client.ask_all("cancel_notification", notification)):
             raise NoSuchNotification(id=notification)
 
     def _notify(self, terms: TriggerSpec, call: What, if_: What | None, when: What | None, host: str) -> Notification:
@@ -200,13 +198,13 @@ class Notifying:
         named = f"trade.{terms.occasion}"
         target = target_of(call, named, "call", 1 if terms.occasion in OF_CHANGES else 0)
         conditions = [None if what is None else target_of(what, named, "a condition", 0) for what in (if_, when)]
-        own = self._lookup.home.address
+        own = self._client.address
         if not host or host == own.container:
             client = speaking.get()
             mine = client if client is not None and client.owner == own else None
             owner = Owner(str(own) if mine is None else mine.name, acts_as=mine)
-            return placed(self._notifier, self._registry, terms, target, conditions[0], conditions[1], owner)
-        notify = self._lookup.find(where(name="notify", group=DOMAIN, container=host))
+            return placed(self._notifier, self._client.registry, terms, target, conditions[0], conditions[1], owner)
+        notify = self._client.find(where(name="notify", group=DOMAIN, container=host))
         actions = [None if one is None else action_of(one, host, named) for one in conditions]
         name = notify(terms, action_of(target, host, named), *actions)
-        return Hosted(name, terms, notify.key.address, self._lookup.handle)
+        return Hosted(name, terms, notify.key.address, self._client.handle)

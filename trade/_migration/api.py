@@ -3,22 +3,20 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
-from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, services_at
-from trade._registry.registry import Registry
 from trade.errors import NoSuchService, TooManyServices
 
 _LONGEST_S: Final = 45.0
 
 
-class Migrating:
+class MigrationApi:
     """Requests migrations and states from the containers of the providers."""
 
-    def __init__(self, lookup: Lookup, registry: Registry) -> None:
-        self._lookup = lookup
-        self._registry = registry
+    def __init__(self, client: CallClient) -> None:
+        self._client = client
 
     def migrate(
         self, which: Handle | Constraint | str, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
@@ -51,7 +49,7 @@ class Migrating:
                 it is offered as before.
         """
         moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
-        self._registry.wait_until_known(one.key for one in moved)
+        self._client.registry.wait_until_known(one.key for one in moved)
         return moved
 
     def save_state(self, which: Handle | Constraint | str) -> Any:
@@ -75,10 +73,10 @@ class Migrating:
     def _of(self, which: Handle | Constraint | str, name: str, *args: Any) -> Any:
         service = which if isinstance(which, Handle) else self._one(as_constraint(which, f"trade.{name}", services_at))
         key = ServiceKey(service.key.address, DOMAIN, PROVIDER, name)
-        return self._lookup.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
+        return self._client.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
 
     def _one(self, which: Constraint) -> Handle:
-        found = {(one.key.address, one.key.domain, one.key.provider): one for one in self._lookup.services(which)}
+        found = {(one.key.address, one.key.domain, one.key.provider): one for one in self._client.services(which)}
         if not found:
             raise NoSuchService(constraint=str(which))
         if len(found) > 1:

@@ -5,16 +5,15 @@ import itertools
 import logging
 from typing import Any, Final
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
-from trade._container.lookup import Lookup
-from trade._container.notifying import Notifying
 from trade._hooks.callee import Callee, callee_of
 from trade._hooks.hook import HookInfo, Side, require_limit
+from trade._notifications.api import NotificationApi
 from trade._notifications.notification import Notification
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, services_at, where
-from trade._security.authorizer import Authorizer
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 
 _logger = logging.getLogger("trade")
@@ -27,7 +26,7 @@ class Hook:
 
     def __init__(
         self,
-        home: "Hooking",
+        api: "HookApi",
         name: str,
         side: Side,
         target: Handle | Constraint,
@@ -42,7 +41,7 @@ class Hook:
         self.call: Final = call.handle or call.constraint
         self._callee: Final = call
         self._limit_s: Final = limit_s
-        self._home = home
+        self._api = api
         self._later: Notification | None = None
         self._attached = True
 
@@ -50,10 +49,10 @@ class Hook:
         """Attaches it in all present and future containers. Raises the first error of the present ones."""
         if isinstance(self.target, Handle):
             self._attach(
-                self._home.lookup.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
+                self._api.client.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
             ).result()
             return
-        present = self._home.lookup.everywhere("attach_hook")
+        present = self._api.client.everywhere("attach_hook")
         for address in present.silent:
             _logger.warning("hook %s is not attached in %s yet: it has not listed its services", self.id, address.who)
         runs = [self._attach(handle) for handle in present.handles]
@@ -63,7 +62,7 @@ class Hook:
             self.detach()
             raise refusal
         # Present containers are reported, too: a second attachment of the same hook has no effect.
-        self._later = self._home.notifying.joined(_EVERYWHERE, self._join, existing=True)
+        self._later = self._api.notifications.joined(_EVERYWHERE, self._join, existing=True)
 
     def _attach(self, handle: Handle) -> Run:
         terms: dict[str, Any] = {"handle" if isinstance(self.target, Handle) else "constraint": self.target}
@@ -79,7 +78,7 @@ class Hook:
         try:
             self._attach(handle).result()
             if not self._attached:  # detached meanwhile, perhaps before this arrived
-                self._home.lookup.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
+                self._api.client.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
         except (ContainerLost, ServiceGone):  # it has left already
             _logger.debug("hook %s is not attached in %s, which has ended", self._callee.text, handle.container)
         except TradeError as error:
@@ -87,7 +86,7 @@ class Hook:
 
     def infos(self) -> list[HookInfo]:
         """Its state in each container."""
-        return [info for info in self._home.hooks() if info.id == self.id]
+        return [info for info in self._api.hooks() if info.id == self.id]
 
     def detach(self) -> None:
         """Detaches it; a call of it under way finishes. Idempotent."""
@@ -96,19 +95,18 @@ class Hook:
             if self._later is not None:
                 self._later.cancel()
             with contextlib.suppress(NoSuchHook):  # its containers are gone
-                self._home.detach_hook(self.id)
+                self._api.detach_hook(self.id)
 
     def __repr__(self) -> str:
         return f"<Hook {self._callee.text} {self.side} {self.target}{'' if self._attached else ', detached'}>"
 
 
-class Hooking:
+class HookApi:
     """The hooks of this container on services of any container."""
 
-    def __init__(self, lookup: Lookup, notifying: Notifying, access: Authorizer) -> None:
-        self.lookup: Final = lookup
-        self.notifying: Final = notifying
-        self._access = access
+    def __init__(self, client: CallClient, notifications: NotificationApi) -> None:
+        self.client: Final = client
+        self.notifications: Final = notifications
         self._numbers = itertools.count(1)
 
     def before_service(
@@ -160,23 +158,23 @@ class Hooking:
         callee = callee_of(call, named)
         require_limit(limit_s, named)
         self._require_instrument(target)
-        hook = Hook(self, f"{self.lookup.home.address.epoch}.h{next(self._numbers)}", side, target, callee, limit_s)
+        hook = Hook(self, f"{self.client.address.epoch}.h{next(self._numbers)}", side, target, callee, limit_s)
         hook.begin()
         return hook
 
     def _require_instrument(self, target: Handle | Constraint) -> None:
         """Raises AccessDenied if, by the policy here, all of these would refuse it."""
-        known = [target] if isinstance(target, Handle) else self.lookup.services(target)
+        known = [target] if isinstance(target, Handle) else self.client.services(target)
         mine = [one for one in known if one.key.domain != DOMAIN]
-        who = self.lookup.home.address.identity
-        denials = [self._access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
+        who = self.client.address.identity
+        denials = [self.client.access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
         denied = next((one for one in denials if one is not None), None)
         if denied is not None and all(denials):
             raise denied
 
     def hooks(self) -> list[HookInfo]:
         """All hooks in the system, one entry for each container where a hook is attached."""
-        found = [info for infos in self.lookup.ask_all("hooks") for info in infos]
+        found = [info for infos in self.client.ask_all("hooks") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def detach_hook(self, hook: str) -> None:
@@ -186,5 +184,5 @@ class Hooking:
             NoSuchHook: no hook has that id.
             AccessDenied: it is another client's, and the policy does not let this container administer the system.
         """
-        if not any(self.lookup.ask_all("detach_hook", hook)):
+        if not any(self.client.ask_all("detach_hook", hook)):
             raise NoSuchHook(id=hook)

@@ -7,9 +7,9 @@ from typing import Final, Protocol
 from msgspec import Struct
 
 from trade._calls.batch import Outcome
+from trade._calls.client import CallClient
 from trade._calls.everywhere import Everywhere, answers
 from trade._calls.handle import Bound, Handle
-from trade._container.lookup import Lookup
 from trade._protocol.keys import Address, ServiceKey
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
@@ -88,11 +88,11 @@ class LogReader:
         return sorted(new.values(), key=lambda line: (line.at, line.process, line.number))
 
 
-class Tracing:
+class TraceApi:
     """The spans and log lines of all containers."""
 
-    def __init__(self, lookup: Lookup) -> None:
-        self._lookup = lookup
+    def __init__(self, client: CallClient) -> None:
+        self._client = client
 
     def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:
         """Switches the tracing of all calls that containers make and serve on or off; earlier spans stay.
@@ -110,7 +110,7 @@ class Tracing:
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
         """
-        outcomes = self._lookup.asked("set_tracing", on, container=container)
+        outcomes = self._client.asked("set_tracing", on, container=container)
         return sorted(outcome.handle.container for outcome in outcomes)
 
     def spans(self, *, container: str = "*") -> list[Span]:
@@ -147,10 +147,10 @@ class Tracing:
         Raises:
             AccessDenied: the policy does not let this container ``read`` group ``trade``.
         """
-        return LogReader(self._lookup, container).read()
+        return LogReader(self._client, container).read()
 
     def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
-        outcomes = self._lookup.asked("spans", calls, container=container)
+        outcomes = self._client.asked("spans", calls, container=container)
         return sorted(itertools.chain.from_iterable(one.result for one in outcomes), key=_when)
 
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 from msgspec import structs
 
+from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed
-from trade._container.lookup import Lookup
 from trade._estop.deadman import Deadman
 from trade._protocol.keys import DOMAIN
 from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
@@ -21,11 +21,11 @@ from trade._transport.base import ChannelClosed
 _logger = logging.getLogger("trade")
 
 
-class Registering:
+class Registration:
     """Offers objects to the whole system."""
 
-    def __init__(self, lookup: Lookup, providers: Providers, withdrawn: Withdrawn, deadman: Deadman) -> None:
-        self._lookup = lookup
+    def __init__(self, client: CallClient, providers: Providers, withdrawn: Withdrawn, deadman: Deadman) -> None:
+        self._client = client
         self._providers = providers
         self._withdrawn = withdrawn
         self._deadman = deadman
@@ -58,9 +58,9 @@ class Registering:
         try:
             keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self._lookup.home.address) from None
+            raise container_closed(self._client.address) from None
         self._withdrawn.forget(provider)
-        return tuple(self._lookup.handle(key) for key in keys)
+        return tuple(self._client.handle(key) for key in keys)
 
     def register_functions(self, functions: object, name: str) -> tuple[Handle, ...]:
         """Offers further services of the middleware in group ``trade``; the access table lists the rights they need.
@@ -69,7 +69,7 @@ class Registering:
             functions: an object with services.
             name: the provider's name, of one object only.
         """
-        return tuple(self._lookup.handle(key) for key in self._providers.add(functions, (DOMAIN,), name=name))
+        return tuple(self._client.handle(key) for key in self._providers.add(functions, (DOMAIN,), name=name))
 
     def deregister(self, provider: object) -> None:
         """Withdraws an object's services from the whole system; handles of them fail from now on.
@@ -133,4 +133,4 @@ class Registering:
         try:
             self._providers.alter(provider_of(provider), change, reread=reread)
         except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self._lookup.home.address) from None
+            raise container_closed(self._client.address) from None

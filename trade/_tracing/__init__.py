@@ -1,0 +1,1 @@
+"""Traces of the whole system: spans and log lines of all containers, and the services that give them."""
