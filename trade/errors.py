@@ -26,15 +26,17 @@
         |   `-- WrongDevice, DeviceAbsent
         `-- CannotConnect, NoContainerFound, CannotStart, LinkStays
 
-Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
-builtin that a Python programmer would catch for it, so ``except TimeoutError`` catches a deadline that passed.
+Every error carries its data as attributes, crosses the wire with them, and says what to do next. `TradeError.message`
+says it for programs, or for people at a terminal. Each also inherits the builtin that a Python programmer would catch
+for it, so ``except TimeoutError`` catches a deadline that passed.
 
 All errors are in one module, so that a reader sees the whole tree.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal, NamedTuple, TypeVar
 
 from trade._timestamps import clock
 
@@ -109,14 +111,51 @@ class TradeError(Exception):
     """The root of all errors that this project raises on purpose."""
 
     def __str__(self) -> str:
-        return self.describe()
+        return self.message()
+
+    def message(self, *, at_terminal: bool = False) -> str:
+        """What happened, why, and what to do.
+
+        Args:
+            at_terminal: whether to name commands, instead of functions of Python.
+        """
+        advice = self.advice()
+        if advice is None:
+            return self.describe()
+        return f"{self.describe()}{advice.joint}{advice.command if at_terminal else advice.call}"
 
     def describe(self) -> str:
-        """The message: what happened, why, and what to do."""
+        """What happened, and why; also what to do, if that is the same in a program and at a terminal."""
         return type(self).__name__
+
+    def advice(self) -> "Advice | None":
+        """What to do, if that differs between the two."""
+        return None
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), {f.name: getattr(self, f.name) for f in fields(self)})
+
+
+class Advice(NamedTuple):
+    """What to do about an error."""
+
+    call: str
+    """In a program of Python."""
+    command: str
+    """At a terminal."""
+    joint: str = ". "
+    """What separates it from the rest of the message."""
+
+
+_MORE_TIME: Final = Advice(
+    "Give it more time with handle.with_(deadline_s=...)", "Give it more time with --deadline SECONDS"
+)
+_METHOD: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
+
+
+def as_commands(device: str, remedy: str) -> str:
+    """Turns a driver's remedy into commands: ``call enable()`` becomes ``trade call rosie.neck.pan.enable``."""
+    return _METHOD.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
 def never_ran(error: TradeError, key: object) -> bool:
@@ -209,8 +248,10 @@ class TooManyServices(CallerError, LookupError):
             remedy = f"Add a constraint on what distinguishes them ({', '.join(self.differ)})"
         else:
             remedy = "No constraint distinguishes them. Register them in different groups or with different meta"
-        found = f"{len(self.matches)} services match {self.constraint}: {_some(self.matches)}"
-        return f"{found}. {remedy}, or take them all with trade.services(...)"
+        return f"{len(self.matches)} services match {self.constraint}: {_some(self.matches)}. {remedy}"
+
+    def advice(self) -> Advice:
+        return Advice("take them all with trade.services(...)", "see all of them with `trade services`", ", or ")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -223,7 +264,10 @@ class ServiceGone(CallerError, LookupError):
     """Where its provider is now, if it moved: ``identity/container/epoch/domain/provider``. Handles do not follow."""
 
     def describe(self) -> str:
-        return f"{self.service} is gone: {self.reason}. Look it up again with trade.find(...)"
+        return f"{self.service} is gone: {self.reason}"
+
+    def advice(self) -> Advice:
+        return Advice("Look it up again with trade.find(...)", "`trade services` lists all services")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -234,11 +278,16 @@ class InvalidArgument(CallerError, ValueError, TypeError):
     argument: str
     problem: str
     signature: str = ""
+    late: bool = False
+    """Whether its call has too little time for it."""
 
     def describe(self) -> str:
         where = f" argument {self.argument!r}" if self.argument else ""
         tail = f". Call it as {self.signature}" if self.signature else ""
         return f"{self.service}{where}: {self.problem}{tail}"
+
+    def advice(self) -> Advice | None:
+        return _MORE_TIME if self.late else None
 
 
 @dataclass(kw_only=True, eq=False)
@@ -309,8 +358,11 @@ class OutcomeUnknown(CallerError, TimeoutError):
     def describe(self) -> str:
         return (
             f"no answer from {self.service} within {self.deadline_s:.3g} s. Whether it ran is unknown. Check its "
-            "state before you try again; handle.with_(deadline_s=...) waits longer"
+            "state before you try again"
         )
+
+    def advice(self) -> Advice:
+        return Advice("handle.with_(deadline_s=...) waits longer", "--deadline SECONDS waits longer", "; ")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -319,9 +371,14 @@ class MotionStopped(CallerError, RuntimeError):
 
     device: str
     reason: str
+    late: bool = False
+    """Whether its call reached its deadline."""
 
     def describe(self) -> str:
         return f"{self.device} stopped before its goal: {self.reason}. It holds its position"
+
+    def advice(self) -> Advice | None:
+        return _MORE_TIME if self.late else None
 
 
 @dataclass(kw_only=True, eq=False)
@@ -339,11 +396,15 @@ class Stopped(CallerError, RuntimeError):
     """The other resources of the call that have to be resumed, too."""
 
     def describe(self) -> str:
-        all_of_them = " ".join((self.resource, *self.others))
-        remedy = "`trade estop --clear`" if self.estop else f"trade.resume(...) or `trade resume {all_of_them}`"
-        cleared = " That e-stop is cleared, but what it stopped was not resumed yet." if self.cleared else ""
-        said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
-        return f"{said} When it is safe to move, call {remedy}"
+        cleared = ". That e-stop is cleared, but what it stopped was not resumed yet" if self.cleared else ""
+        return f"{self.resource} was stopped by {self.by}: {self.reason}{cleared}"
+
+    def advice(self) -> Advice:
+        once = "When it is safe to move, call"
+        if self.estop:
+            return Advice(f"{once} `trade estop --clear`", f"{once} `trade estop --clear`")
+        command = f"`trade resume {' '.join((self.resource, *self.others))}`"
+        return Advice(f"{once} trade.resume(...) or {command}", f"{once} {command}")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -483,11 +544,16 @@ class LockedByOther(CallerError, PermissionError):
         what = ", ".join(self.resources)
         aim = f" for {self.purpose!r}" if self.purpose else ""
         when = f" since {clock(self.since)}" if self.since else ""
+        own = ". That is this container itself. Make the call inside `with lock.use():`" if self.own else ""
+        return f"{what} is locked by {self.owner}{aim}{when}{own}"
+
+    def advice(self) -> Advice | None:
         if self.own:
-            hint = "That is this container itself. Make the call inside `with lock.use():`"
-        else:
-            hint = "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
-        return f"{what} is locked by {self.owner}{aim}{when}. {hint}"
+            return None
+        return Advice(
+            "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)",
+            "Wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`",
+        )
 
 
 @dataclass(kw_only=True, eq=False)
@@ -509,7 +575,10 @@ class LockLost(CallerError, ConnectionError):
     reason: str
 
     def describe(self) -> str:
-        return f"the lock of {', '.join(self.resources)} is lost: {self.reason}. Take it again with trade.lock(...)"
+        return f"the lock of {', '.join(self.resources)} is lost: {self.reason}"
+
+    def advice(self) -> Advice:
+        return Advice("Take it again with trade.lock(...)", "Take it again with `trade lock`")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -531,10 +600,10 @@ class IncompleteGroup(CallerError, LookupError):
     missing: Sequence[str]
 
     def describe(self) -> str:
-        return (
-            f"{self.group} is not complete: {', '.join(self.missing)} missing. Start the missing drivers, or lock the "
-            "rest with partial=True"
-        )
+        return f"{self.group} is not complete: {', '.join(self.missing)} missing. Start the missing drivers"
+
+    def advice(self) -> Advice:
+        return Advice("lock the rest with partial=True", "lock the rest with --partial", ", or ")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -714,6 +783,10 @@ class DeviceFault(DeviceError, RuntimeError):
 
     def describe(self) -> str:
         return f"{self.device} on {self.bus}: {self.fault}; {self.remedy}"
+
+    def message(self, *, at_terminal: bool = False) -> str:
+        text = self.describe()
+        return as_commands(self.device, text) if at_terminal else text
 
 
 @dataclass(kw_only=True, eq=False)

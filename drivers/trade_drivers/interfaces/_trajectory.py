@@ -226,5 +226,5 @@ def _in_time(duration_s: float, service: str) -> None:
     call = current_call()
     left_s = None if call is None else call.remaining_s
     if left_s is not None and duration_s >= left_s:
-        problem = f"lasts {duration_s:.3g} s, but its call has {left_s:.3g} s left; with_(deadline_s=...) gives it more"
-        raise InvalidArgument(service=service, argument="trajectory", problem=problem)
+        problem = f"lasts {duration_s:.3g} s, but its call has {left_s:.3g} s left"
+        raise InvalidArgument(service=service, argument="trajectory", problem=problem, late=True)

@@ -75,9 +75,7 @@ class Motion(Command[AxisT, "Exchange[AxisT]"]):
             if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
                 return axis.deaf(now_ns)
         if until_ns is not None and now_ns >= until_ns:
-            return MotionStopped(
-                device=self.devices[0].name, reason="its call reached its deadline; give it a longer one"
-            )
+            return MotionStopped(device=self.devices[0].name, reason="its call reached its deadline", late=True)
         return None
 
     def done_stepping(self) -> None:

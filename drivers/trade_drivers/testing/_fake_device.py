@@ -114,7 +114,7 @@ class FakeActuator(FakeDevice, Lockable, Generic[_Goal]):
                 if call is not None:
                     call.raise_if_cancelled()
                     if call.remaining_s == 0:
-                        raise MotionStopped(device=self._name, reason="its call reached its deadline")
+                        raise MotionStopped(device=self._name, reason="its call reached its deadline", late=True)
         finally:
             self._show(moving=False)
 

@@ -16,7 +16,7 @@ from trade._default_system import is_of_user
 from trade._protocol.remote_errors import RemoteTraceback
 from trade._settings import Settings
 from trade._stop_line import elsewhere
-from trade.errors import DeviceFault, RemoteError, TradeError
+from trade.errors import RemoteError, TradeError
 
 NOT_FOUND: Final = 3
 """The exit code if what a command was asked for does not exist."""
@@ -108,22 +108,8 @@ def complain(text: str) -> None:
     sys.stderr.flush()
 
 
-REMEDIES: Final = {
-    "Wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)": (
-        "Wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`"
-    ),
-    "with trade.lock(...)": "with `trade lock`",
-    "Look it up again with trade.find(...)": "`trade services` lists all services",
-    "take them all with trade.services(...)": "see all of them with `trade services`",
-    "handle.with_(deadline_s=...) waits longer": "--deadline SECONDS waits longer",
-    "give it a longer one": "--deadline SECONDS gives it more",
-    "with_(deadline_s=...) gives it more": "--deadline SECONDS gives it more",
-    "trade.resume(...) or `trade resume": "`trade resume",
-}
-"""The remedies in errors that name the Python API, and the commands to use at a terminal instead."""
 _FRAMES: Final = re.compile(r'^  File "(.+)", line (\d+), in (.+)\n((?:    .*\n)?)', re.MULTILINE)
 """The entries of a Python traceback: file, line, function and code."""
-_CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
 
 
 def say_unreached(endpoints: Iterable[str]) -> None:
@@ -142,11 +128,6 @@ def say_elsewhere(settings: Settings, *, earlier: bool = False) -> None:
     for system, containers in elsewhere(settings).items():
         if not earlier or (is_of_user(system) and not settings.explicit_system):
             complain(f"system {system} has {', '.join(containers)}; commands reach it with: trade --system {system}")
-
-
-def as_commands(device: str, remedy: str) -> str:
-    """Turns a driver's remedy into a command: ``call enable()`` becomes ``trade call rosie.neck.pan.enable``."""
-    return _CALLED.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
 def is_providers(error: BaseException) -> bool:
@@ -195,7 +176,4 @@ def _place(traceback: str, rest: str) -> list[str]:
 
 def _with_commands(error: BaseException) -> str:
     """The message, with remedies as commands."""
-    message = str(error)
-    for remedy, command in REMEDIES.items():
-        message = message.replace(remedy, command)
-    return as_commands(error.device, message) if isinstance(error, DeviceFault) else message
+    return error.message(at_terminal=True) if isinstance(error, TradeError) else str(error)

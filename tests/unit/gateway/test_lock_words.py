@@ -1,10 +1,14 @@
 """The words of ``trade lock`` and its kind: help with examples, and what follows two dashes is left as it is."""
 
+import re
+
 import pytest
 from typer.testing import CliRunner
 
+from trade import errors
 from trade.errors import (
     DeviceFault,
+    IncompleteGroup,
     InvalidArgument,
     LockedByOther,
     LockLost,
@@ -13,10 +17,11 @@ from trade.errors import (
     ServiceGone,
     Stopped,
     TooManyServices,
+    TradeError,
 )
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import REMEDIES, say_error
+from trade_gateway.cli._output import say_error
 from trade_gateway.cli.motion._lock import _wanted
 
 
@@ -53,24 +58,39 @@ def test_the_remedy_of_a_device_is_given_as_a_command(capsys: pytest.CaptureFixt
     remedy = "remove the cause, then call power_on() and release_brakes()"
     say_error(DeviceFault(device="rosie.arm", bus="/dev/x", fault="overload", remedy=remedy))
     say_error(Stopped(resource="rosie.pan", by="anna/desk", reason="stop"))
-    say_error(MotionStopped(device="rosie.pan", reason="its call reached its deadline; give it a longer one"))
+    say_error(MotionStopped(device="rosie.pan", reason="its call reached its deadline", late=True))
     fault, stopped, ended = capsys.readouterr().err.splitlines()
     assert fault.endswith(
         "remove the cause, then `trade call rosie.arm.power_on` and `trade call rosie.arm.release_brakes`"
     )
     assert stopped.endswith("When it is safe to move, call `trade resume rosie.pan`")
-    assert "--deadline SECONDS gives it more" in ended
+    assert ended.endswith("Give it more time with --deadline SECONDS")
 
 
-def test_every_translated_remedy_belongs_to_an_error() -> None:
-    errors = (
+def _errors() -> list[TradeError]:
+    return [
         LockedByOther(resources=("a",), owner="b"),
         LockLost(resources=("a",), reason="b"),
+        IncompleteGroup(group="a", missing=["b"]),
         ServiceGone(service="a"),
         TooManyServices(constraint="a", matches=["b"]),
         OutcomeUnknown(service="a", deadline_s=1),
         Stopped(resource="a", by="b", reason="c"),
-        MotionStopped(device="a", reason="its call reached its deadline; give it a longer one"),
-        InvalidArgument(service="a", argument="b", problem="with_(deadline_s=...) gives it more"),
-    )
-    assert all(any(remedy in str(error) for error in errors) for remedy in REMEDIES)
+        Stopped(resource="a", by="b", reason="c", estop=True),
+        MotionStopped(device="a", reason="its call reached its deadline", late=True),
+        InvalidArgument(service="a", argument="b", problem="lasts 3 s", late=True),
+    ]
+
+
+@pytest.mark.parametrize("error", _errors(), ids=lambda error: type(error).__name__)
+def test_no_advice_at_a_terminal_names_python(error: TradeError) -> None:
+    python = re.compile(r"trade\.[a-z_]+\(|with_\(|partial=")
+    assert "`trade " in error.message(at_terminal=True) or " --" in error.message(at_terminal=True)
+    assert not python.search(error.message(at_terminal=True))
+    assert str(error) == error.message()
+    assert python.search(str(error)) or "`trade estop" in str(error)
+
+
+def test_every_error_with_other_advice_at_a_terminal_is_tried_here() -> None:
+    advising = {kind for kind in vars(errors).values() if isinstance(kind, type) and "advice" in vars(kind)}
+    assert advising - {TradeError} == {type(error) for error in _errors()}

@@ -132,7 +132,7 @@ class Motion(GripperCommand):
         if hand.fault:
             return hand.faulty()
         if self.until_ns is not None and now_ns >= self.until_ns:
-            return MotionStopped(device=hand.name, reason="its call reached its deadline; give it a longer one")
+            return MotionStopped(device=hand.name, reason="its call reached its deadline", late=True)
         return None
 
 

@@ -80,9 +80,8 @@ class Motion(ArmCommand):
         except TradeError as problem:
             return problem
         if until_ns is not None and now_ns >= until_ns:
-            reason = "its call reached its deadline; give it a longer one"
-            slowed = self.limb.slowed
-            return MotionStopped(device=self.limb.name, reason=f"{reason}; {slowed}" if slowed else reason)
+            reason, slowed = "its call reached its deadline", self.limb.slowed
+            return MotionStopped(device=self.limb.name, reason=f"{reason}; {slowed}" if slowed else reason, late=True)
         return None
 
     def astray(self, sample: Sample) -> LimitExceeded | None:

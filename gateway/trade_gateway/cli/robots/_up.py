@@ -11,14 +11,14 @@ import typer
 from rich.markup import escape
 
 from trade import Container
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, as_commands
 from trade_drivers import AttachedRobot, FaultInfo, attach, load, without
 from trade_drivers import check as drivers_check
 from trade_drivers.plugins._ports import check_ports
 from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import CONNECTION, SELECT, Json
-from trade_gateway.cli._output import Output, as_commands, complain
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import choice_of
 from trade_gateway.cli.robots._bus_processes import BusProcesses

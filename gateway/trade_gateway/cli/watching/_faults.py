@@ -9,10 +9,10 @@ from rich.markup import escape
 
 from trade import Container, where
 from trade._timestamps import day_and_clock
-from trade.errors import InvalidArgument, TradeError
+from trade.errors import InvalidArgument, TradeError, as_commands
 from trade_gateway._usage import UsageError, asked_for
 from trade_gateway.cli._options import FirstByDefault, Json
-from trade_gateway.cli._output import Output, as_commands, complain
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import visitor_among_others
 
 if TYPE_CHECKING:
