@@ -3,21 +3,22 @@
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
 
 import trade
-from trade import Measure
+from trade import Container, Measure
 from trade._default_system import take_over
+from trade._protocol.messages import HEALTHY
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
 from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.faults import FaultLog, FaultPoller, FaultStore
-from trade_drivers.faults._health import HEALTHY, HealthTeller
+from trade_drivers.faults._fault_poller import Health
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
@@ -32,9 +33,6 @@ _FAULTS: Final = "faults"
 Provider = Motor | JointGroup | Gripper | Arm | Camera | Sensor | CanMonitor
 _Sense = TypeVar("_Sense", Camera, Sensor)
 _Provider = TypeVar("_Provider", Motor, JointGroup, Gripper, Arm, Camera, Sensor)
-Register = Callable[[object, Sequence[str]], object]
-Deregister = Callable[[object], object]
-SetHealth = Callable[[object, str], object]
 
 
 class AttachedRobot:
@@ -128,13 +126,10 @@ def _always() -> bool:
 
 def attach(
     robot: Robot,
+    container: Container | None = None,
     *,
-    register: Register | None = None,
-    deregister: Deregister | None = None,
-    set_health: SetHealth | None = None,
+    announced: bool = True,
     ports: Mapping[str, str] | None = None,
-    healthy: Callable[[], bool] = _always,
-    state_dir: Path | None = None,
 ) -> AttachedRobot:
     """Attaches all devices of a robot, then announces their services. Moves and enables nothing; stops what moves.
 
@@ -146,16 +141,13 @@ def attach(
 
     Args:
         robot: the result of ``load``.
-        register: announces a provider in its groups; ``trade.register`` by default.
-        deregister: withdraws a provider; ``trade.deregister`` by default.
-        set_health: reports a provider's health; ``trade.set_health`` by default, nothing if ``register`` is given.
+        container: announces the services and their health; by default the default container. Each bus thread asks in
+            each cycle whether it is healthy: while it is not, or is closed, devices are commanded to hold once and the
+            bus is silent, so that their own watchdogs stop them. Faults and last known angles outlive the process in
+            its state folder; a bus with a port from ``ports`` saves no angles.
+        announced: False: only this program uses the devices; nothing is announced or saved, and no container starts.
         ports: replacements for the ports in the file, for simulated devices. Bus name -> serial device, or
             ``INTERFACE:CHANNEL`` of a CAN bus; camera or sensor name -> its driver's kind of port.
-        healthy: called by each bus thread in each cycle; while it returns False, devices are commanded to hold once and
-            the bus is silent, so that their own watchdogs stop them.
-        state_dir: the folder where faults and last known angles outlive the process; by default the default
-            container's state folder, or none if ``register`` is given. A bus with a port from ``ports`` saves no
-            angles.
 
     Raises:
         ConfigurationError: a driver is missing, a port cannot be opened, or a device is absent, another or set wrongly.
@@ -163,28 +155,29 @@ def attach(
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
         check(robot, ports)
-        state_dir = state_dir if register is not None else state_dir or _default_state_dir()
+        home = (container or trade.container()) if announced else None
+        state_dir = None if home is None else _state_dir(home)
         faults = _fault_log(robot, state_dir, undo)
-        poller = FaultPoller(faults, f"faults of {robot.name}")
+        name = f"faults of {robot.name}"
+        poller = FaultPoller(faults, name) if home is None else FaultPoller(faults, name, home.set_health)
         undo.callback(poller.close)  # closes after the devices, to record faults during their shutdown, too
         senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, no moving device is accessed
         angles = _angle_store(robot, state_dir, undo)
-        buses = _attach_buses(robot, ports or {}, healthy, undo)
+        buses = _attach_buses(robot, ports or {}, _always if home is None else home.healthy, undo)
         for name, bus in buses.items():
             if angles is not None and name not in (ports or {}):
                 bus.remember(angles)
         providers = _providers(robot, buses, senses)
-        poller.start(providers, _unwatched(robot, buses, poller))
-        for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
-            (register or trade.register)(provider, (name,))
-            undo.callback(_withdraw, deregister or trade.deregister, provider)
-        if (tell := set_health or (trade.set_health if register is None else None)) is not None:
-            _tell_health(robot, providers, faults, tell, undo)
+        poller.start(providers, _unwatched(robot, buses, poller), _healths(robot, providers, faults))
+        if home is not None:
+            for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
+                home.register(provider, (name,))
+                undo.callback(_withdraw, home, provider)
         return AttachedRobot(robot, providers, buses, faults, undo.pop_all())
 
 
-def _default_state_dir() -> Path | None:
-    settings = trade.container().settings
+def _state_dir(container: Container) -> Path | None:
+    settings = container.settings
     return None if settings.state_dir is None else settings.state_dir / settings.system
 
 
@@ -290,13 +283,11 @@ def _monitors(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, CanMo
     return {name: monitor for name, monitor in named if monitor is not None}
 
 
-def _tell_health(
-    robot: Robot, providers: Mapping[str, Provider], faults: FaultLog, tell: SetHealth, undo: ExitStack
-) -> None:
-    """Reports the health of each device and group, which depends on its CAN bus and its faults."""
+def _healths(robot: Robot, providers: Mapping[str, Provider], faults: FaultLog) -> dict[object, list[Health]]:
+    """What judges each device and group: its CAN bus, and its faults."""
     groups = {group.name: group.joints for group in robot.groups}
     bus_of = {device.name: device.bus for device in (*robot.joints, *robot.grippers, *robot.arms)}
-    watched: dict[object, list[Callable[[], str]]] = {}
+    watched: dict[object, list[Health]] = {}
     for full, provider in providers.items():
         if isinstance(provider, CanMonitor):
             watched[provider] = [provider.health]
@@ -307,10 +298,10 @@ def _tell_health(
         monitors = [providers.get(_bus_group(robot, bus)) for bus in buses]
         watched[provider] = [monitor.health for monitor in monitors if isinstance(monitor, CanMonitor)]
         watched[provider] += [_health_by(faults, f"{robot.name}.{part}", whole=name in groups) for part in parts]
-    undo.callback(HealthTeller(watched, tell, f"health of {robot.name}").close)
+    return watched
 
 
-def _health_by(faults: FaultLog, device: str, *, whole: bool) -> Callable[[], str]:
+def _health_by(faults: FaultLog, device: str, *, whole: bool) -> Health:
     """Returns a function that derives the health of a device, or of a group with it, from the fault log."""
 
     def health() -> str:
@@ -329,8 +320,8 @@ def _group(robot: Robot, group: Group, buses: Mapping[str, AttachedBus]) -> Join
     return made[0] if len(made) == 1 else AcrossGroup([f"{robot.name}.{joint}" for joint in group.joints], made)
 
 
-def _withdraw(deregister: Deregister, provider: object) -> None:
+def _withdraw(container: Container, provider: object) -> None:
     try:
-        deregister(provider)
+        container.deregister(provider)
     except TradeError as gone:  # its container has already ended, so the provider is withdrawn
         _log.debug("withdrawing %r: %s", provider, gone)

@@ -155,14 +155,7 @@ def simulated_robot(
         container = system.container(robot.name)
         log = log_folder and log_folder / f"{robot.name}.jsonl"
         sim = undo.enter_context(SimThreads(robot_file, log=log) if virtual else SimProcess(robot_file, log=log))
-        attached = attach(
-            robot,
-            register=container.register,
-            deregister=container.deregister,
-            set_health=container.set_health,
-            ports=sim.ports,
-            healthy=container.healthy,
-        )
+        attached = attach(robot, container, ports=sim.ports)
         undo.callback(_leave, attached)
         made = SimulatedRobot(system, container, attached, sim, time.monotonic())
         undo.callback(made._end_timers)

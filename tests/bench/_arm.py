@@ -67,8 +67,7 @@ def run(rounds: int, seconds: float) -> None:
 
 def _driven(sim: SimProcess, seconds: float) -> tuple[float, float]:
     robot = load(_ROBOT)
-    unannounced = {"register": lambda *_: None, "deregister": lambda *_: None}
-    with attach(robot, ports=sim.ports, **unannounced) as attached:
+    with attach(robot, ports=sim.ports, announced=False) as attached:
         arm = attached.arm("right")
         arm.move_to_pose("home")
         mark, spent = time.monotonic(), time.process_time()

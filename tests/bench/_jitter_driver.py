@@ -36,7 +36,7 @@ def drive(pipe: Connection, text: str, ports: Mapping[str, str]) -> None:
     time, or nothing: too busy a machine holds a bus up. The loop turns on, and how late it was is what is measured.
     """
     robot = parse(text, "jitter.toml")
-    with attach(robot, register=lambda *_: None, deregister=lambda *_: None, ports=ports) as attached:
+    with attach(robot, announced=False, ports=ports) as attached:
         busy = busy_with(robot, attached)
         pipe.send(os.getpid())
         for seconds in _requests(pipe):

@@ -72,7 +72,7 @@ def _share(file: Path, seconds: float) -> float:
     with ExitStack() as undo:  # a process for each bus: one for all would be the slowest part of it
         sims = [undo.enter_context(SimProcess(file, buses=[bus.name], logged=False)) for bus in robot.buses]
         ports = {name: port for sim in sims for name, port in sim.ports.items()}
-        attached = attach(robot, register=lambda *_: None, deregister=lambda *_: None, ports=ports)
+        attached = attach(robot, announced=False, ports=ports)
         undo.callback(attached.close)
         return _busy(attached, seconds, _drivers({sim.pid for sim in sims}))
 

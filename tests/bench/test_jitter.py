@@ -51,8 +51,7 @@ def test_a_cycle_is_seen_once_on_its_wire(bus: Bus, tmp_path: Path) -> None:
         pytest.skip(f"{missing[0]} is not installed")
     robot, file = parse(bus.text, "jitter.toml"), tmp_path / "jitter.toml"
     file.write_text(bus.text)
-    unannounced = {"register": lambda *_: None, "deregister": lambda *_: None}
-    with SimProcess(file) as sim, attach(robot, ports=sim.ports, **unannounced) as attached:
+    with SimProcess(file) as sim, attach(robot, ports=sim.ports, announced=False) as attached:
         busy = busy_with(robot, attached)
         before, missed, began = (
             measured(attached, "bus_cycles"),

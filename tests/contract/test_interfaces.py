@@ -63,7 +63,7 @@ def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
             undo.callback(bus.close)
             bus.open()
         ports = {bus.name: str(bus.port) for bus in buses}
-        yield undo.enter_context(attach(file, register=lambda *_: None, deregister=lambda _: None, ports=ports))
+        yield undo.enter_context(attach(file, announced=False, ports=ports))
 
 
 def _patient(text: str) -> str:

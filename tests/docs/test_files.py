@@ -135,8 +135,7 @@ def test_a_share(tmp_path: Path, text: str) -> None:
 def test_a_robot_file(tmp_path: Path, text: str) -> None:
     """What its drivers have to say of it is said by them, on the simulated devices."""
     whole = load(save(tmp_path, "rosie.toml", text))
-    unannounced: dict[str, Any] = {"register": lambda *_: None, "deregister": lambda _: None}
-    with SimProcess(tmp_path / "rosie.toml") as sim, attach(whole, ports=sim.ports, **unannounced) as rosie:
+    with SimProcess(tmp_path / "rosie.toml") as sim, attach(whole, ports=sim.ports, announced=False) as rosie:
         assert rosie.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]
         assert rosie.gripper("left.hand").limits().max_width_m == 0.085
 

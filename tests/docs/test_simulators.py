@@ -25,7 +25,7 @@ def test_a_simulator_in_a_program(play: Play, tmp_path: Path) -> None:
 
     def drive(port: str) -> None:
         robot = load("examples/head.toml")
-        with attach(robot, register=lambda *_: None, deregister=lambda _: None, ports={"neck": port}) as rosie:
+        with attach(robot, announced=False, ports={"neck": port}) as rosie:
             rosie.motor("neck.pan").move_to(0.2)
         play.module.deadline = time.monotonic()
 

@@ -1,13 +1,15 @@
-"""Collects faults from bus threads and recent measurements of devices, and passes both to the log."""
+"""Collects faults from bus threads and recent measurements of devices, for the log and for the health of providers."""
 
 import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
-from trade.errors import DeviceFault
+from trade._protocol.messages import HEALTHY
+from trade.errors import DeviceFault, TradeError
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Moment, when
 from trade_drivers.faults._trouble import Found, Trouble, found_in
@@ -16,12 +18,20 @@ from trade_drivers.interfaces._motion import Gripper, Motor
 from trade_drivers.interfaces._sensing import Sensor
 
 _EVERY_S: Final = 0.04
+_HEALTH_EVERY_S: Final = 0.5
 _KEPT: Final = 50
 """Number of measurements kept for each device: two seconds of them."""
 _END_S: Final = 5.0
 _END: Final = Trouble("", "fault", 0.0, 0.0)
 """The last item of the queue."""
 _MEASURING: Final = (Motor, Gripper, Arm, Sensor)
+
+Health = Callable[[], str]
+"""Judges a device, for example by its bus: ``HEALTHY``, or what is wrong."""
+
+
+def _ignored(_provider: object, _health: str) -> None:
+    pass
 
 
 class FaultPoller:
@@ -30,10 +40,15 @@ class FaultPoller:
     Args:
         log: receives each fault that begins or ends.
         name: of the thread.
+        set_health: receives each change of a provider's health.
     """
 
-    def __init__(self, log: FaultLog, name: str) -> None:
+    def __init__(self, log: FaultLog, name: str, set_health: Callable[[object, str], object] = _ignored) -> None:
         self._log = log
+        self._set_health = set_health
+        self._healths: Mapping[object, Sequence[Health]] = {}
+        self._reported: dict[object, str] = {}
+        """The health of each provider that was reported last."""
         self._queue: queue.SimpleQueue[Trouble] = queue.SimpleQueue()
         self._devices: dict[str, Any] = {}
         self._asked: frozenset[str] = frozenset()
@@ -46,13 +61,18 @@ class FaultPoller:
         """Queues a detected change; never waits."""
         self._queue.put(trouble)
 
-    def start(self, devices: Mapping[str, object], asked: Collection[str]) -> None:
+    def start(
+        self, devices: Mapping[str, object], asked: Collection[str], healths: Mapping[object, Sequence[Health]] = {}
+    ) -> None:
         """Starts the thread.
 
         Args:
             devices: devices by name; those without measurements are left out.
             asked: the names of devices whose bus reports no faults; the thread polls them 25 times a second.
+            healths: each provider with what judges its health, twice a second; the first result that is not healthy
+                counts.
         """
+        self._healths = healths
         self._devices = {name: device for name, device in devices.items() if isinstance(device, _MEASURING)}
         self._asked = frozenset(asked) & frozenset(self._devices)
         self._lately = {name: deque(maxlen=_KEPT) for name in self._devices}
@@ -67,7 +87,7 @@ class FaultPoller:
     # --- the thread
 
     def _run(self) -> None:
-        due_s = time.monotonic()
+        due_s = health_due_s = time.monotonic()
         while (trouble := self._next(due_s)) is not _END:
             if trouble is not None:
                 self._take(trouble)
@@ -75,6 +95,9 @@ class FaultPoller:
                 due_s = time.monotonic() + _EVERY_S
                 self._look_at_all()
                 self._log.save()
+            if time.monotonic() >= health_due_s:
+                health_due_s = time.monotonic() + _HEALTH_EVERY_S
+                self._report_health()
 
     def _next(self, due_s: float) -> Trouble | None:
         try:
@@ -87,6 +110,14 @@ class FaultPoller:
             found = self._measure(name)
             if name in self._asked:
                 self._take(Trouble(name, "fault", time.time(), time.monotonic(), found))
+
+    def _report_health(self) -> None:
+        for provider, judges in self._healths.items():
+            health = next((text for judge in judges if (text := judge()) != HEALTHY), HEALTHY)
+            if health != self._reported.get(provider, HEALTHY):
+                self._reported[provider] = health
+                with suppress(TradeError):  # the container has ended, or the provider was withdrawn
+                    self._set_health(provider, health)
 
     def _measure(self, name: str) -> tuple[Found, ...]:
         """Keeps a device's measurement if it is new, and returns the faults that the device itself reports."""

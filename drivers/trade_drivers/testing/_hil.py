@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> int:
         _refuse_if_in_use(robot)
         if not (options.yes or _agreed(robot)):
             return _REFUSED
-        with attach(robot, register=_keep, deregister=_keep, ports=ports) as attached:
+        with attach(robot, announced=False, ports=ports) as attached:
             return int(pytest.main([*_WORDS, str(_SUITE), *rest], plugins=[_Devices(attached)]))
     except TradeError as problem:
         sys.stderr.write(f"{problem}\n")
@@ -60,10 +60,6 @@ def main(words: Sequence[str] | None = None) -> int:
 
 _WORDS: Final = ("-c", os.devnull, "--import-mode=importlib", "-p", "no:cacheprovider", "-v")
 """Options that make the suite independent of pytest settings in the current folder."""
-
-
-def _keep(*_: object) -> None:
-    """Registers nothing, as the providers are only called in this process."""
 
 
 def _port(word: str) -> tuple[str, str]:

@@ -3,7 +3,8 @@
 import pytest
 
 from trade import Handle
-from trade._hooks.callee import Callee, CalleeHost
+from trade._calls.client import CallClient
+from trade._hooks.callee import Callee
 from trade.errors import Stopped
 from trade_gateway.cli.services import _call
 from trade_gateway.recording._poller import Watch
@@ -17,8 +18,8 @@ def a_placed_object_starts_a_container_of_its_own(patch: pytest.MonkeyPatch) -> 
 def a_callee_is_looked_up_once(patch: pytest.MonkeyPatch) -> None:
     now, found = Callee.now, dict[Callee, Handle]()
 
-    def once(self: Callee, home: CalleeHost) -> Handle | None:
-        if self not in found and (handle := now(self, home)) is not None:
+    def once(self: Callee, client: CallClient) -> Handle | None:
+        if self not in found and (handle := now(self, client)) is not None:
             found[self] = handle
         return found.get(self)
 

@@ -132,13 +132,7 @@ class Stage:
     def attach(self, kind: RobotKind) -> None:
         """Attach the driver."""
         home, bus = self.system.container(kind.home), kind.robot.buses[0].name
-        self.attached[kind.group] = attach(
-            kind.robot,
-            ports={bus: str(self.buses[kind.group].port)},
-            register=home.register,
-            deregister=home.deregister,
-            healthy=home.healthy,
-        )
+        self.attached[kind.group] = attach(kind.robot, home, ports={bus: str(self.buses[kind.group].port)})
 
     def detach(self, kind: RobotKind) -> None:
         """Close the driver, if there is one."""

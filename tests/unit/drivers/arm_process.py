@@ -11,9 +11,7 @@ ROBOT, HOST, HOW = sys.argv[1:4]
 
 def main() -> None:
     robot = trade_drivers.parse(Path(ROBOT).read_text(encoding="utf-8"), ROBOT)
-    with trade_drivers.attach(
-        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={"ur": HOST}
-    ) as attached:
+    with trade_drivers.attach(robot, announced=False, ports={"ur": HOST}) as attached:
         arm = attached.arm("right")
         far = [3.0, *arm.state().positions_rad[1:]]
         if HOW == "move":

@@ -4,6 +4,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from tests.support.fake_container import fake_container
 from trade.errors import TradeError
 from trade_drivers import AttachedRobot, attach, parse
 from trade_hil_sim.ur import HOME
@@ -16,8 +17,7 @@ AT_HOME = list(HOME)
 
 def attached(undo: ExitStack, host: str, text: str = ARM, **options: Any) -> AttachedRobot:
     """The driver, attached to the controller at this address; it ends with the stack."""
-    given = {"register": _ignored, "deregister": _ignored, **options}
-    driver = attach(parse(text, "arm.toml"), ports={"ur": host}, **given)
+    driver = attach(parse(text, "arm.toml"), fake_container(**options), ports={"ur": host})
     undo.callback(_close, driver)
     return driver
 
@@ -27,7 +27,3 @@ def _close(driver: AttachedRobot) -> None:
         driver.close()
     except TradeError as error:  # what closing says is tested where it matters
         print(f"closing: {error}")
-
-
-def _ignored(*_: object) -> None:
-    """Nothing is announced."""

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
 
+from tests.support.fake_container import fake_container
 from tests.support.simulated_robots import patient
 from tests.support.waiting import wait_until
 from trade_drivers import AttachedRobot, Robot, attach, parse
@@ -47,11 +48,9 @@ class BusRig:
 
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
-        if "ports" not in options:
-            options["ports"] = self.ports
+        ports = options.pop("ports", None)
         options.setdefault("register", lambda _, groups: self.announced.append(groups))
-        options.setdefault("deregister", lambda _: None)
-        robot = attach(self.robot, **options)
+        robot = attach(self.robot, fake_container(**options), ports=self.ports if ports is None else ports)
         self._undo.callback(_close, robot)
         return robot
 

@@ -15,9 +15,7 @@ BUS, JOINT = sys.argv[3:5] or ("neck", "neck.pan")
 
 def main() -> None:
     robot = trade_drivers.parse(Path(ROBOT).read_text(encoding="utf-8"), ROBOT)
-    with trade_drivers.attach(
-        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={BUS: PORT}
-    ) as head:
+    with trade_drivers.attach(robot, announced=False, ports={BUS: PORT}) as head:
         print("attached", flush=True)
         try:
             motor = head.motor(JOINT)

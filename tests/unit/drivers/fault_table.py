@@ -303,7 +303,7 @@ answers again, the driver does not enable it and sends it no goal. At most, it m
 
 Three orders are not from the simulator:
 
-- `sick`: `attach(healthy=...)` returns False.
+- `sick`: the container is not healthy.
 - `process signal`: a signal to the control process of an arm's driver.
 - `dashboard`: a line that another client sends to the arm's controller.
 

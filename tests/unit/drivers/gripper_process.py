@@ -10,9 +10,7 @@ ROBOT, PORT = sys.argv[1:3]
 
 def main() -> None:
     robot = trade_drivers.parse(Path(ROBOT).read_text(encoding="utf-8"), ROBOT)
-    with trade_drivers.attach(
-        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={"hand": PORT}
-    ) as attached:
+    with trade_drivers.attach(robot, announced=False, ports={"hand": PORT}) as attached:
         attached.gripper("left.hand").activate()
         attached.gripper("left.hand").move_to(0.05, 0.02)
         sys.stdin.read()

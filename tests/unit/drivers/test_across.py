@@ -61,9 +61,7 @@ class Walker:
             sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), folder / bus.name, paced=False)
             self.sims[bus.name] = undo.enter_context(sim)
         ports = {name: str(sim.port) for name, sim in self.sims.items()}
-        self.attached: AttachedRobot = undo.enter_context(
-            attach(self.robot, register=lambda *_: None, deregister=lambda _: None, ports=ports)
-        )
+        self.attached: AttachedRobot = undo.enter_context(attach(self.robot, announced=False, ports=ports))
         self.legs: JointGroup = self.attached.group("legs")
 
     def log(self, side: str) -> list[Entry]:

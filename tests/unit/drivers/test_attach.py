@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import trade_hil_sim as sim
+from tests.support.fake_container import fake_container
 from tests.unit.drivers.conftest import Outcome, Rig
 from trade.errors import ConfigurationError
 from trade_drivers import Driver, drivers, load
@@ -191,8 +192,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
     announced: list[object] = []
     robot = attach(
         head.robot,
-        register=lambda provider, groups: announced.append(provider),
-        deregister=announced.remove,
+        fake_container(register=lambda provider, groups: announced.append(provider), deregister=announced.remove),
         ports={"neck": str(head.sim.port)},
     )
     assert len(announced) == 4  # two joints, their group, and what reports faults

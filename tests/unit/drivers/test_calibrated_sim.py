@@ -45,15 +45,12 @@ class Twin:
 
     def attach(self, robot: Robot) -> AttachedRobot:
         ports = {robot.buses[0].name: str(self.sim.port)}
-        attached = attach(robot, ports=ports, register=_nothing, deregister=_nothing)
+        attached = attach(robot, ports=ports, announced=False)
         self._undo.callback(attached.close)
         return attached
 
     def truth(self) -> Any:
         return next(device for device in self.sim.state().devices if device.device_id == 1)
-
-
-def _nothing(*_: object) -> None: ...
 
 
 @pytest.fixture

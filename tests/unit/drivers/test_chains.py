@@ -66,7 +66,7 @@ class Mind:
 def robot(head: Rig, start_container: Callable[..., Container]) -> Iterator[AttachedRobot]:
     driver = start_container("driver")
     ports = {"neck": str(head.sim.port)}
-    with attach(head.robot, register=driver.register, deregister=driver.deregister, ports=ports) as up:
+    with attach(head.robot, driver, ports=ports) as up:
         yield up
 
 

@@ -179,7 +179,7 @@ def stand(tmp_path: Path) -> Iterator[Stand]:
 @pytest.fixture
 def robot(stand: Stand) -> Iterator[AttachedRobot]:
     ports = stand.sim.ports
-    attached = attach(parse(LEG, "leg.toml"), register=lambda *_: None, deregister=lambda _: None, ports=ports)
+    attached = attach(parse(LEG, "leg.toml"), announced=False, ports=ports)
     yield attached
     attached.close()
 

@@ -24,7 +24,7 @@ def test_a_bus_counts_its_cycles_and_its_joints_say_how_warm_they_are(
     file = ROOT / "examples" / robot
     with (
         SimProcess(file) as sim,
-        attach(load(file), register=lambda *_: None, deregister=lambda _: None, ports=sim.ports) as attached,
+        attach(load(file), announced=False, ports=sim.ports) as attached,
     ):
 
         def found() -> dict[tuple[str, ...], float]:

@@ -54,9 +54,7 @@ class Oven:
 
     def attach(self) -> AttachedRobot:
         ports = {self.sim.name: str(self.sim.port)}
-        return self._undo.enter_context(
-            attach(load(OVEN), register=lambda *_: None, deregister=lambda _: None, ports=ports)
-        )
+        return self._undo.enter_context(attach(load(OVEN), announced=False, ports=ports))
 
 
 @pytest.fixture

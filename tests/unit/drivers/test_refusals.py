@@ -70,7 +70,7 @@ def test_what_a_driver_cannot_do_is_refused_with_file_key_and_what_would_be_righ
     assert str(refusal).startswith(f"rosie.toml: {key}: ")
     assert problem in str(refusal)
     with pytest.raises(ConfigurationError) as raised:
-        attach(robot, register=lambda *_: None, deregister=lambda _: None)
+        attach(robot, announced=False)
     assert str(raised.value) == str(refusal)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.fake_container import fake_container
 from tests.support.simulated_robots import HAND, HEAD
 from trade.errors import ConfigurationError, DeviceFault, DeviceSilent, InvalidArgument
 from trade_drivers import AttachedRobot, Camera, Image, attach, load, parse
@@ -59,9 +60,7 @@ class Stage:
 
     def attach(self, **changed: str) -> AttachedRobot:
         ports = {name: str(sim.port) for name, sim in self.sims.items()}
-        return self._undo.enter_context(
-            attach(self.file, register=lambda *_: None, deregister=lambda _: None, ports={**ports, **changed})
-        )
+        return self._undo.enter_context(attach(self.file, announced=False, ports={**ports, **changed}))
 
     def field(self, device: str) -> Field:
         states = [sim.state() for sim in self.sims.values()]
@@ -163,7 +162,7 @@ def test_the_example_is_seen_to_move_in_a_simulator_of_its_own() -> None:
     file = Path(__file__).parents[3] / "examples" / "eye.toml"
     with (
         SimProcess(file, paced=False) as sim,
-        attach(load(file), register=lambda *_: None, deregister=lambda _: None, ports=sim.ports) as robot,
+        attach(load(file), announced=False, ports=sim.ports) as robot,
     ):
         before = robot.camera("eye").image()
         robot.motor("neck.pan").move_to(0.5)
@@ -218,7 +217,7 @@ def test_a_camera_of_another_size_than_the_file_says_is_refused(stage: Stage) ->
     robot = parse(SEEN.replace("width_px = 160", "width_px = 640"), "seen.toml")
     ports = {name: str(sim.port) for name, sim in stage.sims.items()}
     with pytest.raises(ConfigurationError, match=r"seen\.toml: camera\.eye\.width_px: its pictures have 160, not 640"):
-        attach(robot, register=lambda *_: None, deregister=lambda _: None, ports=ports)
+        attach(robot, announced=False, ports=ports)
 
 
 @pytest.mark.parametrize(
@@ -257,7 +256,7 @@ def test_unless_every_camera_is_present_nothing_is_announced_and_no_motor_gets_a
     announced: list[object] = []
     ports = {name: str(sim.port) for name, sim in stage.sims.items()} | {"eye": "http://127.0.0.1:9/"}
     with pytest.raises(ConfigurationError):
-        attach(stage.file, register=lambda *given: announced.append(given), deregister=lambda _: None, ports=ports)
+        attach(stage.file, fake_container(register=lambda *given: announced.append(given)), ports=ports)
     assert not announced
     assert not [entry for entry in stage.log.entries if entry.bus == "neck" and entry.kind == "received"]
 

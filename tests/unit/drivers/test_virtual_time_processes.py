@@ -24,8 +24,7 @@ robot = parse(BUS + JOINT.format("root", 1) + SPEED + JOINT.format("tip", 2) + S
 with virtual_time(seed=int(sys.argv[1]), switch=0.3) as time, memory_system() as system:
     container = system.container("robot")
     with FeetechBus.from_robot(robot.buses[0], robot.joints_on("tail"), Path("unused")) as sim:
-        services = {"register": container.register, "deregister": container.deregister}
-        attached = attach(robot, ports={"tail": str(sim.port)}, **services)
+        attached = attach(robot, container, ports={"tail": str(sim.port)})
         mind = system.container("mind")
         with mind.lock("rosie.root", wait_s=5):
             mind.call("rosie.root.move_to", 0.5)

@@ -173,7 +173,7 @@ def test_the_imported_arm_works_on_servos_that_lerobot_has_set_up(bench: Bench, 
                 servo.memory.set(name, value)
                 servo.memory.keep(name)
         undo.enter_context(sim)
-        arm = attach(robot, ports={"follower": str(sim.port)}, register=nothing, deregister=nothing)
+        arm = attach(robot, ports={"follower": str(sim.port)}, announced=False)
         undo.callback(arm.close)
         assert not writes(list(sim.log.entries), register="homing_offset")
         for joint in robot.joints:
@@ -182,6 +182,3 @@ def test_the_imported_arm_works_on_servos_that_lerobot_has_set_up(bench: Bench, 
             motor.move_to(joint.max_rad)
             at = events(list(sim.log.entries), "at_rest", device_id=joint.id)[-1].position_counts
             assert at == ARM[joint.name.partition(".")[2]]["range_max"]
-
-
-def nothing(*_: object) -> None: ...

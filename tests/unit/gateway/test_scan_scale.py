@@ -29,10 +29,6 @@ def drives(*objects: Object) -> Cia402Bus:
     return Cia402Bus(made)
 
 
-def ignore(*_: object) -> None:
-    """Registers nothing."""
-
-
 @pytest.mark.parametrize(
     ("objects", "counts_per_rev"),
     [
@@ -54,7 +50,7 @@ def test_S23_a_scan_writes_the_scale_that_a_drive_reports_and_the_driver_accepts
         assert [joint.counts_per_rev for joint in robot.joints] == pytest.approx([counts_per_rev, 4096], rel=1e-9)
         assert ("as the drive says" in text) == bool(objects)
         assert not [frame for frame in frames(sim.log.entries, "sdo_request") if frame.data[0] & 0xE0 == 0x20]
-        attach(robot, register=ignore, deregister=ignore).close()
+        attach(robot, announced=False).close()
 
 
 def test_S23_no_file_is_written_for_a_drive_whose_scale_is_impossible(tmp_path: Path) -> None:

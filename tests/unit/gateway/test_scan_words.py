@@ -64,7 +64,7 @@ def test_a_robot_file_of_servos_that_another_program_has_homed_comes_up(
         )
         assert said.exit_code == 0, said.output
         assert (f"homing_counts = {homing}" in file.read_text()) == written
-        attach(load(file), register=lambda *_: None, deregister=lambda _: None).close()
+        attach(load(file), announced=False).close()
         assert not motion_writes(list(sim.log.entries))
 
 

@@ -162,16 +162,7 @@ def up(
         options = _options(leave_out, ordinary=sim or no_real_time)
         processes = stack.enter_context(BusProcesses(container, whole, own, ports, options))
         _say_attaching(out, whole, robot, ports)
-        state_dir = container.settings.state_dir
-        attached = attach(
-            robot,
-            register=container.register,
-            deregister=container.deregister,
-            set_health=container.set_health,
-            ports={part: port for part, port in ports.items() if part not in own},
-            healthy=container.healthy,
-            state_dir=state_dir and state_dir / container.settings.system,
-        )
+        attached = attach(robot, container, ports={part: port for part, port in ports.items() if part not in own})
         logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch reports them once, with the time
         stack.callback(_say_left, attached)
         stack.enter_context(attached)
