@@ -26,7 +26,7 @@
         |   `-- WrongDevice, DeviceAbsent
         `-- CannotConnect, NoContainerFound, CannotStart, LinkStays
 
-Every error carries its data as attributes, crosses the wire with them, and says what to do next. `TradeError.message`
+Every error carries its data as attributes, crosses the wire with them, and says what to do next. `TradeError.text`
 says it for programs, or for people at a terminal. Each also inherits the builtin that a Python programmer would catch
 for it, so ``except TimeoutError`` catches a deadline that passed.
 
@@ -111,9 +111,9 @@ class TradeError(Exception):
     """The root of all errors that this project raises on purpose."""
 
     def __str__(self) -> str:
-        return self.message()
+        return self.text()
 
-    def message(self, *, at_terminal: bool = False) -> str:
+    def text(self, *, at_terminal: bool = False) -> str:
         """What happened, why, and what to do.
 
         Args:
@@ -784,7 +784,7 @@ class DeviceFault(DeviceError, RuntimeError):
     def describe(self) -> str:
         return f"{self.device} on {self.bus}: {self.fault}; {self.remedy}"
 
-    def message(self, *, at_terminal: bool = False) -> str:
+    def text(self, *, at_terminal: bool = False) -> str:
         text = self.describe()
         return as_commands(self.device, text) if at_terminal else text
 
@@ -918,10 +918,10 @@ class NoContainerFound(SetupError, ConnectionError):
     """Endpoints where no container was found, each with the reason."""
 
     def describe(self) -> str:
-        said = [] if self.others else [f"no other container was found in system {self.system}"]
-        said += [_unanswered(self.apart)] if self.apart else []
-        said += [f"{_some(self.silent)} did not answer"] if self.silent else []
-        return "; ".join([*said, self.so] if self.so else said)
+        parts = [] if self.others else [f"no other container was found in system {self.system}"]
+        parts += [_unanswered(self.apart)] if self.apart else []
+        parts += [f"{_some(self.silent)} did not answer"] if self.silent else []
+        return "; ".join([*parts, self.so] if self.so else parts)
 
 
 StartFailure = Literal[
@@ -948,13 +948,13 @@ class CannotStart(SetupError, ConnectionError):
     host: str
     container: str
     reason: StartFailure
-    said: str
+    output: str
     """The output of ssh, or of the command on the host."""
     remedy: str
 
     def describe(self) -> str:
-        said = f" ({self.said})" if self.said else ""
-        return f"container {self.container} was not started on {self.host}: {self.reason}{said}; {self.remedy}"
+        output = f" ({self.output})" if self.output else ""
+        return f"container {self.container} was not started on {self.host}: {self.reason}{output}; {self.remedy}"
 
 
 @dataclass(kw_only=True, eq=False)

@@ -119,8 +119,8 @@ class AuditStore:
             last = oldest + pieces * keep.piece - 1
             (its_hash,) = self._file.execute("SELECT hash FROM record WHERE seq = ?", (last,)).fetchone()
             self._file.execute("DELETE FROM record WHERE seq <= ?", (last,))
-            said = structs.replace(row, kind="audit", what=DROPPED, about=checkpoint(Head(last, its_hash)))
-            self._append(head, [said])
+            gap = structs.replace(row, kind="audit", what=DROPPED, about=checkpoint(Head(last, its_hash)))
+            self._append(head, [gap])
             return pieces * keep.piece
 
     def _older(self, oldest: int, before_ns: int, keep: Keep, head: Head) -> int:

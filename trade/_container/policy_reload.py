@@ -66,9 +66,9 @@ class _Watching:
         self._refused = None
         after = self._access.policy
         assert after is not None  # noqa: S101 - it has just been read
-        said = f"{path}: {', '.join(different(before, after)) or 'nothing is different'}"
-        _logger.warning("read again: %s", said)
-        self._audit.changed("policy read again", said, None)
+        text = f"{path}: {', '.join(different(before, after)) or 'nothing is different'}"
+        _logger.warning("read again: %s", text)
+        self._audit.changed("policy read again", text, None)
         try:
             self._recheck_access()
         except Exception:

@@ -113,8 +113,8 @@ class Registration:
         Raises:
             ConfigurationError: the health is not a text, or it is not registered here.
         """
-        said = checked_health(provider, health)
-        self._alter(provider, lambda info: structs.replace(info, health=said))
+        checked = checked_health(provider, health)
+        self._alter(provider, lambda info: structs.replace(info, health=checked))
 
     def alter(self, provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
         """Reads a registered provider again: its class's ``@service`` marks and its resources. Handles stay valid.

@@ -35,7 +35,7 @@ class ActiveCall:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "queued_ns", "report", "said", "size"),
+        *("cancelled", "queued_ns", "report", "size", "unsent"),
     )
 
     def __init__(self, caller: str, call: Call | None, report: "Callable[[ActiveCall, Any], None] | None") -> None:
@@ -43,7 +43,7 @@ class ActiveCall:
         self.call = call
         self.report = report
         """Takes the provider's progress without waiting: `Dispatcher._report`, or the local target's."""
-        self.said: Raw | None = None
+        self.unsent: Raw | None = None
         """The latest progress that is not sent yet."""
         self.cancelled = False
         self.answer: Answer | None = None
@@ -238,7 +238,7 @@ class ProgressReporter:
     def report(self, ongoing: ActiveCall, body: Raw) -> None:
         """Sends this soon, unless newer progress replaces it."""
         with self._lock:
-            ongoing.said = body
+            ongoing.unsent = body
             self._news.add(ongoing)
             self._some.set()
             if self._thread is None and not self._ended.is_set():
@@ -257,12 +257,12 @@ class ProgressReporter:
 
     def send(self, ongoing: ActiveCall) -> None:
         """Sends the latest progress of a call, unless it was sent or the call has ended."""
-        body = ongoing.said
+        body = ongoing.unsent
         if body is None or ongoing.answer is not None:
             return
         self._send(ongoing, body)
-        if ongoing.said is body:  # only now: better twice than never
-            ongoing.said = None
+        if ongoing.unsent is body:  # only now: better twice than never
+            ongoing.unsent = None
 
     def close(self) -> None:
         """Ends the thread. Idempotent."""

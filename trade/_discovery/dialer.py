@@ -165,10 +165,10 @@ class Dialer:
         if self._links.hub:
             return _NO_LINK if accepts(endpoint) else WITHOUT_HUB
         tried = self._tried(endpoint)
-        said = f" (tried {', '.join(map(str, tried))})" if tried else ""
+        where = f" (tried {', '.join(map(str, tried))})" if tried else ""
         if tried and not any(attempt.accepted for attempt in tried):
-            return f"nothing accepts connections there{said}"
-        known = [f"{_NO_LINK}{said}", _NEEDED[self._links.certified]]
+            return f"nothing accepts connections there{where}"
+        known = [f"{_NO_LINK}{where}", _NEEDED[self._links.certified]]
         known += [_BRIDGES] if self._links.bridges else []
         return "; ".join(known)
 

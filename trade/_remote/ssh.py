@@ -108,9 +108,9 @@ def start(
     if found is not None:
         return found
     outcome, hint = _give_up(host, name, started.pid, words, ssh_config)
-    said = f"it came up there as process {started.pid}, was not visible here within {wait_s:g} s, and {outcome}"
+    output = f"it came up there as process {started.pid}, was not visible here within {wait_s:g} s, and {outcome}"
     remedy = f"{hint}set its endpoints (connect=...), and give it the credentials or certificates of this system"
-    raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
+    raise CannotStart(host=host, container=name, reason="not seen", output=output, remedy=remedy)
 
 
 def _give_up(host: str, name: str, pid: int, words: Sequence[str], ssh_config: Path | None) -> tuple[str, str]:
@@ -207,11 +207,11 @@ def _run(
         )
     except FileNotFoundError:
         remedy = "install it (Debian: apt-get install openssh-client)"
-        raise CannotStart(host=host, container=name, reason="no ssh here", said="", remedy=remedy) from None
+        raise CannotStart(host=host, container=name, reason="no ssh here", output="", remedy=remedy) from None
     except subprocess.TimeoutExpired:
-        said = f"not finished within {longest_s:.3g} s"
+        output = f"not finished within {longest_s:.3g} s"
         remedy = f"it may still come up there: `trade containers` shows it, or `ssh {host} pgrep -af {name}`"
-        raise CannotStart(host=host, container=name, reason="timeout", said=said, remedy=remedy) from None
+        raise CannotStart(host=host, container=name, reason="timeout", output=output, remedy=remedy) from None
 
 
 def _read(
@@ -226,7 +226,7 @@ def _read(
         f"it said {ended.stdout[-200:]!r}, and may run there: `ssh {host} pgrep -af {name}` shows it. Does "
         f"{command!r} there start this version of trade?"
     )
-    raise CannotStart(host=host, container=name, reason="no answer", said=_complaint(ended), remedy=remedy)
+    raise CannotStart(host=host, container=name, reason="no answer", output=_complaint(ended), remedy=remedy)
 
 
 def _refusal(
@@ -243,7 +243,7 @@ def _refusal(
         remedy = f"{command!r} is not found by its shell; install trade-gateway there, or give the path of its `trade`"
     else:
         reason, remedy = "it did not come up", f"try `ssh {host} {shlex.join(words)}`"
-    return CannotStart(host=host, container=name, reason=reason, said=_complaint(ended), remedy=remedy)
+    return CannotStart(host=host, container=name, reason=reason, output=_complaint(ended), remedy=remedy)
 
 
 def _complaint(ended: "subprocess.CompletedProcess[str]") -> str:

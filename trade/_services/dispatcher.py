@@ -239,7 +239,7 @@ class Dispatcher:
         self._end(ongoing, service, incoming, answer)
 
     def _end(self, ongoing: ActiveCall, service: LocalService, incoming: IncomingCall, answer: Answer) -> None:
-        if ongoing.said is not None:
+        if ongoing.unsent is not None:
             self._progress_reporter.send(ongoing)
         also = self._deduplicator.end(ongoing, incoming.call, answer, keep=service.effect != "read")
         self._answer(incoming, *answer)

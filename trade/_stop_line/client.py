@@ -189,8 +189,8 @@ class StopLines:
 
     def _request(self, ask: str, limit_s: float, reason: str, **more: object) -> StopRequest:
         by = f"{self._settings.identity}/{self._settings.container}"
-        said = reason[:LONGEST_REASON]  # no stop is refused for its reason
-        return StopRequest(v=VERSION, ask=ask, by=by, limit_s=limit_s, reason=said, **more)  # type: ignore[arg-type]
+        shortened = reason[:LONGEST_REASON]  # no stop is refused for its reason
+        return StopRequest(v=VERSION, ask=ask, by=by, limit_s=limit_s, reason=shortened, **more)  # type: ignore[arg-type]
 
     def _places(self) -> list[Place]:
         own = self._own()

@@ -176,10 +176,10 @@ class GroupStopServices:
         return dict.fromkeys(report.stopped, "") | report.failed
 
 
-def _read(group: str, said: dict[str, str]) -> StopReport:
+def _read(group: str, problems: dict[str, str]) -> StopReport:
     """The answer of `stop_group`."""
-    done = tuple(label for label, problem in said.items() if not problem)
-    return StopReport(group, done, {label: problem for label, problem in said.items() if problem})
+    done = tuple(label for label, problem in problems.items() if not problem)
+    return StopReport(group, done, {label: problem for label, problem in problems.items() if problem})
 
 
 def _over(run: "Run[Any] | str") -> bool:

@@ -90,9 +90,9 @@ class Database:
             self._open = sqlite3.connect(self._path, timeout=_WAIT_S / 2)
             self._open.execute("pragma journal_mode = wal")
             self._open.execute("pragma synchronous = full")
-            [[said]] = self._open.execute("pragma quick_check(1)").fetchall()
-            if said != "ok":
-                raise sqlite3.DatabaseError(said)
+            [[result]] = self._open.execute("pragma quick_check(1)").fetchall()
+            if result != "ok":
+                raise sqlite3.DatabaseError(result)
             self._open.execute(self._table)
             self._path.chmod(0o600)
         return self._open

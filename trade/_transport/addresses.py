@@ -131,20 +131,20 @@ def knock(endpoints: Sequence[Endpoint], limit_s: float) -> Iterator[tuple[Endpo
                 host = endpoint.host.strip("[]")
                 sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
                 sock.setblocking(False)
-                said = sock.connect_ex((host, endpoint.port))
-                if said in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
+                error_number = sock.connect_ex((host, endpoint.port))
+                if error_number in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
                     waiting[sock.fileno()] = sock
                     selector.register(sock, selectors.EVENT_WRITE, endpoint)
                 else:
                     sock.close()
-                    yield endpoint, _problem(said)
+                    yield endpoint, _problem(error_number)
             while waiting and (left_s := until - time.monotonic()) > 0:
                 for key, _ in selector.select(left_s):
                     sock = waiting.pop(key.fd)
                     selector.unregister(sock)
-                    said = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+                    error_number = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
                     sock.close()
-                    yield key.data, _problem(said)
+                    yield key.data, _problem(error_number)
             for descriptor in list(waiting):
                 yield selector.get_key(descriptor).data, _TIMED_OUT
         finally:
@@ -152,7 +152,7 @@ def knock(endpoints: Sequence[Endpoint], limit_s: float) -> Iterator[tuple[Endpo
                 sock.close()
 
 
-def _problem(said: int) -> str:
-    return {0: "", errno.ECONNREFUSED: "refused", errno.ETIMEDOUT: _TIMED_OUT}.get(said) or (
-        os.strerror(said).lower() if said else ""
+def _problem(error_number: int) -> str:
+    return {0: "", errno.ECONNREFUSED: "refused", errno.ETIMEDOUT: _TIMED_OUT}.get(error_number) or (
+        os.strerror(error_number).lower() if error_number else ""
     )

@@ -97,7 +97,7 @@ class PortGuard:
         elif strangers > self._most:
             crowded = {place for place, sock in enumerate(self._sockets) if _count(sock, there) > self._most // 2}
             self._filter(self._shut | crowded)
-        if self._flood is not None and self._flood.said(now, strangers, self._most, shut=bool(self._shut)):
+        if self._flood is not None and self._flood.log_due(now, strangers, self._most, shut=bool(self._shut)):
             self._flood = None
 
     def _filter(self, shut: frozenset[int]) -> None:
@@ -172,7 +172,7 @@ class _Flood:
     def __init__(self, now: float, ports: str, ends: Iterable[tuple[str, str]]) -> None:
         self._began = self._last = now
         self._ports = ports
-        self._said = False
+        self._logged = False
         self._came = Counter[str]()
         self.note(ends)
 
@@ -180,12 +180,12 @@ class _Flood:
         """These connections are new."""
         self._came.update(end.partition(":")[0] for end, _ in ends)
 
-    def said(self, now: float, strangers: int, most: int, *, shut: bool) -> bool:
+    def log_due(self, now: float, strangers: int, most: int, *, shut: bool) -> bool:
         """Logs what is due; returns whether it is over."""
         if shut:
             self._last = now
-            if not self._said:
-                self._said = True
+            if not self._logged:
+                self._logged = True
                 _logger.warning(
                     "%d connections at port %s are not links (%s): no new connection is accepted until they end. Stops "
                     "and e-stops still arrive on the stop line",
@@ -196,7 +196,7 @@ class _Flood:
         if strangers > most // 2:
             self._last = now
         over = now - self._last > _QUIET_S
-        if over and self._said:
+        if over and self._logged:
             _logger.warning("connections at port %s are accepted again (%s)", self._ports, self._sources(self._last))
         return over
 

@@ -271,9 +271,9 @@ class Links:
             return
         before, self._known = self._known, _dialled()
         changes = (("new", self._known - before), ("gone", before - self._known))
-        if said := "; ".join(f"{what} {', '.join(sorted(ips))}" for what, ips in changes if ips):
+        if changed := "; ".join(f"{what} {', '.join(sorted(ips))}" for what, ips in changes if ips):
             _logger.warning(
-                "the addresses of this host changed: %s. Those that dial a name, and discovery, find it there", said
+                "the addresses of this host changed: %s. Those that dial a name, and discovery, find it there", changed
             )
 
     def _ask_who(self, endpoint: str, wait_s: float, ended: Callable[[], bool]) -> _There:

@@ -130,11 +130,11 @@ class Condition(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, r
         return (self.above is None or value > self.above) and (self.below is None or value < self.below)
 
     def __str__(self) -> str:
-        said = [f"above {self.above:g}" if self.above is not None else ""]
-        said += [f"below {self.below:g}" if self.below is not None else ""]
-        said += [f"is {self.is_!r}" if self.is_ is not UNSET else ""]
+        conditions = [f"above {self.above:g}" if self.above is not None else ""]
+        conditions += [f"below {self.below:g}" if self.below is not None else ""]
+        conditions += [f"is {self.is_!r}" if self.is_ is not UNSET else ""]
         field = f", {self.field}" if self.field else ""
-        return " ".join(["the service with", f"{self.service.constraint()}{field}", *filter(None, said)])
+        return " ".join(["the service with", f"{self.service.constraint()}{field}", *filter(None, conditions)])
 
 
 def _picked(answer: Any, field: str) -> Any:
@@ -217,16 +217,16 @@ def _converted(raw: Any, kind: Any, where: str, joint: str) -> Any:
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
-        said = str(bad)
-    at = _AT.search(said)
+        message = str(bad)
+    at = _AT.search(message)
     path = at.group(1) if at else ""
     place = f"{where}{joint or ': '}{path}" if path else where
-    if missing := _MISSING.search(said):
+    if missing := _MISSING.search(message):
         key = missing.group(1)
         raise ConfigurationError(where=place, problem=f"{key} is missing; write {_EXAMPLES.get(key, key)}")
-    if unknown := _UNKNOWN.search(said):
+    if unknown := _UNKNOWN.search(message):
         raise ConfigurationError(where=place, problem=f"has no {unknown.group(1)!r}; {_known(path, kind)}")
-    raise ConfigurationError(where=place, problem=said[: at.start()] if at else said)
+    raise ConfigurationError(where=place, problem=message[: at.start()] if at else message)
 
 
 def _known(path: str, kind: Any) -> str:
@@ -245,11 +245,11 @@ class _Check:
 
     def all(self) -> None:
         rule = self._rule
-        said = [name for name in rule.when.__struct_fields__ if getattr(rule.when, name) is not None]
-        if len(said) != 1:
-            self._wrong("when", f"says {' and '.join(said) or 'nothing'}; it is exactly one: {_EXAMPLES['when']}")
+        given = [name for name in rule.when.__struct_fields__ if getattr(rule.when, name) is not None]
+        if len(given) != 1:
+            self._wrong("when", f"says {' and '.join(given) or 'nothing'}; it is exactly one: {_EXAMPLES['when']}")
         if rule.when.selection is not None:
-            self._selection(rule.when.selection, f"when.{said[0]}", known=None)
+            self._selection(rule.when.selection, f"when.{given[0]}", known=None)
         self._number("when.every_s", rule.when.every_s, SHORTEST_S, LONGEST_S)
         self._number("cooldown_s", rule.cooldown_s, 0.0, LONGEST_S)
         if (rule.when.missing or rule.when.present) is not None and rule.cooldown_s <= 0:

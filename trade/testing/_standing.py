@@ -36,10 +36,10 @@ class StandingConformance(ABC):
         with self.pair() as (one, other):
             ear = RecordingListener(other.announcements("shop/**"))
             meet(listener=other, speaker=one)
-            said = [Message(f"shop/{number % 7}/{number}", str(number).encode()) for number in range(2000)]
-            for message in said:
+            sent = [Message(f"shop/{number % 7}/{number}", str(number).encode()) for number in range(2000)]
+            for message in sent:
                 one.announce(message.key, message.payload or b"")
-            assert [ear.next() for _ in said] == said
+            assert [ear.next() for _ in sent] == sent
 
     def test_who_listens_later_hears_nothing_of_what_was_announced(self) -> None:
         with self.pair() as (one, other):

@@ -199,8 +199,8 @@ class SerialWire:
     def _wrong(self, key: str, problem: str) -> ConfigurationError:
         if not self._where:
             return ConfigurationError(where=self.path, problem=problem)
-        said = f"{self.path}: {problem}" if key == "port" else problem
-        return ConfigurationError(where=f"{self._where}.{key}", problem=said)
+        text = f"{self.path}: {problem}" if key == "port" else problem
+        return ConfigurationError(where=f"{self._where}.{key}", problem=text)
 
     def close(self) -> None:
         """Let go of the port; more than once is fine."""

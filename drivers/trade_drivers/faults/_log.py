@@ -169,7 +169,7 @@ class FaultLog:
         """Returns a short text with the device's faults; empty if there are none."""
         with self._lock:
             found = [entry for entry in self._entries.values() if entry.fault.open and entry.fault.device == device]
-            return max(found, key=lambda entry: entry.number).fault.said if found else ""
+            return max(found, key=lambda entry: entry.number).fault.summary if found else ""
 
     def save(self) -> None:
         """Starts to write changes to disk, at most once a second; does not wait."""

@@ -57,7 +57,7 @@ class FaultInfo(Struct, frozen=True, kw_only=True):
     """Findings that clients have attached, oldest first."""
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """The kind with the numbers of the latest occurrence."""
         text = self.text.removeprefix(f"{self.device}: ")
         return text if kind_of(text) == self.kind else self.kind

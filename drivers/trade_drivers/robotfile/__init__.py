@@ -210,8 +210,8 @@ def parse(text: str, where: str) -> Robot:
     try:
         raw = read_toml_text(text)
     except ValueError as bad:
-        said = _TWICE.sub(r'there are two of the name [\1."\2"]', str(bad))
-        raise ConfigurationError(where=where, problem=f"not valid TOML: {said}") from None
+        message = _TWICE.sub(r'there are two of the name [\1."\2"]', str(bad))
+        raise ConfigurationError(where=where, problem=f"not valid TOML: {message}") from None
     _only_known(raw, where)
     name = _robot_name(raw.get("robot"), where)
     buses = _tables(raw, "bus", where)

@@ -176,4 +176,4 @@ def _place(traceback: str, rest: str) -> list[str]:
 
 def _with_commands(error: BaseException) -> str:
     """The message, with remedies as commands."""
-    return error.message(at_terminal=True) if isinstance(error, TradeError) else str(error)
+    return error.text(at_terminal=True) if isinstance(error, TradeError) else str(error)

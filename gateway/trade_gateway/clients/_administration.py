@@ -198,8 +198,8 @@ class Administration:
                 done = do()
             except TradeError as error:
                 if not isinstance(error, AccessDenied):  # which the protocol audits
-                    said = str(error)
-                    self._container.note_asked(what, about, who=who, outcome=type(error).__name__, why=said)
+                    message = str(error)
+                    self._container.note_asked(what, about, who=who, outcome=type(error).__name__, why=message)
                 raise
             self._container.note_asked(what, about, who=who, why=why)
             return done

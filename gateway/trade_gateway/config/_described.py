@@ -98,11 +98,14 @@ def differences(file: Mapping[str, Any], runs: Mapping[str, Any]) -> Iterator[Di
         elif name not in file:
             yield Difference(container=name, file="is not named", runs="is supervised")
         else:
-            said, known = file[name], runs[name]
-            for key in dict.fromkeys((*said, *known)):
-                if said.get(key) != known.get(key):
+            wanted, known = file[name], runs[name]
+            for key in dict.fromkeys((*wanted, *known)):
+                if wanted.get(key) != known.get(key):
                     yield Difference(
-                        container=name, key=key, file=_shown(key, said.get(key)), runs=_shown(key, known.get(key))
+                        container=name,
+                        key=key,
+                        file=_shown(key, wanted.get(key)),
+                        runs=_shown(key, known.get(key)),
                     )
 
 

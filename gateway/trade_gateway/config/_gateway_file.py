@@ -226,8 +226,8 @@ class Plan(NamedTuple):
         named = read_policy(self.settings.policy).gateways
         if name in named:
             return ""
-        said = ", ".join(f'"{one}"' for one in (*named, name))
-        return f"does not name the gateway {name!r}, so containers refuse what it forwards; write gateways = [{said}]"
+        listed = ", ".join(f'"{one}"' for one in (*named, name))
+        return f"does not name the gateway {name!r}, so containers refuse what it forwards; write gateways = [{listed}]"
 
     def check_here(self, where: Path) -> None:
         """Checks that each network listens at addresses of its own interface, as far as this host has them.
@@ -363,18 +363,18 @@ def _check_proof(file: GatewayFile, part: GatewayFile | Share, where: str, words
         raise ConfigurationError(where=f"{where}tls", problem=problem)
 
 
-def _explained(said: str, raw: Mapping[str, Any], where: str) -> ConfigurationError:
-    at = _AT.search(said)
+def _explained(message: str, raw: Mapping[str, Any], where: str) -> ConfigurationError:
+    at = _AT.search(message)
     path = at.group(1) if at else ""
     prefix = _named(path, raw)
-    if missing := _MISSING.search(said):
+    if missing := _MISSING.search(message):
         key = missing.group(1)
         return ConfigurationError(where=f"{where}: {prefix}{key}", problem=f"missing; write {_EXAMPLES.get(key, key)}")
-    if unknown := _UNKNOWN.search(said):
+    if unknown := _UNKNOWN.search(message):
         kind = _KINDS.get(prefix.partition(".")[0], GatewayFile)
         problem = f"unknown key; there is {', '.join(kind.__struct_encode_fields__)}"
         return ConfigurationError(where=f"{where}: {prefix}{unknown.group(1)}", problem=problem)
-    return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=said[: at.start()] if at else said)
+    return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=message[: at.start()] if at else message)
 
 
 def _fits(part: object, kind: type[Struct] | None) -> bool:

@@ -21,23 +21,23 @@ def as_gateway(path: Path, text: str, raw: Mapping[str, Any]) -> Mapping[str, An
     system = raw.get("system")
     if not isinstance(system, dict):
         return raw
-    said, tables = cast("dict[str, Any]", system), raw.get("container")
-    if not said.get("supervisor"):
+    settings, tables = cast("dict[str, Any]", system), raw.get("container")
+    if not settings.get("supervisor"):
         problem = 'this is a system file; run `trade system up`, or write supervisor = "keeper" here'
         raise ConfigurationError(where=at(path, text, ("system",), ""), problem=problem)
-    own = {key: said[key] for key in _OF_GATEWAY if key in said}
-    defaults = {"connect": said["connect"]} if said.get("connect") else {}
+    own = {key: settings[key] for key in _OF_GATEWAY if key in settings}
+    defaults = {"connect": settings["connect"]} if settings.get("connect") else {}
     containers = {
         name: {**defaults, **table}
         for name, table in (cast("dict[str, Any]", tables) if isinstance(tables, dict) else {}).items()
         if is_supervised(table)
     }
-    return {"system": said.get("name"), "name": said.get("supervisor"), **own, "container": containers}
+    return {"system": settings.get("name"), "name": settings.get("supervisor"), **own, "container": containers}
 
 
 def is_supervised(table: object) -> bool:
     """Whether a table of a system file with a supervisor is one of its containers."""
     if not isinstance(table, dict):
         return True  # the reader of tables refuses it
-    said = cast("dict[str, Any]", table)
-    return said.get("host", LOCAL) == LOCAL and not said.get("gateway")
+    entry = cast("dict[str, Any]", table)
+    return entry.get("host", LOCAL) == LOCAL and not entry.get("gateway")

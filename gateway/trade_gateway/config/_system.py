@@ -137,9 +137,9 @@ class _WithGateways(Tables):
         file = self.beside(entry.gateway)
         with self.about(name, entry):
             settings = read_gateway_file(file).settings
-        for key, said, wanted in (
+        for key, actual, wanted in (
             ("name", settings.container, name),
             ("system", settings.system, self.defaults.system),
         ):
-            if said != wanted:
-                self.refuse(name, "gateway", f"{file} has {key} = {said!r}; here it is {wanted!r}")
+            if actual != wanted:
+                self.refuse(name, "gateway", f"{file} has {key} = {actual!r}; here it is {wanted!r}")

@@ -208,22 +208,22 @@ class Tables:
         return ["--system", self.defaults.system, *dialled, *does]
 
     def _http_words(self, entry: Entry) -> list[str]:
-        said = entry.http or HttpSpec()
-        options = {"--listen": [said.listen], "--origin": said.origins, "--host": said.hosts}
-        options["--ask-first"] = said.ask_first
-        for option, named in (("--tokens", said.tokens), ("--tls", said.tls), ("--twin", said.twin)):
+        spec = entry.http or HttpSpec()
+        options = {"--listen": [spec.listen], "--origin": spec.origins, "--host": spec.hosts}
+        options["--ask-first"] = spec.ask_first
+        for option, named in (("--tokens", spec.tokens), ("--tls", spec.tls), ("--twin", spec.twin)):
             options[option] = [self._path(entry, named)] if named else []
-        return [*_options(options), "--mcp"] if said.mcp else _options(options)
+        return [*_options(options), "--mcp"] if spec.mcp else _options(options)
 
     def _record_words(self, entry: Entry) -> list[str]:
-        said = entry.record or RecordSpec(folder=".")
-        rates = {"--hz": said.hz, "--camera-hz": said.camera_hz, "--service-hz": said.service_hz}
-        options: dict[str, Sequence[str]] = {"--group": said.groups, "--services": said.services}
+        spec = entry.record or RecordSpec(folder=".")
+        rates = {"--hz": spec.hz, "--camera-hz": spec.camera_hz, "--service-hz": spec.service_hz}
+        options: dict[str, Sequence[str]] = {"--group": spec.groups, "--services": spec.services}
         options |= {option: [f"{hz:g}"] for option, hz in rates.items() if hz is not None}
-        folder = self._path(entry, said.folder)
-        if said.keep_last_s is None:
+        folder = self._path(entry, spec.folder)
+        if spec.keep_last_s is None:
             return [f"{folder}/", *_options(options)]
-        return [*_options(options), "--keep-last", f"{said.keep_last_s:g}", "--at-fault", folder]
+        return [*_options(options), "--keep-last", f"{spec.keep_last_s:g}", "--at-fault", folder]
 
     def _path(self, entry: Entry, named: str) -> str:
         return str(self.beside(named)) if entry.is_local else named
@@ -288,15 +288,15 @@ def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tupl
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
-        said = str(bad)
-    place = _AT.search(said)
+        message = str(bad)
+    place = _AT.search(message)
     inside = place.group(1) if place else ""
     key = re.split(r"[.\[]", inside, maxsplit=1)[0]
     fields = INSIDE.get(key, kind).__struct_encode_fields__
-    problem = said[: place.start()] if place else said
-    if unknown := _UNKNOWN.search(said):
+    problem = message[: place.start()] if place else message
+    if unknown := _UNKNOWN.search(message):
         key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"
-    elif missing := _MISSING.search(said):
+    elif missing := _MISSING.search(message):
         problem = f"{missing.group(1)} is missing"
     raise ConfigurationError(where=at(path, text, table, key), problem=problem)
 

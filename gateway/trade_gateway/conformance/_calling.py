@@ -23,8 +23,8 @@ def answers(stage: Stage) -> None:
         for value in [*values, "x" * 70_000]:
             for how in ({}, {"by_name": {"value": value}}):
                 args = () if how else (value,)
-                said = anna.result(stage.peer.place("echo"), "echo", *args, expires_ns=NEVER, **how)
-                require(said == value and type(said) is type(value), f"echo({value!r}) answered {said!r}"[:200])
+                answer = anna.result(stage.peer.place("echo"), "echo", *args, expires_ns=NEVER, **how)
+                require(answer == value and type(answer) is type(value), f"echo({value!r}) answered {answer!r}"[:200])
 
 
 @check("refuses-arguments", "Messages")
@@ -193,5 +193,5 @@ def forged(stage: Stage) -> None:
         dropped += [anna.call(arm, "turn", 0.1, key=key) for key in keys]
         require(anna.ask(arm, "echo", 1).status == Status.OK, "echo did not run")
         require(stage.turns(anna) == began, "a forged turn began")
-        said = [reply.status for call_id in dropped for reply in anna.answers(call_id)]
-        require(Status.OK not in said, "a forged call was answered as if it had run")
+        statuses = [reply.status for call_id in dropped for reply in anna.answers(call_id)]
+        require(Status.OK not in statuses, "a forged call was answered as if it had run")

@@ -127,11 +127,11 @@ class Stage:
         known = set(self.boots())
         log = self._folder / "peer.log"
         try:
-            with log.open("ab") as said:
+            with log.open("ab") as output:
                 process = subprocess.Popen(  # noqa: S603 - the container under test, as configured
                     self._command,
                     stdin=subprocess.DEVNULL,
-                    stdout=said,
+                    stdout=output,
                     stderr=subprocess.STDOUT,
                     env={**_without_settings(os.environ), **self.environment()},
                     start_new_session=True,  # it may be a shell, or start other processes: all of them are ended

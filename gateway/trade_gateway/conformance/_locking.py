@@ -67,8 +67,8 @@ def locks_shown(stage: Stage) -> None:
         [info] = found
         require(info.token == lock, "locks shows a token other than the granted one")
         require(list(info.resources) == _ARM, f"locks shows the resources {info.resources!r}")
-        said = (info.holder.identity, info.holder.session, info.holder.purpose)
-        require(said == ("anna", anna.session, "a check"), f"locks shows the holder {info.holder!r}")
+        shown = (info.holder.identity, info.holder.session, info.holder.purpose)
+        require(shown == ("anna", anna.session, "a check"), f"locks shows the holder {info.holder!r}")
         require(0 < info.left_s <= 20, f"locks shows that {info.left_s!r} s of a lease of 20 s are left")
         refused = error_of(bob.ask(arm, "turn", 0.1))
         require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")

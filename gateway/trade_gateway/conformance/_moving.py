@@ -13,8 +13,8 @@ def turns(stage: Stage) -> None:
     """A turn moves the arm, and is answered when the arm has arrived."""
     with stage.voice() as anna:
         goal_rad = stage.angle(anna) + (0.3 if stage.angle(anna) < 0 else -0.3)
-        said = anna.result(stage.peer.arm, "turn", goal_rad)
-        require(said == goal_rad and stage.angle(anna) == goal_rad, f"turn({goal_rad}) answered {said}")
+        answer = anna.result(stage.peer.arm, "turn", goal_rad)
+        require(answer == goal_rad and stage.angle(anna) == goal_rad, f"turn({goal_rad}) answered {answer}")
 
 
 @check("stops", "S07")

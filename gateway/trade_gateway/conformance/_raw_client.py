@@ -171,8 +171,8 @@ def body_of(reply: Reply, what: str) -> Any:
     """The result in an answer; raises NotHeld if it is an error."""
     if reply.status == Status.OK:
         return msgspec.msgpack.decode(reply.body)
-    said = f": {error_of(reply)}" if reply.status == Status.ERROR else ""
-    raise NotHeld(f"{what} was answered with status {reply.status}{said}")
+    detail = f": {error_of(reply)}" if reply.status == Status.ERROR else ""
+    raise NotHeld(f"{what} was answered with status {reply.status}{detail}")
 
 
 def error_of(reply: Reply) -> BaseException:

@@ -65,7 +65,7 @@ class Actor:
         """Whether it has not ended."""
         return self._process.poll() is None
 
-    def said(self, within_s: float) -> dict[str, Any]:
+    def read_message(self, within_s: float) -> dict[str, Any]:
         """Its next message; raises DrillFailed if there is none in time, or if it reports an error."""
         try:
             line = self._lines.get(timeout=within_s)
@@ -83,7 +83,7 @@ class Actor:
         if self._lines.empty():
             return ""
         try:
-            self.said(0.0)
+            self.read_message(0.0)
         except DrillFailed as failed:
             return failed.problem
         return ""

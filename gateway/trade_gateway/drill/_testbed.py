@@ -109,7 +109,7 @@ class Testbed:
         self._actors["link"] = self._actor(
             "link", ["trade_gateway.drill._tcp_relay", str(self._near), str(self._far)], {}
         )
-        to_near, to_far = self._actors["link"].said(UP_S)["ports"]
+        to_near, to_far = self._actors["link"].read_message(UP_S)["ports"]
         self._write_gateway("gateway", self._near, dials=to_far)
         self._write_gateway("lab", self._far, dials=to_near)
         for name in ("gateway", "lab", "driver"):
@@ -120,7 +120,7 @@ class Testbed:
         orders = [self._order(scene, target) for target in targets]
         words = ["trade_gateway.drill._caller", msgspec.json.encode(orders).decode()]
         caller = self._actors["caller"] = self._actor("caller", words, self._settings("caller", self._far))
-        caller.said(UP_S)
+        caller.read_message(UP_S)
         return caller
 
     def strike(self, scene: Scene, targets: Sequence[Target]) -> float:
@@ -179,7 +179,7 @@ class Testbed:
         words = self._driver if name == "driver" else ["gateway", str(self._folder / f"{name}.toml"), "--json"]
         settings = self._settings("driver", self._near) if name == "driver" else self._places(name)
         self._actors[name] = actor = self._actor(name, ["trade_gateway", "--with-stdin", *words], settings)
-        actor.said(UP_S)
+        actor.read_message(UP_S)
 
     def _actor(self, name: str, words: Sequence[str], settings: dict[str, str]) -> Actor:
         return Actor(name, words, {**bare_environment(), **settings}, self._folder / f"{name}.complaints")

@@ -301,8 +301,8 @@ def _operation(
     status: str = "200",
 ) -> Schema:
     asked = {"requestBody": _json(_ref(body), required=needed)} if body else {}
-    said = {"operationId": name, "summary": summary, "tags": [_TAG]}
-    return {**said, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
+    operation = {"operationId": name, "summary": summary, "tags": [_TAG]}
+    return {**operation, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
 
 
 def _responses(answer: Schema | None, status: str = "200") -> Schema:

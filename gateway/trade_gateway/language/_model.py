@@ -152,9 +152,9 @@ def _require_asked(sentence: str, phrase: Phrase, names: Iterable[str]) -> None:
     if is_question(sentence):
         problem = f"proposed an order ({phrase.means}) for a question. Nothing was done. Say an order in the imperative"
         raise _refused(sentence, problem)
-    said = _content(sentence)
+    spoken = _content(sentence)
     meant = set[str]().union(*map(_content, [*phrase.hear, *names]))
-    if not any(one == other or one[:_LEAST_SHARED] == other[:_LEAST_SHARED] for one in said for other in meant):
+    if not any(one == other or one[:_LEAST_SHARED] == other[:_LEAST_SHARED] for one in spoken for other in meant):
         problem = f"proposed an order ({phrase.means}) that the sentence does not ask for. Nothing was done"
         raise _refused(sentence, problem)
 

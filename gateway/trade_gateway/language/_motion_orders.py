@@ -6,7 +6,7 @@ from itertools import repeat
 from typing import Final
 
 from trade import where
-from trade_gateway.language._names import groups_named, one_group, resources, said
+from trade_gateway.language._names import groups_named, in_words, one_group, resources
 from trade_gateway.language._requests import (
     PURPOSE,
     Ambiguous,
@@ -40,7 +40,7 @@ def _lock(asker: Asker, gaps: Gaps) -> Plan:
     def do() -> Answer:
         taken = asker.container.lock(group, purpose=PURPOSE, wait_s=_LOCK_WAIT_S).acquire()
         asker.locks.append(taken)
-        return Answer(len(taken.resources), {"count": len(taken.resources), "report": said(taken.resources)}, group)
+        return Answer(len(taken.resources), {"count": len(taken.resources), "report": in_words(taken.resources)}, group)
 
     return Plan(f"lock {group}", do, confirm=False)
 
@@ -48,13 +48,13 @@ def _lock(asker: Asker, gaps: Gaps) -> Plan:
 def _release(asker: Asker, gaps: Gaps) -> Plan:
     _require_locks(asker)
     words = gaps.get("group", "")
-    held = [(said(lock.resources), lock) for lock in asker.locks]
+    held = [(in_words(lock.resources), lock) for lock in asker.locks]
     if words and words not in [name for name, _ in held]:
         group = one_group(asker, words)
         used = resources(asker.container.services(where(group=group)))
         held = [(name, lock) for name, lock in held if not used.isdisjoint(lock.resources)]
         if not held:
-            mine = "; ".join(said(lock.resources) for lock in asker.locks)
+            mine = "; ".join(in_words(lock.resources) for lock in asker.locks)
             raise Unknown(f"I hold no lock of {group}. I hold {mine}")
     elif words:
         held = [(name, lock) for name, lock in held if name == words]
@@ -72,7 +72,7 @@ def _release(asker: Asker, gaps: Gaps) -> Plan:
 
 def _release_all(asker: Asker, _gaps: Gaps) -> Plan:
     _require_locks(asker)
-    names = said([said(lock.resources) for lock in asker.locks])
+    names = in_words([in_words(lock.resources) for lock in asker.locks])
 
     def do() -> Answer:
         while asker.locks:
@@ -101,13 +101,13 @@ def _stop(asker: Asker, gaps: Gaps) -> Plan:
             reports = list(at_once.map(asker.container.stop, groups, repeat(gaps.get("reason", PURPOSE))))
         stopped = sorted({name for report in reports for name in report.stopped})
         failed = {name: why for report in reports for name, why in report.failed.items()}
-        shown = [f"stopped: {said(stopped)}"] if stopped else []
+        shown = [f"stopped: {in_words(stopped)}"] if stopped else []
         shown += [f"FAILED: {name}: {why}" for name, why in sorted(failed.items())]
         empty = [report.group for report in reports if not (report.stopped or report.failed)]
         shown += [f"FAILED: {group} has nothing that can be stopped" for group in empty]
         return Answer(len(stopped), {"count": len(stopped), "report": "; ".join(shown)}, reports)
 
-    return Plan(f"stop {said(groups)}", do, confirm=False, stops=True)
+    return Plan(f"stop {in_words(groups)}", do, confirm=False, stops=True)
 
 
 def _estop(asker: Asker, gaps: Gaps) -> Plan:
@@ -115,7 +115,7 @@ def _estop(asker: Asker, gaps: Gaps) -> Plan:
         report = asker.container.estop(gaps.get("reason", "requested in a sentence"))
         troubles = [f"{name} did not answer" for name in report.missing]
         troubles += [f"{name} failed: {why}" for name, why in report.failed.items()]
-        shown = f"confirmed by {said(report.confirmed) or 'none'}{'; ' if troubles else ''}{'; '.join(troubles)}"
+        shown = f"confirmed by {in_words(report.confirmed) or 'none'}{'; ' if troubles else ''}{'; '.join(troubles)}"
         count = len(report.confirmed)
         return Answer(count, {"count": count, "report": shown, "id": report.id}, report)
 
@@ -127,7 +127,7 @@ def _resume(asker: Asker, gaps: Gaps) -> Plan:
 
     def do() -> Answer:
         resumed = sorted(asker.container.resume(group))
-        return Answer(len(resumed), {"count": len(resumed), "report": said(resumed)}, resumed)
+        return Answer(len(resumed), {"count": len(resumed), "report": in_words(resumed)}, resumed)
 
     return Plan(f"let {group} move again", do)
 
@@ -140,10 +140,10 @@ def _clear(asker: Asker, _gaps: Gaps) -> Plan:
     def do() -> Answer:
         report = asker.container.estop_clear(ids)
         troubles = [*report.missing, *report.failed]
-        shown = f"{said(ids)}{f'; not in {said(troubles)}' if troubles else ''}"
+        shown = f"{in_words(ids)}{f'; not in {in_words(troubles)}' if troubles else ''}"
         return Answer(len(ids), {"count": len(ids), "report": shown}, report)
 
-    return Plan(f"clear e-stop {said(ids)}", do)
+    return Plan(f"clear e-stop {in_words(ids)}", do)
 
 
 MOTION_ORDERS: Final[Mapping[str, Request]] = {

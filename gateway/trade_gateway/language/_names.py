@@ -8,7 +8,7 @@ from trade import Container, ContainerInfo, Handle, where
 from trade_gateway.language._requests import Ambiguous, Answer, Asker, Gaps, Unknown
 
 __all__ = ["Place", "groups_named", "matching", "names", "one_container", "one_group", "one_of", "others", "place"]
-__all__ += ["provider_of", "resources", "said"]
+__all__ += ["in_words", "provider_of", "resources"]
 
 _SPLIT: Final = re.compile(r"[\s._]+")
 _SPLIT_WIDE: Final = re.compile(r"[\s._-]+")
@@ -77,7 +77,7 @@ def provider_of(asker: Asker, words: str) -> Handle:
     groups = sorted({name for handle in providers.values() for name in handle.groups})
     if len(groups) > 1:
         raise Ambiguous("group", groups)
-    where_ = said(sorted(f"one in container {handle.container}" for handle in providers.values()))
+    where_ = in_words(sorted(f"one in container {handle.container}" for handle in providers.values()))
     raise Unknown(f"{group} has {len(providers)} providers, {where_}. `trade migrate` takes the name of one of them")
 
 
@@ -101,7 +101,7 @@ def _ending(words: str, handles: Sequence[Handle], named: Callable[[Handle], Ite
         if found := _with(form, handles, named):
             return found
     known = sorted({name for handle in handles for name in named(handle)})
-    raise Unknown(f"I know no {kind} {words!r}; there is {said(known) or 'none'}")
+    raise Unknown(f"I know no {kind} {words!r}; there is {in_words(known) or 'none'}")
 
 
 def _forms(text: str) -> list[list[str]]:
@@ -140,7 +140,7 @@ def place(asker: Asker, words: str | None) -> Place:
     found = exact or found
     if not found:
         known = {f"container {info.name}" for info in infos} | {f"host {info.host}" for info in infos}
-        raise Unknown(f"I know no container or host {words!r}; there is {said(sorted(known)) or 'none'}")
+        raise Unknown(f"I know no container or host {words!r}; there is {in_words(sorted(known)) or 'none'}")
     if len({one.containers for one in found}) > 1:
         raise Ambiguous("place", [one.text for one in found])
     return found[0]
@@ -171,7 +171,7 @@ def one_of(kind: str, words: str | None, known: Iterable[str]) -> str:
     for name in every:
         if name.lower() == words.lower():
             return name
-    raise Unknown(f"I know no {kind} {words!r}; there is {said(every) or 'none'}")
+    raise Unknown(f"I know no {kind} {words!r}; there is {in_words(every) or 'none'}")
 
 
 # --- in answers
@@ -179,10 +179,10 @@ def one_of(kind: str, words: str | None, known: Iterable[str]) -> str:
 
 def names(every: Sequence[str]) -> Answer:
     """An answer that is a list of names."""
-    return Answer(len(every), {"count": len(every), "names": said(every)}, list(every))
+    return Answer(len(every), {"count": len(every), "names": in_words(every)}, list(every))
 
 
-def said(every: Sequence[str]) -> str:
+def in_words(every: Sequence[str]) -> str:
     """Names as text; if there are many, the first ones and the number of the others."""
     shown = every if len(every) <= _NAMED else every[: _NAMED - 2]
     return ", ".join(shown) + (f" and {len(every) - len(shown)} more" if len(every) > len(shown) else "")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from trade import Container, Handle, Outcome, where
-from trade_gateway.language._names import one_container, place, provider_of, said
+from trade_gateway.language._names import in_words, one_container, place, provider_of
 from trade_gateway.language._requests import (
     PURPOSE,
     Ambiguous,
@@ -33,7 +33,7 @@ def _functions(asker: Asker, name: str, containers: Sequence[str]) -> list[Handl
     found = asker.container.services(where(name=name, group="trade") & ~where.local)
     found = [permitted(asker.container, handle) for handle in found if handle.container in containers]
     if not found:
-        raise Unknown(f"no container offers trade.{name}{f' of {said(containers)}' if containers else ''}")
+        raise Unknown(f"no container offers trade.{name}{f' of {in_words(containers)}' if containers else ''}")
     return found
 
 
@@ -43,7 +43,7 @@ def _done(outcomes: Sequence[Outcome]) -> Answer:
     failed = {outcome.handle.container: str(outcome.error) for outcome in outcomes if not outcome.ok}
     if failed and not done:
         raise next(outcome.error for outcome in outcomes if outcome.error is not None)
-    shown = [said(sorted(done)), *(f"it failed in {name}: {why}" for name, why in sorted(failed.items()))]
+    shown = [in_words(sorted(done)), *(f"it failed in {name}: {why}" for name, why in sorted(failed.items()))]
     return Answer(len(done), {"count": len(done), "report": "; ".join(shown)}, {"done": sorted(done), "failed": failed})
 
 
@@ -54,7 +54,7 @@ def _switch(name: str, *, on: bool) -> Callable[[Asker, Gaps], Plan]:
     def plan(asker: Asker, gaps: Gaps) -> Plan:
         there = place(asker, gaps.get("place"))
         asked = _functions(asker, f"set_{name}", [info.name for info in there.containers])
-        containers = said(sorted(handle.container for handle in asked))
+        containers = in_words(sorted(handle.container for handle in asked))
         shall = f"turn {'on' if on else 'off'} {name} in {containers}"
         return Plan(shall, lambda: _done(asker.container.call_all(asked, on)))
 
@@ -100,7 +100,7 @@ def _instantiate(asker: Asker, gaps: Gaps) -> Plan:
     def do() -> Answer:
         made = asked(kind, (), groups)
         labels = sorted(handle.label for handle in made)
-        return Answer(len(labels), {"count": len(labels), "report": said(labels)}, labels)
+        return Answer(len(labels), {"count": len(labels), "report": in_words(labels)}, labels)
 
     return Plan(f"create {kind} in container {there.name}{f' as {groups[0]}' if groups else ''}", do)
 
@@ -123,7 +123,7 @@ def _migrate(asker: Asker, gaps: Gaps) -> Plan:
     def do() -> Answer:
         moved = asker.container.migrate(provider, to=there.name)
         labels = sorted(handle.label for handle in moved)
-        return Answer(len(labels), {"count": len(labels), "report": f"{said(labels)} in {there.name}"}, labels)
+        return Answer(len(labels), {"count": len(labels), "report": f"{in_words(labels)} in {there.name}"}, labels)
 
     return Plan(f"move {name} from container {provider.container} to container {there.name}", do)
 
@@ -139,10 +139,10 @@ def _restart(asker: Asker, gaps: Gaps) -> Plan:
     if not found and failed is not None:
         raise failed
     if not found:
-        known = said([name for name, _ in children]) or "none"
+        known = in_words([name for name, _ in children]) or "none"
         raise Unknown(f"no gateway restarts {gaps['container']!r}; gateways here restart these containers: {known}")
     if len(found) > 1:
-        raise Unknown(f"several gateways restart {found[0][0]}: {said([gateway for _, gateway in found])}")
+        raise Unknown(f"several gateways restart {found[0][0]}: {in_words([gateway for _, gateway in found])}")
     [(name, gateway)] = found
     [restart] = _functions(asker, "restart_child", [gateway])[:1]
     return Plan(f"restart container {name} by gateway {gateway}", lambda: done(name, restart(name)))

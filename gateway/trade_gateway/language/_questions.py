@@ -8,7 +8,7 @@ from trade import where
 from trade._protocol.messages import HEALTHY
 from trade._timestamps import clock
 from trade.errors import AccessDenied, ConfigurationError
-from trade_gateway.language._names import matching, names, one_of, others, resources, said
+from trade_gateway.language._names import in_words, matching, names, one_of, others, resources
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
 
 _ARTICLES: Final = ("a", "an", "the", "my", "some")
@@ -34,7 +34,7 @@ def _hosts(asker: Asker, _gaps: Gaps) -> Answer:
 
 def _place(asker: Asker, gaps: Gaps) -> Answer:
     places = sorted({(handle.container, handle.host) for handle in matching(asker.container, gaps)})
-    shown = said([f"container {name} on host {host}" for name, host in places])
+    shown = in_words([f"container {name} on host {host}" for name, host in places])
     data = [{"container": name, "host": host} for name, host in places]
     return Answer(len(places), {"count": len(places), "places": shown}, data)
 
@@ -97,7 +97,7 @@ def _needs(asker: Asker, gaps: Gaps) -> Answer:
 
 
 def _sources(labels: list[str]) -> str:
-    return f"which {said(labels)} can achieve" if labels else "which no service achieves"
+    return f"which {in_words(labels)} can achieve" if labels else "which no service achieves"
 
 
 def _locks(asker: Asker, gaps: Gaps) -> Answer:
@@ -139,7 +139,7 @@ def _news(asker: Asker, _gaps: Gaps) -> Answer:
     if news is None:
         return Answer(1, {"count": 1, "news": "I have not looked before; from now on I know"}, None)
     came, gone = news
-    shown = [f"{word}: {said(labels)}" for word, labels in (("new", came), ("gone", gone)) if labels]
+    shown = [f"{word}: {in_words(labels)}" for word, labels in (("new", came), ("gone", gone)) if labels]
     count = len(came) + len(gone)
     return Answer(count, {"count": count, "news": "; ".join(shown)}, {"came": came, "gone": gone})
 

@@ -11,7 +11,7 @@ from trade import Handle, where
 from trade._protocol.messages import HEALTHY
 from trade._timestamps import clock
 from trade.auditing import AuditRow, reading, records_in
-from trade_gateway.language._names import matching, others, place, resources, said
+from trade_gateway.language._names import in_words, matching, others, place, resources
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
 
 _ROWS: Final = 5_000
@@ -53,7 +53,9 @@ def _stops(asker: Asker, found: Iterable[Handle], wanted: set[str]) -> list[str]
     for info in [info for outcome in answered for info in outcome.result]:
         if info.resource in wanted and not info.estop:
             stops.setdefault((info.by, info.reason), []).append(info.resource)
-    shown = [f"{by} stopped {said(sorted(names))}: {why}; `resume` lets it move" for (by, why), names in stops.items()]
+    shown = [
+        f"{by} stopped {in_words(sorted(names))}: {why}; `resume` lets it move" for (by, why), names in stops.items()
+    ]
     silent = addresses - {outcome.handle.key.address for outcome in answered}
     return shown + sorted(f"the stops in {address.container} are not known" for address in silent)
 
@@ -97,7 +99,7 @@ def _movers(asker: Asker, gaps: Gaps) -> Answer:
     domains = {handle.key.domain for handle in moved}
     able = [name for name in known if all(policy.decide(name, "call", domain).allowed for domain in domains)]
     own = asker.container.address.identity
-    text = f"by {policy.source}, {said(able) or 'no identity'} may. You are {own}{locked}"
+    text = f"by {policy.source}, {in_words(able) or 'no identity'} may. You are {own}{locked}"
     return Answer(len(able), {"count": len(able), "who": text}, able)
 
 
@@ -105,7 +107,7 @@ def _held(asker: Asker, wanted: set[str]) -> str:
     """Who has locked these, as an addition to a sentence."""
     locks = asker.container.lock_api.known().locks
     owners = sorted({info.holder.owner for info in locks if not wanted.isdisjoint(info.resources)})
-    return f". Now only {said(owners)} can, under a lock" if owners else ""
+    return f". Now only {in_words(owners)} can, under a lock" if owners else ""
 
 
 # --- what if
@@ -134,13 +136,13 @@ def _loss(asker: Asker, gaps: Gaps) -> Answer:
 
 
 def _parts(data: Mapping[str, Sequence[str]], kept: Sequence[str]) -> list[str]:
-    shown = [f"{'containers' if len(data['containers']) > 1 else 'container'} {said(data['containers'])}"]
+    shown = [f"{'containers' if len(data['containers']) > 1 else 'container'} {in_words(data['containers'])}"]
     if gone := data["services"]:
-        shown.append(f"{len(gone)} {'services' if len(gone) > 1 else 'service'}: {said(gone)}")
+        shown.append(f"{len(gone)} {'services' if len(gone) > 1 else 'service'}: {in_words(gone)}")
         if kept:
-            shown.append(f"another container also offers {said(kept)}")
+            shown.append(f"another container also offers {in_words(kept)}")
     if locks := data["locks"]:
-        shown.append(f"{'locks' if len(locks) > 1 else 'a lock'}: {said(locks)}")
+        shown.append(f"{'locks' if len(locks) > 1 else 'a lock'}: {in_words(locks)}")
     return shown
 
 

@@ -132,11 +132,11 @@ class Approvals:
         async with self._offering:
             await run_sync(self._offer, handle)
         now, name, loop = time.time(), secrets.token_hex(3), asyncio.get_running_loop()
-        said: asyncio.Future[str] = loop.create_future()
+        answered: asyncio.Future[str] = loop.create_future()
 
         def settle(verdict: str) -> None:
-            if not said.done():
-                said.set_result(verdict)
+            if not answered.done():
+                answered.set_result(verdict)
 
         request = Request(name, agent, handle.label, text, why[:_MOST_TEXT], now, now + wait_s)
         waiting = _Waiting(request, handle.key.domain, lambda verdict: _soon(loop, partial(settle, verdict)))
@@ -145,7 +145,7 @@ class Approvals:
                 raise NeedsApproval(service=handle.label, reason=f"{_MOST} requests wait already")
             self._waiting[name] = waiting
         try:
-            verdict = await asyncio.wait_for(said, wait_s)
+            verdict = await asyncio.wait_for(answered, wait_s)
         except asyncio.TimeoutError:
             verdict = f"it was not approved within {wait_s:g} s (`trade approvals` shows what waits)"
         finally:

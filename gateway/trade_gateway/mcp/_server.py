@@ -124,8 +124,8 @@ async def _reporting(server: "Server[Any, Any]") -> AsyncGenerator[Callable[[Any
             await more.wait()
             more.clear()
             count += 1
-            [said] = newest
-            text = said if isinstance(said, str) else messages.encoder.encode(said).decode()
+            [content] = newest
+            text = content if isinstance(content, str) else messages.encoder.encode(content).decode()
             await context.session.send_progress_notification(token, float(count), message=text)
 
     reporting = asyncio.ensure_future(report())  # not a task group: that would wrap the call's exceptions
@@ -140,9 +140,9 @@ def _content(result: Any) -> list[types.ContentBlock]:
     text = messages.encoder.encode(result).decode()
     match msgspec.json.decode(text):
         case {"result": {"format": ("jpeg" | "png") as kind, "data": str() as data, **rest}}:
-            said = messages.encoder.encode({"format": kind, **rest}).decode()
+            described = messages.encoder.encode({"format": kind, **rest}).decode()
             picture = types.ImageContent(type="image", data=data, mimeType=f"image/{kind}")
-            return [types.TextContent(type="text", text=said), picture]
+            return [types.TextContent(type="text", text=described), picture]
         case _:
             return [types.TextContent(type="text", text=text)]
 

@@ -101,7 +101,7 @@ class Twin:
         words = ["trade_gateway", "--with-stdin", "up", str(self._robot), "--sim", "--name", "twin", "--json"]
         self._process = Actor("twin", words, environment, self._folder / "complaints")
         try:
-            self._process.said(_UP_S)
+            self._process.read_message(_UP_S)
         except DrillFailed as failed:
             raise NoTwin(reason=failed.problem) from None
         own = Settings.read(system=self._system, container="tries", connect=[])

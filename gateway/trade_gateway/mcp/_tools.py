@@ -216,7 +216,7 @@ class Tools:
         stops = [one for one in self._api.seen(who, asked.group) if one.effect == "stop"]
         if not stops:
             raise NoSuchService(constraint=f"stop in {asked.group}")
-        said: dict[str, str] = {}
+        results: dict[str, str] = {}
 
         async def stop(handle: Handle) -> None:
             try:
@@ -224,14 +224,14 @@ class Tools:
                 run = await self._api.begin(self._client, handle, body, self._client.admit(handle))
                 await run.settled()
                 run.result(0)
-                said[handle.label] = "stopped"
+                results[handle.label] = "stopped"
             except Exception as error:  # noqa: BLE001 - the other stops must still run
-                said[handle.label] = f"{type(error).__name__}: {error}"
+                results[handle.label] = f"{type(error).__name__}: {error}"
 
         async with anyio.create_task_group() as tasks:
             for handle in stops:
                 tasks.start_soon(stop, handle)
-        return said
+        return results
 
     async def estop(self, asked: messages.EstopBody, _: Progress) -> Any:
         """Stop everything in the whole system. A person has to clear it. Not safety-rated."""

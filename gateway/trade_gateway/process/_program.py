@@ -40,8 +40,8 @@ def order(name: str, words: Sequence[str], folder: Path, log: Path, log_mb: floa
         grace_s: the time between SIGTERM and SIGKILL, in seconds.
     """
     most_bytes = int(log_mb * 1e6)
-    said = {"name": name, "words": list(words), "folder": str(folder), "log": str(log)}
-    return json.dumps({**said, "log_bytes": most_bytes, "grace_s": grace_s})
+    request = {"name": name, "words": list(words), "folder": str(folder), "log": str(log)}
+    return json.dumps({**request, "log_bytes": most_bytes, "grace_s": grace_s})
 
 
 class Log:
@@ -79,9 +79,9 @@ class Log:
 class _Program:
     """The program with its descendants."""
 
-    def __init__(self, said: dict[str, Any]) -> None:
-        self.log = Log(Path(said["log"]), said["log_bytes"])
-        self._name, self._grace_s = said["name"], said["grace_s"]
+    def __init__(self, request: dict[str, Any]) -> None:
+        self.log = Log(Path(request["log"]), request["log_bytes"])
+        self._name, self._grace_s = request["name"], request["grace_s"]
         self._selector = selectors.DefaultSelector()
         self._wake, wake = os.pipe()
         os.set_blocking(self._wake, False)
@@ -96,7 +96,7 @@ class _Program:
         self._output, output = os.pipe()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the file of the supervisor names it
-                said["words"], stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=said["folder"]
+                request["words"], stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=request["folder"]
             )
         finally:
             os.close(output)
@@ -201,12 +201,14 @@ def _end_like(status: int) -> None:
 
 def main() -> None:
     """Runs the program that the argument orders."""
-    said = json.loads(sys.argv[1])
+    request = json.loads(sys.argv[1])
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:
-        program = _Program(said)
+        program = _Program(request)
     except OSError as wrong:
-        Log(Path(said["log"]), said["log_bytes"]).say(f"{said['words'][0]} cannot be started: {wrong.strerror}")
+        Log(Path(request["log"]), request["log_bytes"]).say(
+            f"{request['words'][0]} cannot be started: {wrong.strerror}"
+        )
         sys.exit(_NOT_STARTED)
     _end_like(program.run())
 

@@ -334,9 +334,9 @@ def _read_description(entry: RobotEntry) -> None:
         raise ConfigurationError(where=entry.urdf, problem=f"cannot be read: {bad}") from None
 
 
-def _explained(path: Path, said: str) -> ConfigurationError:
-    found = _AT.search(said)
-    place, problem = (found.group(1), said[: found.start()]) if found else ("", said)
+def _explained(path: Path, message: str) -> ConfigurationError:
+    found = _AT.search(message)
+    place, problem = (found.group(1), message[: found.start()]) if found else ("", message)
     if missing := _MISSING.search(problem):
         place, problem = f"{place}.{missing.group(1)}".lstrip("."), "is missing"
     elif unknown := _UNKNOWN.search(problem):

@@ -52,16 +52,17 @@ def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | 
     Raises:
         Unacceptable: it has other joints, or points without angles.
     """
-    said: Sequence[str] = goal["trajectory"]["joint_names"]
-    if sorted(said) != sorted(names.trade_names):
-        problem = f"it is for {', '.join(said) or 'no joints'}, but must include exactly {', '.join(names.trade_names)}"
+    joint_names: Sequence[str] = goal["trajectory"]["joint_names"]
+    if sorted(joint_names) != sorted(names.trade_names):
+        given = ", ".join(joint_names) or "no joints"
+        problem = f"it is for {given}, but must include exactly {', '.join(names.trade_names)}"
         raise Unacceptable(INVALID_JOINTS, problem)
     if goal.get("multi_dof_trajectory", {}).get("points"):
         raise Unacceptable(INVALID_GOAL, "multi_dof_trajectory has points, but only joints of one axis are supported")
-    points = [_point(point, said) for point in goal["trajectory"]["points"]]
+    points = [_point(point, joint_names) for point in goal["trajectory"]["points"]]
     if not points:
         raise Unacceptable(INVALID_GOAL, "it has no points. To stop, cancel a goal or call the stop service")
-    joints = [names.trade_names[name] for name in said]
+    joints = [names.trade_names[name] for name in joint_names]
     if points[0]["time_from_start_s"] >= AT_ONCE_S:
         if here is None:
             raise Unacceptable(INVALID_GOAL, "its first point must be at 0 s")
@@ -101,8 +102,8 @@ def tolerances_of(goal: Message) -> dict[str, float]:
     """
     tolerances: dict[str, float] = {}
     for name, field in (("path_rad", "path_tolerance"), ("goal_rad", "goal_tolerance")):
-        if said := [one["position"] for one in goal[field] if one["position"] > 0]:
-            tolerances[name] = min(said)
+        if bounds := [one["position"] for one in goal[field] if one["position"] > 0]:
+            tolerances[name] = min(bounds)
     if (time_s := seconds(goal["goal_time_tolerance"])) > 0:
         tolerances["goal_time_s"] = time_s
     return tolerances

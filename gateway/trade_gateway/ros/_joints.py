@@ -41,8 +41,8 @@ class JointNames:
             if own not in joints:
                 problem = f"{own!r}, called {ros_name!r}, is not among {', '.join(joints)}"
                 raise ConfigurationError(where="joints", problem=problem)
-        said = {own: ros_name for ros_name, own in named.items()}
-        self.ros_names: Final = [said.get(own, own.rpartition(".")[2] if short else own) for own in joints]
+        renamed = {own: ros_name for ros_name, own in named.items()}
+        self.ros_names: Final = [renamed.get(own, own.rpartition(".")[2] if short else own) for own in joints]
         """In the order of the TRADE names."""
         if len(set(self.ros_names)) < len(joints):
             problem = f'two of {", ".join(joints)} would have one name. Set names = "full", or name them in joints'

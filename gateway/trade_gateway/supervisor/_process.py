@@ -136,8 +136,8 @@ class Process:
         if self._is_program and code < 0:  # perhaps it was killed, and has not ended what the program started
             _kill_marked(self._mark)
         words = self._last_words() if code > 0 or self._is_program else ""
-        said = f": {words}" if words else ""
-        return f"crashed (signal {-code}{said})" if code < 0 else f"ended (exit code {code}{said})"
+        detail = f": {words}" if words else ""
+        return f"crashed (signal {-code}{detail})" if code < 0 else f"ended (exit code {code}{detail})"
 
     def _forget(self) -> int:
         code = self._process.wait()

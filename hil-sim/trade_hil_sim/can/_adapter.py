@@ -33,7 +33,7 @@ class Tenant(Protocol):
         """A client that had joined has disconnected."""
         ...
 
-    def said(self, client: Client, frame: Frame, t: float) -> None:
+    def submitted(self, client: Client, frame: Frame, t: float) -> None:
         """A client wants a frame sent; it was read at `t` seconds (monotonic)."""
         ...
 

@@ -280,7 +280,7 @@ class CanBus(BusThread):
         self._wire.detach(self._clients.pop(client))
         self._note("left", time.monotonic(), source=client.name)
 
-    def said(self, client: Client, frame: Frame, t: float) -> None:
+    def submitted(self, client: Client, frame: Frame, t: float) -> None:
         """It sends a frame."""
         self._post(self._clients[client], frame, t)
 

@@ -208,7 +208,7 @@ class Hub:
         except SimulationError as problem:
             self._tenant.misunderstood(client, str(problem))
         else:
-            self._tenant.said(client, frame, t)
+            self._tenant.submitted(client, frame, t)
 
     def _drop(self, client: HubClient) -> None:
         if client in self._clients:

@@ -99,7 +99,7 @@ class Interface:
                 return
             head, length, payload = LAYOUT.unpack(data)
             if not head & ERROR:
-                self._tenant.said(self, _frame(head, length, payload), t)
+                self._tenant.submitted(self, _frame(head, length, payload), t)
 
     def tell_frame(self, frame: Frame, wall_s: float) -> bool:  # noqa: ARG002 - the system notes the time
         """Put a frame on it; False if it is lost."""

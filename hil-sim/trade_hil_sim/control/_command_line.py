@@ -37,8 +37,8 @@ def listing() -> str:
 
 def _described(kind: type[msgspec.Struct]) -> str:
     keys = " ".join(key for key in kind.__struct_fields__ if key != "bus")
-    said = (inspect.getdoc(kind) or "").splitlines()[0].replace("`", "")
-    return f"{said} [{keys}]" if keys else said
+    summary = (inspect.getdoc(kind) or "").splitlines()[0].replace("`", "")
+    return f"{summary} [{keys}]" if keys else summary
 
 
 def _pair(word: str) -> tuple[str, str]:

@@ -187,9 +187,9 @@ class SimProcess:
         if not line.endswith(b"\n"):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(0.5)
-            said = (self._own / "_stderr").read_text(errors="replace").strip()
+            output = (self._own / "_stderr").read_text(errors="replace").strip()
             state = "ended" if self._process.poll() is not None else f"was not ready after {ready_s:g} s"
-            raise SimulationError(f"the simulator {state}: {said or 'it said nothing'}")
+            raise SimulationError(f"the simulator {state}: {output or 'it said nothing'}")
         return msgspec.json.decode(line, type=Ready)
 
     def _first_line(self, deadline: float) -> bytes:

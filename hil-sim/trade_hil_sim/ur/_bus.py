@@ -203,7 +203,7 @@ class UrBus(BusThread):
     def _understand(self, client: Client) -> None:
         match self._clients[client]:
             case "rtde":
-                self._rtde.said(self._sessions[client], client.held)
+                self._rtde.received(self._sessions[client], client.held)
             case "dashboard":
                 for line in lines_in(client.held):
                     answer = self._dashboard.answer(line)

@@ -58,7 +58,7 @@ class Rtde:
         """A client has disconnected; others can set its fields."""
         self._sessions.remove(session)
 
-    def said(self, session: RtdeSession, held: bytearray) -> None:
+    def received(self, session: RtdeSession, held: bytearray) -> None:
         """Carry out the packets of a client.
 
         Raises:

@@ -233,7 +233,7 @@ def _ur_rtde(data: bytes) -> Any:
     held = bytearray()
     for at in range(1, len(data), 97):
         held += data[at : at + 97]
-        bus._rtde.said(session, held)
+        bus._rtde.received(session, held)
         for _ in range(3):
             bus.arm.advance(0.002)
             bus._program.cycle()

@@ -187,10 +187,10 @@ def test_a_fault_shows_its_latest_message_with_the_numbers(bench: Bench) -> None
         error = DeviceFault(device=PAN, bus="x", fault=f"it makes no progress, {short} rad short of its goal")
         bench.begin(*found_in(PAN, error))
         said = f"it makes no progress, {short} rad short of its goal"
-        assert (only(log).said, log.health(PAN)) == (said, said)
+        assert (only(log).summary, log.health(PAN)) == (said, said)
         bench.end(*found_in(PAN, error))
     bench.begin(*found_in(PAN, DeviceSilent(device=PAN, bus="x", waited_s=0.3)))
-    assert ([info.said for info in log.faults(open_only=True)], log.health(PAN)) == (["silent"], "silent")
+    assert ([info.summary for info in log.faults(open_only=True)], log.health(PAN)) == (["silent"], "silent")
     assert len(log.faults()) == 2
 
 

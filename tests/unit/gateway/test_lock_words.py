@@ -85,9 +85,9 @@ def _errors() -> list[TradeError]:
 @pytest.mark.parametrize("error", _errors(), ids=lambda error: type(error).__name__)
 def test_no_advice_at_a_terminal_names_python(error: TradeError) -> None:
     python = re.compile(r"trade\.[a-z_]+\(|with_\(|partial=")
-    assert "`trade " in error.message(at_terminal=True) or " --" in error.message(at_terminal=True)
-    assert not python.search(error.message(at_terminal=True))
-    assert str(error) == error.message()
+    assert "`trade " in error.text(at_terminal=True) or " --" in error.text(at_terminal=True)
+    assert not python.search(error.text(at_terminal=True))
+    assert str(error) == error.text()
     assert python.search(str(error)) or "`trade estop" in str(error)
 
 

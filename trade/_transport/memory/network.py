@@ -208,7 +208,7 @@ class Network:
                 question.send()
             self.changed.wait_for(lambda: source.closed or all(question.ended for question in questions), timeout_s)
             _check_open(source)
-            return [question.said for question in questions if question.said.messages]
+            return [question.collected for question in questions if question.collected.messages]
 
     def linked(self, one: Node, other: Node) -> bool:
         """Whether a link between two open nodes is up."""

@@ -15,7 +15,7 @@ class MemoryQuestion(Question):
     """One query to one node."""
 
     def __init__(self, network: "Network", source: Node, target: Node, pattern: str, asked: MemoryQuestions) -> None:
-        self.said = Answer(f"{target.name}-{network.next_number()}", [])
+        self.collected = Answer(f"{target.name}-{network.next_number()}", [])
         self._network = network
         self._source = source
         self._target = target
@@ -46,7 +46,7 @@ class MemoryQuestion(Question):
                     self._target,
                     self._source,
                     message,
-                    lambda: self.said.messages.append(message),
+                    lambda: self.collected.messages.append(message),
                     at_once=True,
                 )
 

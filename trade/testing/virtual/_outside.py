@@ -23,8 +23,8 @@ def _audit(event: str, args: tuple[Any, ...]) -> None:
     if not _running or (event not in _PROCESSES and event != _CONNECT) or not _running[0].knows_this_thread():
         return
     if event in _PROCESSES:
-        said = _words(args) if event == "subprocess.Popen" else event
-        raise VirtualTimeError(f"a process was started ({said}): virtual time has threads of this process only")
+        what = _words(args) if event == "subprocess.Popen" else event
+        raise VirtualTimeError(f"a process was started ({what}): virtual time has threads of this process only")
     if isinstance(args[1], tuple) and not str(cast("tuple[Any, ...]", args[1])[0]).startswith(
         ("127.", "::1", "localhost")
     ):

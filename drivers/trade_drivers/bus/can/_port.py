@@ -166,8 +166,8 @@ class CanPort:
                 heard.setdefault(frame.id, []).append(frame.data)
         self.talk = Talk(heard)
         if orders := self._orders(self.talk):
-            said = ", ".join(f"{one:03X}h" for one in sorted(orders))
-            problem = f"{self.path}: another driver commands the devices of this bus (it sends {said}); stop it first"
+            ids = ", ".join(f"{one:03X}h" for one in sorted(orders))
+            problem = f"{self.path}: another driver commands the devices of this bus (it sends {ids}); stop it first"
             raise self._wrong("channel", problem)
 
     def _look_over(self) -> None:

@@ -65,11 +65,11 @@ class SendQueue:
             with suppress(OSError):
                 link = look_at(self._channel)
                 state, queue = link.state, f"the send queue of {self._channel} (txqueuelen {link.queue})"
-        said = f"{queue} has been full for {self._patience_s * 1e3:.0f} ms"
+        text = f"{queue} has been full for {self._patience_s * 1e3:.0f} ms"
         if state is not None:
-            said += f"; the bus is {state.word}"
+            text += f"; the bus is {state.word}"
         alone = "nothing acknowledges its frames: check the power of its devices, cable, bit rate and terminations"
         if unheard or (state or ErrorState.ACTIVE) >= ErrorState.PASSIVE:
-            return PortFull(f"{said}; {alone}")
+            return PortFull(f"{text}; {alone}")
         longer = f"`sudo ip link set {self._channel} txqueuelen {_ENOUGH}`, or " if self._system else ""
-        return PortFull(f"{said}; it is too short: {longer}a lower rate_hz; or {alone}")
+        return PortFull(f"{text}; it is too short: {longer}a lower rate_hz; or {alone}")

@@ -88,9 +88,9 @@ class MotorAxis(Axis):
         at_ns = now_ns if self.hushed else asked_ns
         values = (position, velocity, effort)
         if not all(isfinite(value) and abs(value) <= _LARGEST for value in values):
-            said = ", ".join(f"{value:.6g}" for value in values)
+            given = ", ".join(f"{value:.6g}" for value in values)
             self.why_silent = (
-                f"it reports an impossible position, speed or effort ({said}, in its driver's counts), as while its "
+                f"it reports an impossible position, speed or effort ({given}, in its driver's counts), as while its "
                 "encoder is not ready; check its encoder and calibration"
             )
             return

@@ -51,7 +51,7 @@ class Scale(NamedTuple):
 
     counts_per_rev: float | None
     """Counts for one turn of the motor; None if it says nothing."""
-    said: str
+    source: str
     """The objects that say it, with their values."""
     gear: float
     """Turns of the motor for one of the shaft, which angles refer to."""
@@ -72,7 +72,7 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
     if scale.counts_per_rev is not None and not isclose(scale.counts_per_rev, counts, rel_tol=_SAME):
         raise Unfit(
             f"the robot file has {counts:.9g} counts for a turn of the motor, the drive {scale.counts_per_rev:.9g} "
-            f"({scale.said}); correct the one that is wrong",
+            f"({scale.source}); correct the one that is wrong",
             ".counts_per_rev",
         )
     polarity = yield from read_optional(net, axis.id, table.POLARITY)
@@ -143,10 +143,10 @@ def _ratio(net: Net, node: int, entries: tuple[Entry, Entry]) -> Answer[tuple[fl
     if above is None:
         return None
     below = (yield from read_optional(net, node, entries[1])) or 0
-    said = f"{entries[0].index:04X}h = {above}/{below}"
+    source = f"{entries[0].index:04X}h = {above}/{below}"
     if not above or not below:
-        raise Unfit(f"its scale is impossible: {said}; set this object of the drive to what is true")
-    return above / below, said
+        raise Unfit(f"its scale is impossible: {source}; set this object of the drive to what is true")
+    return above / below, source
 
 
 def _converted(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> float:

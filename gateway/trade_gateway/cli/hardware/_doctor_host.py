@@ -92,13 +92,16 @@ def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
 def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
     """Checks whether the clock is synchronised; certificates, logs and traces need it, motion does not."""
     try:
-        said = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False).stdout.strip()  # noqa: S603 - ours
+        ran = subprocess.run(  # noqa: S603 - ours
+            command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False
+        )
+        answer = ran.stdout.strip()
     except (OSError, subprocess.TimeoutExpired):
-        said = ""
+        answer = ""
     fix = "sudo timedatectl set-ntp true; without a network, let one host serve the time to the others (chrony)"
-    if said == "yes":
+    if answer == "yes":
         yield Finding(level="ok", about="clock", text="is synchronised")
-    elif said == "no":
+    elif answer == "no":
         text = "is not synchronised: certificates may seem invalid, and the logs of hosts do not match"
         yield Finding(level="warning", about="clock", text=text, fix=fix)
     else:

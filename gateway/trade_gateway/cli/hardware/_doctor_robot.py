@@ -202,13 +202,13 @@ def _of_device(bench: Bench, device: Joint | Gripper, bus: SerialBus) -> Finding
 
 def _identity(about: str, device: Joint | Gripper, found: Found) -> Finding:
     firmware = device.firmware if isinstance(device, Joint) else None
-    for key, expected, said in (("model", device.model, found.model), ("firmware", firmware, found.firmware)):
-        if expected is not None and expected != said:
-            text = f"its {key} is {said}, and the robot file says {expected}"
+    for key, expected, actual in (("model", device.model, found.model), ("firmware", firmware, found.firmware)):
+        if expected is not None and expected != actual:
+            text = f"its {key} is {actual}, and the robot file says {expected}"
             fix = f"attach the intended device, or correct {key} and calibrate it"
             return Finding(level="error", about=about, text=text, fix=fix)
-    said = f"{found.model}, firmware {found.firmware}," if found.firmware else found.model
-    return Finding(level="ok", about=about, text=f"{said} answers")
+    identity = f"{found.model}, firmware {found.firmware}," if found.firmware else found.model
+    return Finding(level="ok", about=about, text=f"{identity} answers")
 
 
 def controllers(robot: Robot) -> Iterator[Finding]:

@@ -134,15 +134,15 @@ def _angle_rad(joint: Joint, count: float) -> float:
 def _remarks(joint: Joint, motor: Calibrated, *, reversed_inside: bool) -> list[str]:
     middle_rad = _angle_rad(joint, (motor.range_min + motor.range_max) / 2)
     pose = f"{joint.name}: 0 rad is count {_CENTRE}, the pose in which LeRobot took its homing offset"
-    said = [f"{pose}; its degrees count from the middle of the range, at {middle_rad:.4f} rad"]
+    notes = [f"{pose}; its degrees count from the middle of the range, at {middle_rad:.4f} rad"]
     if (motor.range_min, motor.range_max) == (0, _LAST):
-        said.append(
+        notes.append(
             f"{joint.name}: its range is a whole turn. If it has mechanical ends, it passed the end of its encoder "
             f"while it was recorded: measure its range with `trade calibrate`"
         )
     if motor.drive_mode and not reversed_inside and not joint.reversed:
-        said.append(f"{joint.name}: LeRobot counts it in the opposite direction; `reversed = true` does the same here")
-    return said
+        notes.append(f"{joint.name}: LeRobot counts it in the opposite direction; `reversed = true` does the same here")
+    return notes
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -93,10 +93,10 @@ def _joint(one: Found) -> list[str]:
     ]
 
 
-def _counts_per_rev(said: float | None) -> str:
-    if said is None:
+def _counts_per_rev(reported: float | None) -> str:
+    if reported is None:
         return "counts_per_rev = 4096   # encoder counts per motor turn: see the data sheet"
-    return f"counts_per_rev = {said:.12g}   # per motor turn, as the drive says"
+    return f"counts_per_rev = {reported:.12g}   # per motor turn, as the drive says"
 
 
 def _gripper(one: Found) -> list[str]:

@@ -67,9 +67,11 @@ def detached(words: Sequence[str], settings: Settings, environment: Mapping[str,
         return msgspec.json.decode(_first_line(reported, process), type=Started)
     except msgspec.DecodeError:
         _end(process)
-        said = as_text(log.read_text(errors="replace")).strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
+        complaint = (
+            as_text(log.read_text(errors="replace")).strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
+        )
         here, why = socket.gethostname(), "it did not come up"
-        raise CannotStart(host=here, container=name, reason=why, said=said, remedy=f"its log is {log}") from None
+        raise CannotStart(host=here, container=name, reason=why, output=complaint, remedy=f"its log is {log}") from None
     except BaseException:  # an interrupted start is ended, too
         _end(process)
         raise

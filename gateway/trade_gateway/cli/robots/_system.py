@@ -153,8 +153,8 @@ def take_snapshot(
 
 
 def _plan(context: typer.Context, file: Path) -> SystemPlan:
-    plan, said = read_system_file(file), choice_of(context)
-    if said.system not in (None, plan.settings.system) or said.connect:
+    plan, choice = read_system_file(file), choice_of(context)
+    if choice.system not in (None, plan.settings.system) or choice.connect:
         problem = f"{file} names the system and its endpoints; leave out --system and --connect"
         raise UsageError(where="trade system", problem=problem)
     return plan

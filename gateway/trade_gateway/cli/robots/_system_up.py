@@ -143,9 +143,9 @@ class SystemStarter:
                 problem = f"{self._plan.supervisor} does not supervise it; which file does it read? {_SHOWS}"
                 raise ConfigurationError(where=where_, problem=problem)
             if late or (child is not None and child.state == "given up"):
-                why, said = ("it did not come up", child.why if child else "") if not late else ("timeout", state)
+                why, output = ("it did not come up", child.why if child else "") if not late else ("timeout", state)
                 remedy = f"its log is {part.name}.log in the folder logs of {self._plan.supervisor}"
-                raise CannotStart(host=LOCAL, container=part.name, reason=why, said=said, remedy=remedy)
+                raise CannotStart(host=LOCAL, container=part.name, reason=why, output=output, remedy=remedy)
             if state not in (known, "stopped"):
                 known = state
                 self._report(Report(container=part.name, host=LOCAL, state=state))
@@ -171,9 +171,11 @@ class SystemStarter:
             self._member.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
         info = next((one for one in self._member.containers() if one.epoch == started.epoch), None)
         if info is None:
-            said = f"it is up there as process {started.pid}, but was not visible here within {self._wait_s:g} s"
+            output = f"it is up there as process {started.pid}, but was not visible here within {self._wait_s:g} s"
             remedy = f"set its endpoints ({self._plan.at(part.name, 'connect')}), and give it the certificate"
-            raise CannotStart(host=part.entry.host, container=part.name, reason="not seen", said=said, remedy=remedy)
+            raise CannotStart(
+                host=part.entry.host, container=part.name, reason="not seen", output=output, remedy=remedy
+            )
         return info
 
     def _own(self, part: ContainerSpec, name: str) -> Handle:

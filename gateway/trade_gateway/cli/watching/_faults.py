@@ -131,7 +131,7 @@ def _asked(container: Container, fault_id: str, name: str) -> Any:
 
 
 def _said(info: "FaultInfo") -> str:
-    """Returns what `FaultInfo.said` does in the driver's process; here only the fields are known."""
+    """Returns what `FaultInfo.summary` does in the driver's process; here only the fields are known."""
     begin = f"{info.device}: "
     return info.text.removeprefix(begin) if info.text.startswith(begin) else info.kind
 

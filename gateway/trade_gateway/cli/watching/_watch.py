@@ -164,8 +164,10 @@ def _say(out: Output, news: Iterable[Event]) -> None:
     for kind, alike in kinds.items():
         colour = _COLOURS.get(kind.what, "bold")
         about = escape(_some([one.about for one in alike]))
-        said = f": {escape(kind.text)}" if kind.text else ""
-        out.say(f"{clock(alike[0].at, ms=True)} {escape(kind.container):12} [{colour}]{kind.what:11}[/] {about}{said}")
+        detail = f": {escape(kind.text)}" if kind.text else ""
+        out.say(
+            f"{clock(alike[0].at, ms=True)} {escape(kind.container):12} [{colour}]{kind.what:11}[/] {about}{detail}"
+        )
 
 
 def _some(names: list[str]) -> str:

@@ -68,8 +68,8 @@ class SentGoals:
     def fault(self, outcome: Outcome) -> DeviceFault:
         """The error of a goal that failed."""
         code = outcome.result.get("error_code", 0)
-        said = f" (error code {code})" if isinstance(code, int) and code else ""
-        fault = f"{text_of(outcome) or 'its goal was aborted'}{said}"
+        detail = f" (error code {code})" if isinstance(code, int) and code else ""
+        fault = f"{text_of(outcome) or 'its goal was aborted'}{detail}"
         return DeviceFault(device=self._device, bus=self._action, fault=fault)
 
     def stop(self) -> None:
@@ -162,5 +162,5 @@ class SentGoals:
 
 def text_of(outcome: Outcome) -> str:
     """What its server says about a goal."""
-    said = (outcome.result.get(name) for name in TEXTS)
-    return outcome.text or next((text for text in said if isinstance(text, str) and text), "")
+    texts = (outcome.result.get(name) for name in TEXTS)
+    return outcome.text or next((text for text in texts if isinstance(text, str) and text), "")

@@ -70,8 +70,8 @@ class Child:
             began = time.monotonic()
             self._words.clear()
             problem = self._live()
-            said = f": {self._words[-1]}" if self._words else ""
-            before, self.problem = self.problem, f"the node of ROS 1 {problem}{said}"
+            detail = f": {self._words[-1]}" if self._words else ""
+            before, self.problem = self.problem, f"the node of ROS 1 {problem}{detail}"
             if self._closed.is_set():
                 return
             if self.problem != before:
