@@ -13,7 +13,7 @@ from msgspec import structs
 from trade._calls.client import CallClient
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
-from trade._locks.lock import Lock, apart
+from trade._locks.lock import Lock, in_own_thread
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._resources.grants import LockRequest
@@ -214,7 +214,7 @@ class LeaseClient:
             found = next((lock for lock in self._locks if token in lock.granted.values()), None)
         if found is None or found.on_request is None:
             return False
-        apart(self.over, found.on_request, who, reason)
+        in_own_thread(self.over, found.on_request, who, reason)
         return True
 
     def close(self) -> None:

@@ -178,7 +178,7 @@ class Lock:
         try:
             await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.add_done_callback(lambda _: apart(self._lease_client.over, self.release))
+            taking.add_done_callback(lambda _: in_own_thread(self._lease_client.over, self.release))
             raise
         return self._enter()
 
@@ -258,16 +258,16 @@ class Lock:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        apart(self._lease_client.over, self._lease_client.release, self, reason)
+        in_own_thread(self._lease_client.over, self._lease_client.release, self, reason)
         if self._on_lost is not None:
-            apart(self._lease_client.over, self._on_lost, _again(self._lost))
+            in_own_thread(self._lease_client.over, self._on_lost, _again(self._lost))
 
 
 def _again(lost: LockLost) -> LockLost:
     return LockLost(resources=lost.resources, reason=lost.reason)
 
 
-def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
+def in_own_thread(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
     """Calls a lock callback on another thread, so that no lock waits for it.
 
     Args:

@@ -67,7 +67,7 @@ class ClientApi:
         self.administration: Final = Administration(container, self.judge, self.counted)
         self.configuration: Final = Configuration(container, self.judge, self.counted, self.administration)
 
-    async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
+    async def in_thread(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
         """Runs a function that may block in a thread; one that stops something never waits for a free thread."""
         return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
 
@@ -75,7 +75,7 @@ class ClientApi:
         """Likewise, counted against the limits of pending operations. Raises TooMany."""
         ended = self._quota.take(who)
         try:
-            return await self.apart(do, *args)
+            return await self.in_thread(do, *args)
         finally:
             ended()
 
@@ -132,7 +132,7 @@ class ClientApi:
         stops = handle.effect == "stop"
         counted = None if stops else self._quota.take(client.identity)
         try:
-            run = await self.apart(self._begin, client, handle, body, admitted, stops=stops)
+            run = await self.in_thread(self._begin, client, handle, body, admitted, stops=stops)
         except BaseException:
             if counted is not None:
                 counted()
@@ -165,7 +165,7 @@ class ClientApi:
     async def end(self, client: Client, run: Run) -> None:
         """Cancels a call in its client's name."""
         try:
-            await self.apart(client.cancel, run, stops=True)
+            await self.in_thread(client.cancel, run, stops=True)
         except TradeError as error:  # the call itself reports how it ended
             _logger.info("a call of %s could not be cancelled: %s", client.identity, error)
 
@@ -192,7 +192,7 @@ class ClientApi:
         async def watch() -> None:
             await gone()
             if alone:
-                await self.apart(client.close, stops=True)
+                await self.in_thread(client.close, stops=True)
             else:
                 await self.end(client, run)
             tasks.cancel_scope.cancel()
@@ -301,9 +301,9 @@ class ClientApi:
             NoContainerFound: no container is known to have received it. It is open here; joining containers receive it.
         """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
-        report = await self.apart(self._container.estop, reason, stops=True)
+        report = await self.in_thread(self._container.estop, reason, stops=True)
         look = partial(self._container.reachability, limit_s=0)
-        reachability = await self.apart(look, stops=True)  # only after the e-stop, as it waits
+        reachability = await self.in_thread(look, stops=True)  # only after the e-stop, as it waits
         if not (report.confirmed or report.missing or report.failed):
             raise reachability.as_error(self._container.settings.system, f"e-stop {report.id}: {_NOT_RECEIVED}")
         return _stopped(report, reachability)

@@ -167,7 +167,7 @@ class Agents:
         finally:
             if self._twin is not None:
                 with anyio.CancelScope(shield=True):
-                    await self._api.apart(self._twin.close, stops=True)
+                    await self._api.in_thread(self._twin.close, stops=True)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answers one HTTP request."""
@@ -183,7 +183,7 @@ class Agents:
             await refusal(error)(scope, receive, send)
             return
         if request.method == "DELETE":
-            await self._api.apart(agent.client.close, stops=True)
+            await self._api.in_thread(agent.client.close, stops=True)
             await Response()(scope, receive, send)
             return
         statuses: list[int] = []
@@ -210,7 +210,7 @@ class Agents:
         """Opens a session for a new agent. Raises TooMany; HttpError: this request begins none."""
         if asked.method != "initialize" or self._tasks is None:
             raise HttpError(status=400, problem="name a session (Mcp-Session-Id), or begin one with `initialize`")
-        client = await self._api.apart(self._api.clients.open, who)
+        client = await self._api.in_thread(self._api.clients.open, who)
         agent = self._agents[client] = _Agent(client)
         await self._tasks.start(self._converse, agent)
         self._leases.begin(client, 0, lambda: self._authenticator.still(scope, who))
@@ -233,13 +233,13 @@ class Agents:
                     task_status.started()
                     await agent.watch(says)
                     _logger.info("an agent of %s was silent for too long; its session ends", client.identity)
-                    await self._api.apart(client.close, stops=True)
+                    await self._api.in_thread(client.close, stops=True)
         except Exception:
             _logger.exception("the session of an agent of %s has failed", client.identity)
         finally:
             self._agents.pop(client, None)
             with anyio.CancelScope(shield=True):
-                await self._api.apart(client.close, stops=True)
+                await self._api.in_thread(client.close, stops=True)
                 await agent.transport.terminate()
 
 

@@ -213,7 +213,7 @@ class Http:
 
     async def open_session(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.SessionBody)
-        client = await self._api.apart(self._api.clients.open, who)
+        client = await self._api.in_thread(self._api.clients.open, who)
         self._leases.begin(client, body.lease_s, lambda: self._authenticator.still(request.scope, who))
         return _answer(messages.SessionOpened(client.secret, client.session.name, body.lease_s), 201)
 
@@ -223,7 +223,7 @@ class Http:
 
     async def close_session(self, request: Request) -> Response:
         client = self._lasting(request, self._who(request), "this")
-        await self._api.apart(client.close, stops=True)
+        await self._api.in_thread(client.close, stops=True)
         return Response(status_code=204)
 
     # --- locks and stops
@@ -238,7 +238,7 @@ class Http:
 
     async def unlock(self, request: Request) -> Response:
         client = self._lasting(request, self._who(request), "a lock")
-        if not await self._api.apart(client.unlock, request.path_params["lock"]):
+        if not await self._api.in_thread(client.unlock, request.path_params["lock"]):
             raise HttpError(status=404, problem="this session has no such lock, or has lost it")
         return Response(status_code=204)
 
@@ -303,12 +303,12 @@ class Http:
         if named is not None:
             yield named, False
             return
-        client = await self._api.apart(self._api.clients.open_for_one, who, stops=True)
+        client = await self._api.in_thread(self._api.clients.open_for_one, who, stops=True)
         self._leases.begin(client, 0, lambda: self._authenticator.still(request.scope, who))
         try:
             yield client, True
         finally:
-            await asyncio.shield(asyncio.ensure_future(self._api.apart(client.close, stops=True)))
+            await asyncio.shield(asyncio.ensure_future(self._api.in_thread(client.close, stops=True)))
 
 
 def _lost(_name: str, _error: LockLost) -> None:

@@ -171,7 +171,7 @@ def _application(
                 yield
         finally:
             watching.cancel()
-            await api.apart(api.clients.close, stops=True)
+            await api.in_thread(api.clients.close, stops=True)
 
     middleware = [Middleware(Gate, hosts=hosts, origins=origins)]
     if origins:

@@ -69,7 +69,7 @@ class Leases:
                     self._end(client)
 
     def _end(self, client: Client) -> None:
-        closing = asyncio.ensure_future(self._api.apart(client.close, stops=True))
+        closing = asyncio.ensure_future(self._api.in_thread(client.close, stops=True))
         self._closing.add(closing)
         closing.add_done_callback(self._closing.discard)
 

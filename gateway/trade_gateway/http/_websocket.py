@@ -48,7 +48,7 @@ class Socket:
         """Serves one connection, from its handshake to its end."""
         try:
             who = self._authenticator.who(websocket.scope)
-            client = await self._api.apart(self._api.clients.open, who, stops=True)
+            client = await self._api.in_thread(self._api.clients.open, who, stops=True)
         except TradeError as error:
             await websocket.send_denial_response(problem_response(error))
             return
@@ -60,7 +60,7 @@ class Socket:
             with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is closed
                 await websocket.close(_ENDED)
         finally:
-            await asyncio.shield(asyncio.ensure_future(self._api.apart(client.close, stops=True)))
+            await asyncio.shield(asyncio.ensure_future(self._api.in_thread(client.close, stops=True)))
 
 
 class _Ongoing:
@@ -244,7 +244,7 @@ class Conversation:
             case messages.TakeLock():
                 return await self._api.lock(self._client, asked, self._lock_lost)
             case messages.Unlock():
-                return {"released": await self._api.apart(self._client.unlock, asked.lock)}
+                return {"released": await self._api.in_thread(self._client.unlock, asked.lock)}
             case messages.Resume():
                 return {"resumed": await self._api.resume(self._client, asked)}
             case messages.Estop():
@@ -315,7 +315,7 @@ class Conversation:
             view = self._api.view(self._client.identity, handle)
             self._post({"id": asked.id, "event": occasion, "service": view})
 
-        standing = await self._api.apart(self._api.watch, self._client, asked, tell)
+        standing = await self._api.in_thread(self._api.watch, self._client, asked, tell)
         try:
             await anyio.sleep_forever()
         finally:
@@ -342,7 +342,7 @@ class Conversation:
 
     async def _apart(self, close: Callable[[], object]) -> None:
         with anyio.CancelScope(shield=True):
-            await self._api.apart(close, stops=True)
+            await self._api.in_thread(close, stops=True)
 
     def _lock_lost(self, lock: str, error: LockLost) -> None:
         self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})

@@ -48,7 +48,7 @@ async def serve(
         leave: ends everything else of the process; called when a signal ends it.
     """
     api = ClientApi(container)
-    client = await api.apart(api.clients.open, container.address.identity)
+    client = await api.in_thread(api.clients.open, container.address.identity)
     tools = Tools(container, api, client, approvals, lexicon, twin)
     async with stdio_server() as (hears, says), _signals(client.close, leave):
         await converse(api, client, tools, hears, says)
@@ -67,7 +67,7 @@ async def converse(api: ClientApi, client: Client, tools: Tools, hears: Hears, s
                     await passed_on.send(message)
         finally:
             with anyio.CancelScope(shield=True):
-                await api.apart(client.close, stops=True)
+                await api.in_thread(client.close, stops=True)
 
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(hear)

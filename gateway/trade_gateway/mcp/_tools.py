@@ -178,7 +178,7 @@ class Tools:
 
     async def unlock(self, asked: LockArgs, _: Progress) -> Any:
         """Release a lock; motion under it stops."""
-        return {"released": await self._api.apart(self._client.unlock, asked.lock)}
+        return {"released": await self._api.in_thread(self._client.unlock, asked.lock)}
 
     async def call(self, asked: ToCall, progress: Progress) -> Any:
         """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
