@@ -73,7 +73,7 @@ def account_name() -> str:
 
         return as_chunk(pwd.getpwuid(os.getuid()).pw_name)
     except (ImportError, OSError, KeyError):  # a container image without a user name
-        return "nobody"  # plain: nobody
+        return "nobody"
 
 
 def account_home() -> Path | None:

@@ -1,8 +1,9 @@
 """The style checker finds avoided words where people read them, and nowhere else."""
 
+import re
 from pathlib import Path
 
-from tests.docs.plain_english import findings, in_names
+from tests.docs.plain_english import KEPT, PRODUCT, ROOT, files, findings, in_names
 
 PAGE = """# A title
 
@@ -63,3 +64,12 @@ def test_of_a_test_module_the_names_of_tests_are_searched(tmp_path: Path) -> Non
     path = tmp_path / "test_module.py"
     path.write_text(NAMES, encoding="utf-8")
     assert [line.split('"')[1] for line in findings([path])] == ["nobody"]
+
+
+def test_the_product_needs_each_word_that_is_kept_and_marks_none() -> None:
+    for name, word in KEPT:
+        assert re.search(rf"(?i)(?<![a-z]){word}", (ROOT / name).read_text(encoding="utf-8"))
+    marks = [
+        path for path in files([ROOT / part for part in PRODUCT]) if "# plain:" in path.read_text(encoding="utf-8")
+    ]
+    assert marks == []

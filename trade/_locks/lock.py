@@ -285,4 +285,4 @@ def in_own_thread(over: Callable[[], bool], call: Callable[..., object], *argume
             else:
                 _logger.exception("the lock callback %r failed", call)
 
-    threading.Thread(target=guarded, name="trade-lock-told", daemon=True).start()  # plain: told
+    threading.Thread(target=guarded, name="trade-lock-callback", daemon=True).start()

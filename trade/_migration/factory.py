@@ -40,7 +40,7 @@ class ProviderFactory:
     """Owns the objects created here: each is closed when a client terminates it, or with the container.
 
     Args:
-        container: hosts the objects; code of theirs uses it by default.
+        container: hosts the objects; their code uses it by default.
         own: its address.
         register: registers a created object in groups.
         providers: of the container.

@@ -148,7 +148,7 @@ class Estop(Struct, frozen=True, array_like=True, gc=False):
     reason: Annotated[str, Meta(max_length=500)]
     at: float
     """``time.time()`` there."""
-    told_by: Annotated[str, Meta(max_length=300)] = ""  # plain: told
+    told_by: Annotated[str, Meta(max_length=300)] = ""
     """``identity/container`` of the container that reported it, if neither that nor its identity gave it; empty: this
     container received the order itself. The reporter may have invented it."""
 

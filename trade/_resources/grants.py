@@ -103,7 +103,7 @@ def withheld(resource: Resource, epoch: str, container: str) -> LockInfo:
         token=Token(epoch, 0),
         container=container,
         resources=(resource.name,),
-        holder=Holder("nobody", "", "", purpose, resource.unsafe_at),  # plain: nobody
+        holder=Holder("nobody", "", "", purpose, resource.unsafe_at),
         left_s=0.0,
         uses=0,
         last_use=0.0,

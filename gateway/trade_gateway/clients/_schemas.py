@@ -258,7 +258,7 @@ class EstopView(Struct, frozen=True):
     by: str
     reason: str
     at: float
-    told_by: str = ""  # plain: told
+    told_by: str = ""
     """The container that reported it, if this is not its giver: the report may be false."""
 
 

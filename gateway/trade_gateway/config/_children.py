@@ -30,7 +30,7 @@ class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Resident memory above which it is ended; None: no limit."""
     lease_from: str = ""
     """A gateway of another host whose lease it needs to run here, and which runs it if this host is lost."""
-    stands_in_for: str | list[str] = ""  # plain: stands
+    stands_in_for: str | list[str] = ""
     """The gateway of another host that has this container, or several; it runs here while their hosts are lost."""
     move_above: Annotated[float, Meta(gt=0, le=1)] | None = None
     """With ``stands_in_for``: the load of its host, as a share of all cores, above which it moves to another one."""

@@ -52,7 +52,7 @@ def knows_not(stage: Stage) -> None:
         began = stage.turns(anna)
         wrong: list[tuple[tuple[str, str], str, tuple[Any, ...], bool]] = [
             (arm, "fly", (), False),
-            ((arm[0], "nobody"), "echo", (1,), False),  # plain: nobody
+            ((arm[0], "unknown"), "echo", (1,), False),
             (("elsewhere", arm[1]), "echo", (1,), False),
             (arm, "halt", (), False),
             (arm, "turn", (0.1,), True),

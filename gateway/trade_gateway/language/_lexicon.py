@@ -28,7 +28,7 @@ _NAMES: Final = ("container", "group", "host", "kind", "name", "place", "service
 _IN_NO_NAME: Final = (
     "a|about|after|again|all|am|an|and|are|as|at|because|before|but|by|can|could|did|do|does|else|except|for|from|had|has"
     "|have|how|i|if|in|instead|into|is|may|must|never|no|none|nor|not|nothing|now|of|off|on|onto|or|over|please"
-    "|nobody"  # plain: nobody
+    "|nobody"
     "|shall|should|so|still|than|then|there|to|too|unless|until|was|we|were|what|when|where|whether|which|while|who|why|will|with"
     "|without|would|yes|you|(?:i|it|let|that|what|who|you)'\\w+|\\w+n't"
 )

@@ -57,7 +57,7 @@ def tell(host: str, line: str, timeout_s: float) -> threading.Thread:
         with suppress(DashboardError):
             ask(host, line, timeout_s)
 
-    saying = threading.Thread(target=say, name=f"telling {host}", daemon=True)  # plain: telling
+    saying = threading.Thread(target=say, name=f"dashboard of {host}", daemon=True)
     saying.start()
     return saying
 
