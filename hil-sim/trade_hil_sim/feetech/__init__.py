@@ -1,11 +1,12 @@
-"""Simulated Feetech STS servos: the bytes of the STS3215, without the hardware."""
+"""Simulated Feetech STS servos: their bytes, without the hardware. All models move as an STS3215 does."""
 
 from ._bus import FeetechBus
 from ._protocol import Instruction, Packet, PacketReader, checksum, encode, status
 from ._servo import Servo, Status
-from ._table import STS3215, Model, Register
+from ._table import MODELS, STS3215, Model, Register
 
 __all__ = [
+    "MODELS",
     "STS3215",
     "FeetechBus",
     "Instruction",

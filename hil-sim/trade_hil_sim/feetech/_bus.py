@@ -9,7 +9,7 @@ from trade_hil_sim.serial._servo_bus import ServoBus
 
 from ._protocol import Instruction, Packet, PacketReader, status
 from ._servo import MOTION, Servo
-from ._table import BAUDS, STS3215
+from ._table import BAUDS, MODELS
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint
@@ -29,12 +29,13 @@ class FeetechBus(ServoBus[Servo, Packet]):
         clock: the servos' clock, in seconds. The line itself keeps real time.
     """
 
-    models, bauds, motion = (STS3215.name,), BAUDS, MOTION
+    models, bauds, motion = MODELS, BAUDS, MOTION
 
     @classmethod
     def _new_servo(cls, joint: "Joint", baud: int, position_counts: int, t: float) -> Servo:
         return Servo(
             joint.id,
+            MODELS[joint.model],
             position_counts=position_counts,
             baud=baud,
             joint=joint.name,

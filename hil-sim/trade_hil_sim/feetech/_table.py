@@ -1,10 +1,10 @@
-"""The memory table of the STS3215 as data.
+"""The memory table of STS servos as data.
 
 Sources: addresses, sizes and defaults from Feetech's "STS memory table", where it gives them; signs as the vendor's
 library has them. The drivers keep a table of their own on purpose: a mistake in one of them shows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from trade_hil_sim.serial import _registers as registers
@@ -121,3 +121,13 @@ STS3215: Final = Model(
         Register(86, 1, "acceleration_factor", READ, 1),
     ),
 )
+
+
+def _likewise(name: str, number: int) -> Model:
+    """A model with the same memory table and the same motor."""
+    renamed = {"model_number": number}
+    registers = [replace(one, default=renamed.get(one.name, one.default)) for one in STS3215.registers]
+    return replace(STS3215, name=name, number=number, registers=tuple(registers))
+
+
+MODELS: Final = {model.name: model for model in (STS3215, _likewise("STS3250", 2825), _likewise("STS3095", 2569))}

@@ -89,3 +89,15 @@ def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig
     arrived = [rig.events("at_rest", i, mark)[-1].t for i in range(1, 7)]
     started = [rig.events("motion_started", i, mark)[0].t for i in range(1, 7)]
     assert max(arrived) - min(arrived) < 0.3 * (max(arrived) - min(started))
+
+
+@pytest.mark.parametrize(("model", "other"), [("STS3215", "STS3250"), ("STS3250", "STS3095"), ("STS3095", "STS3215")])
+def test_each_model_is_taken_for_itself_and_for_no_other(rig: TailRig, model: str, other: str) -> None:
+    rig.configure(('model = "STS3215"', f'model = "{model}"'))
+    rig.plug()
+    rig.configure(('model = "STS3215"', f'model = "{other}"'))
+    said = refused(rig)
+    assert other in said
+    assert model in said
+    rig.configure(('model = "STS3215"', f'model = "{model}"'))
+    assert rig.attach().motor("tail.root").state().fault == ""

@@ -194,7 +194,10 @@ def test_the_program_brings_it_up_from_a_robot_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("before", "after", "complaint"),
-    [("STS3215", "STS9999", "is not simulated; there is STS3215"), ("port =", "baud = 9600\nport =", "is no rate of")],
+    [
+        ("STS3215", "STS9999", "is not simulated; there is STS3095, STS3215, STS3250"),
+        ("port =", "baud = 9600\nport =", "is no rate of"),
+    ],
 )
 def test_what_is_not_simulated_is_named(tmp_path: Path, before: str, after: str, complaint: str) -> None:
     file = tmp_path / "tail.toml"

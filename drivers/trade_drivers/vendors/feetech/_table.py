@@ -1,4 +1,4 @@
-"""The memory table of the STS3215: registers as data, with their conversion to SI units.
+"""The memory table of STS servos: registers as data, with their conversion to SI units.
 
 Sources: addresses and sizes from Feetech's "STS memory table" and, independently of it, rustypot's table of the
 STS3215; units from the same memory table. Negative numbers are sign and magnitude, not two's complement.
@@ -126,7 +126,12 @@ class Model(Struct, frozen=True):
     number: int
 
 
-MODELS: Final = (Model("STS3215", 777),)
+MODELS: Final = (
+    Model("STS3215", 777),
+    Model("STS3250", 2825),  # LeRobot's table of model numbers; it drives it by the same memory table
+    Model("STS3095", 2569),  # likewise AlohaMini's
+)
+"""The models, by the number in register 3; all have the same memory table. A further one is a line here."""
 BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
 BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}
 
