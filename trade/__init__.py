@@ -47,7 +47,6 @@ from trade._resources.resource import Permit, Resource, permit
 from trade._services.decorator import service
 from trade._services.secret import Secret
 from trade._settings import Settings
-from trade._stop_line import StopReport
 from trade._streams.source import ListenerInfo
 from trade._streams.stream import Stream
 from trade._table import Table
@@ -56,6 +55,7 @@ from trade._telemetry.load import LoadInfo
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
 from trade._tracing.api import LogReader, Trace
+from trade.stop_line import StopReport
 
 __all__ = [
     "Bound",

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 
 CHOSEN: Final = ("TRADE_SYSTEM", "TRADE_CONNECT", "TRADE_TLS", "TRADE_POLICY")
 """The settings that can be chosen, by their variables; the first one always is."""

@@ -38,7 +38,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final, Literal, NamedTuple, TypeVar
 
-from trade._timestamps import clock
+from trade.timestamps import clock
 
 __all__ = [
     "AccessDenied",

@@ -153,7 +153,7 @@ def _deviations_unseen(patch: Patch) -> None:
 
 def _no_stop_line(patch: Patch) -> None:
     """No container listens on the stop line."""
-    from trade._stop_line import service
+    from trade.stop_line import service
 
     patch(service, "host_socket", lambda _: None)
     patch(service, "_network_sockets", lambda *_: [])

@@ -9,7 +9,7 @@ import sys
 import time
 
 from trade import Container, Settings
-from trade._stop_line import StopLines
+from trade.stop_line import StopLines
 
 
 def main(group: str, limit_s: str, *connect: str) -> None:

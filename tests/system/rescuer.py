@@ -10,7 +10,7 @@ import os
 import sys
 
 from trade import Settings
-from trade._stop_line import StopLines
+from trade.stop_line import StopLines
 
 
 def main(group: str, limit_s: str, *connect: str) -> None:

@@ -58,7 +58,6 @@ from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
 from trade._services.withdrawn import Withdrawn
 from trade._settings import Settings
-from trade._stop_line import RelayedEstop, StopApi, StopLines, StopLineService
 from trade._streams.api import StreamApi
 from trade._streams.source import Streams
 from trade._streams.subscriptions import Subscriptions
@@ -76,6 +75,7 @@ from trade._transport.host_socket import host_sockets, listen_on_host
 from trade._transport.local_greeting import Passport
 from trade._transport.zenoh import ZenohTransport
 from trade.errors import AccessDenied, ConfigurationError, TradeError
+from trade.stop_line import RelayedEstop, StopApi, StopLines, StopLineService
 
 _logger = logging.getLogger("trade")
 

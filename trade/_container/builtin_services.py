@@ -8,9 +8,9 @@ from trade._locks.services import LockServices
 from trade._migration.services import MigrationServices
 from trade._notifications.services import NotificationServices
 from trade._notifications.states import StateServices
-from trade._stop_line import GroupStopServices
 from trade._streams.services import StreamServices
 from trade._tracing.services import TraceServices
+from trade.stop_line import GroupStopServices
 
 
 class OwnServices(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from trade._security.authorizer import Authorizer
-from trade._security.policy import Policy
+from trade._security.policy import different
 from trade._security.policy_file import Seen
 from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
@@ -73,13 +73,3 @@ class _Watching:
             self._recheck_access()
         except Exception:
             _logger.exception("the changed policy %s could not be applied everywhere", path)
-
-
-def different(before: Policy, after: Policy) -> list[str]:
-    """The differences between two policies, in words."""
-    changed = [f"{name} is revoked now" for name in sorted(after.revoked - before.revoked)]
-    changed += [f"{name} is revoked no more" for name in sorted(before.revoked - after.revoked)]
-    parts = ("roles", "identities", "gateways", "approval")
-    others = [part for part in parts if getattr(before, part) != getattr(after, part)]
-    changed += [f"other {' and '.join(others)}"] if others else []
-    return changed

@@ -14,9 +14,9 @@ from io import FileIO
 from pathlib import Path
 from typing import Final
 
-from trade._atomic_file import fresh_beside
 from trade._paths import runtime_folder, runtime_folders
 from trade._transport.endpoints import Endpoint
+from trade.atomic_files import fresh_beside
 from trade.errors import ConfigurationError
 
 try:

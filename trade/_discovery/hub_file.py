@@ -9,10 +9,10 @@ import socket
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from trade._atomic_file import replace
 from trade._paths import runtime_folders
 from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import host_sockets, is_deaf, listen_on_host
+from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 
 _MARK: Final = ".hub-"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from trade._atomic_file import replace
+from trade.atomic_files import replace
 from trade.errors import CodeRefused, ConfigurationError
 
 _logger = logging.getLogger("trade")

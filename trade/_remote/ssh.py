@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from trade._context.call_context import patience_s
-from trade._remote.error_output import as_text
+from trade.command_output import as_text
 from trade.errors import CannotStart, ConfigurationError, StartFailure
 
 CONNECT_S: Final = 10

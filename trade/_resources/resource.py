@@ -15,8 +15,8 @@ from msgspec import Struct, structs
 from trade._context.call_context import CallContext, running
 from trade._context.sessions import foreign
 from trade._protocol.messages import Token
-from trade._timestamps import clock
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, SessionEnded, Stopped
+from trade.timestamps import clock
 
 _stop_numbers: Final = itertools.count(1).__next__
 _permit_ids: Final = itertools.count(-1, -1).__next__

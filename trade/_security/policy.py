@@ -170,3 +170,13 @@ class Policy:
 
 def _is_pattern(name: str) -> bool:
     return "*" in name or "?" in name
+
+
+def different(before: Policy, after: Policy) -> list[str]:
+    """The differences between two policies, in words."""
+    changed = [f"{name} is revoked now" for name in sorted(after.revoked - before.revoked)]
+    changed += [f"{name} is revoked no more" for name in sorted(before.revoked - after.revoked)]
+    parts = ("roles", "identities", "gateways", "approval")
+    others = [part for part in parts if getattr(before, part) != getattr(after, part)]
+    changed += [f"other {' and '.join(others)}"] if others else []
+    return changed

@@ -8,9 +8,9 @@ from typing import Final, cast
 
 from trade._protocol.keys import GROUP, NO_GROUP, is_chunk
 from trade._security.policy import EVERYTHING, VERBS, Policy, Role
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 
 Seen = tuple[tuple[int, int, int, int] | None, ...]
 """The state of files: inode, times of change of contents and of rights, and size of each; None: it does not exist."""

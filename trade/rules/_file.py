@@ -15,9 +15,9 @@ from trade._notifications.triggers import LONGEST_S, SHORTEST_S
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import Scalar
 from trade._registry.constraints import Constraint, where
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 
 SERVICE: Final = "$service"
 """The service that joined, left or changed; for an event without one, the service that ``if`` calls."""

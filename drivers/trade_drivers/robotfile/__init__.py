@@ -11,9 +11,9 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade._protocol.keys import DOMAIN
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_drivers.robotfile._convert import explain, record_of, wrong
 from trade_drivers.robotfile._records import Arm, Camera, Coupled, Drill, Gripper, Group, Positive, Sensor, arm_problem
 

@@ -3,8 +3,8 @@
 from os import PathLike
 from pathlib import Path
 
-from trade._text_file import read_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
 from trade_drivers.robotfile import Robot, parse
 
 

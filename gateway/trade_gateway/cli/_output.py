@@ -12,11 +12,11 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 
+from trade import Settings
 from trade._default_system import is_of_user
 from trade._protocol.remote_errors import RemoteTraceback
-from trade._settings import Settings
-from trade._stop_line import elsewhere
 from trade.errors import RemoteError, TradeError
+from trade.stop_line import elsewhere
 
 NOT_FOUND: Final = 3
 """The exit code if what a command was asked for does not exist."""

@@ -5,14 +5,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from trade._container.policy_reload import different
-from trade._security.certificates import Certificate
-from trade._security.policy import Policy
-from trade._security.policy_file import policy_files
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-from trade.policies import read_policy
+from trade.policies import Certificate, Policy, different, policy_files, read_policy
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_gateway.config._gateway_file import Plan
 
 _CERTIFICATE: Final = "cert.pem"

@@ -14,11 +14,11 @@ import msgspec
 from msgspec import Struct
 
 from trade import Settings
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_drivers import check, load, without
 from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_gateway.config._entry import (

@@ -9,9 +9,9 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._atomic_file import replace
-from trade._text_file import as_before, as_text
+from trade.atomic_files import replace
 from trade.errors import ConfigurationError
+from trade.text_files import as_before, as_text
 
 __all__ = ["Document", "FileText"]
 

@@ -15,15 +15,13 @@ from typing import Any, Final
 
 import msgspec
 
-from trade import Container
+from trade import Container, Settings
 from trade._protocol.keys import ALIVE, Address, is_chunk, registry_key
-from trade._protocol.messages import Token
-from trade._resources.grants import Granted
-from trade._settings import Settings
 from trade._transport.base import Answer, ChannelClosed
 from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
+from trade.records import Granted, Token
 from trade_gateway.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
 from trade_gateway.conformance._peer import Peer, end_group
 from trade_gateway.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice

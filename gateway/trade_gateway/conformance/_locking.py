@@ -5,9 +5,8 @@ import time
 
 import msgspec
 
-from trade import errors, where
+from trade import LockInfo, errors, where
 from trade._protocol.messages import Status, Token
-from trade._resources.grants import LockInfo
 from trade_gateway.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._environment import Stage

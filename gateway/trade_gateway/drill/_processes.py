@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from trade._remote.error_output import last_line
+from trade.command_output import last_line
 from trade.errors import TradeError
 
 _END_S: Final = 20.0

@@ -11,10 +11,10 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 from tomlkit.exceptions import TOMLKitError
 
-from trade._atomic_file import replace
 from trade._protocol.keys import is_chunk
-from trade._text_file import as_before, read_text
+from trade.atomic_files import replace
 from trade.errors import AccessDenied, ConfigurationError
+from trade.text_files import as_before, read_text
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
 from trade_gateway.clients._errors import NotAuthenticated
 

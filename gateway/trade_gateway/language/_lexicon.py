@@ -10,9 +10,9 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_gateway._usage import UsageError
 from trade_gateway.language._catalogue import DIALOGUE, REQUESTS
 from trade_gateway.language._requests import Gaps

@@ -9,8 +9,8 @@ import msgspec
 
 from trade import Handle, where
 from trade._protocol.messages import HEALTHY
-from trade._timestamps import clock
 from trade.auditing import AuditRow, reading, records_in
+from trade.timestamps import clock
 from trade_gateway.language._names import in_words, matching, others, place, resources
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown
 

@@ -25,11 +25,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
-from trade._atomic_file import claim, replace
 from trade._protocol.keys import is_chunk
-from trade._text_file import as_before, read_text
-from trade._toml import read_toml_text
+from trade.atomic_files import claim, replace
 from trade.errors import ConfigurationError
+from trade.text_files import as_before, read_text
+from trade.toml_files import read_toml_text
 
 Purpose = Literal["container", "gateway"]
 

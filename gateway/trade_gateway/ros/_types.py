@@ -17,8 +17,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from trade._text_file import read_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
 
 Message = dict[str, Any]
 

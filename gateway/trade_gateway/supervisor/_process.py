@@ -12,8 +12,8 @@ from typing import Final
 import msgspec
 
 from trade import Settings
-from trade._remote.error_output import last_line
 from trade._transport.credentials import user_secret
+from trade.command_output import last_line
 from trade.starting import Started
 from trade_gateway._usage import ABSENT
 from trade_gateway.config._children import Child

@@ -39,7 +39,7 @@ def samples_have_the_time_of_the_wall_clock(patch: pytest.MonkeyPatch) -> None:
 
 
 def a_byte_order_mark_is_text(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade._text_file.as_text", lambda data: data.decode())
+    patch.setattr("trade.text_files.as_text", lambda data: data.decode())
 
 
 def lines_end_as_on_unix(patch: pytest.MonkeyPatch) -> None:

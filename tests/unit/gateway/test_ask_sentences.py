@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trade._toml import read_toml_text
+from trade.toml_files import read_toml_text
 from trade_gateway.language import NotUnderstood, read_lexicon
 from trade_gateway.language._catalogue import REQUESTS
 

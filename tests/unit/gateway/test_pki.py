@@ -14,7 +14,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner, Result
 
-from trade import _atomic_file
+from trade import atomic_files
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway.cli import build
@@ -88,13 +88,13 @@ def test_a_reader_of_a_certificate_gets_a_whole_one_while_it_is_replaced(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = authority.issue("arm").folder / "cert.pem"
-    before, seen, claim = path.read_bytes(), [], _atomic_file.claim
+    before, seen, claim = path.read_bytes(), [], atomic_files.claim
 
     def watched(fresh: Path, text: bytes) -> None:
         claim(fresh, text)
         seen.append(path.read_bytes())
 
-    monkeypatch.setattr(_atomic_file, "claim", watched)
+    monkeypatch.setattr(atomic_files, "claim", watched)
     authority.issue("arm")
     assert seen and set(seen) == {before}
     assert path.read_bytes() != before

@@ -14,9 +14,9 @@ from tests.support.simulated_robots import HEAD
 from trade._chosen_system import chosen_settings
 from trade._security.certificates import Certificate
 from trade._security.policy_file import read_policy
-from trade._text_file import as_before, as_text
 from trade.errors import ConfigurationError
 from trade.rules._file import read_rules
+from trade.text_files import as_before, as_text
 from trade_drivers import load
 from trade_gateway.cli.watching._profile import read as read_profile
 from trade_gateway.config._gateway_file import read_gateway_file

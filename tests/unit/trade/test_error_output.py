@@ -1,6 +1,6 @@
 """Standard error of a command that another process ran, as people read it."""
 
-from trade._remote.error_output import as_text, last_line
+from trade.command_output import as_text, last_line
 
 JSON = '{"error":"ConfigurationError","message":"head.toml: no such port","data":{"where":"head.toml"}}'
 

@@ -6,8 +6,8 @@ import time
 import pytest
 
 from trade._notifications.triggers import TriggerSpec
-from trade._timestamps import clock, day_and_clock
 from trade.errors import ConfigurationError, LockedByOther
+from trade.timestamps import clock, day_and_clock
 
 pytestmark = pytest.mark.virtual_time
 

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, service, where
-from trade._stop_line.listener import Listener
 from trade._threads import fork_guard
 from trade.errors import Busy, Cancelled, ConfigurationError, DeadlineExceeded
+from trade.stop_line.listener import Listener
 
 pytestmark = pytest.mark.virtual_time
 

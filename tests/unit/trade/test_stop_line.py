@@ -18,13 +18,13 @@ from trade._audit.events import Event
 from trade._estop.broadcast import EstopReport, all_of
 from trade._paths import runtime_folder
 from trade._protocol.messages import Malformed
-from trade._stop_line import StopLines, StopReport
-from trade._stop_line.group_stop import together
-from trade._stop_line.listener import MOST_STRANGERS
-from trade._stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
-from trade._stop_line.places import Place, line_port, places
 from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import listen_on_host
+from trade.stop_line import StopLines, StopReport
+from trade.stop_line.group_stop import together
+from trade.stop_line.listener import MOST_STRANGERS
+from trade.stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
+from trade.stop_line.places import Place, line_port, places
 
 StartContainer = Callable[..., Container]
 
@@ -400,7 +400,7 @@ def test_a_dead_endpoint_keeps_no_report_waiting(
     driver: Container, lamp: Lamp, dead: Place, ask: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = [*places(driver.settings), dead]
-    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    monkeypatch.setattr("trade.stop_line.client.places", lambda _: known)
     line = lines(driver)
     asked = line.stop("rosie", "", 60) if ask == "stop" else line.estop("abc", "", 60)
     assert asked.wait_enough().complete
@@ -415,7 +415,7 @@ def test_a_place_that_accepts_and_does_not_answer_is_waited_for(
     """As that of a robot in a flood, or frozen: the others' confirmations do not speak for it."""
     assert dead.endpoint is not None
     known = [*places(driver.settings), dead]
-    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    monkeypatch.setattr("trade.stop_line.client.places", lambda _: known)
     with socket.create_server(("127.0.0.1", line_port(dead.endpoint.port))):
         asked = lines(driver).estop("abc", "", 1.5)
         assert asked.wait_enough().complete  # what is confirmed, is confirmed
@@ -428,7 +428,7 @@ def test_a_place_that_refuses_the_request_makes_no_report_enough(
     driver: Container, lamp: Lamp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = [*places(driver.settings), Place(".stop-1-gone", path=runtime_folder() / ".stop-1-gone")]
-    monkeypatch.setattr("trade._stop_line.client.places", lambda _: known)
+    monkeypatch.setattr("trade.stop_line.client.places", lambda _: known)
     asked = lines(driver).estop("abc", "", 3)
     assert asked.wait_enough().complete
     assert not asked.is_enough()

@@ -16,9 +16,9 @@ import typer
 from msgspec import Struct
 from rich.markup import escape
 
-from trade._atomic_file import replace
-from trade._text_file import as_before, as_text
+from trade.atomic_files import replace
 from trade.errors import ConfigurationError, WrongDevice
+from trade.text_files import as_before, as_text
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._output import Output

@@ -9,9 +9,9 @@ import typer
 from msgspec.structs import replace
 from rich.markup import escape
 
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError, TradeError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_drivers import SerialBus, drivers, load, refusals
 from trade_drivers.plugins._ports import SeenPorts
 from trade_gateway.cli._options import Json

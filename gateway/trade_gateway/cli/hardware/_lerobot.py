@@ -8,8 +8,8 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta, Struct
 
-from trade._text_file import read_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
 from trade_drivers import Joint, Robot, SerialBus
 
 _DRIVERS: Final = {"dynamixel": 1_044_479, "feetech": 2047}

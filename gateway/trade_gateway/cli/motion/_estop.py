@@ -7,8 +7,8 @@ from rich.markup import escape
 
 from trade import Container, EstopReport, Reachability
 from trade._estop.controller import new_estop_id
-from trade._stop_line import StopLines
 from trade.errors import NoSuchEstop
+from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, say_elsewhere, say_unreached

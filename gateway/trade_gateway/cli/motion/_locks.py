@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from trade import Constraint, Container, LockInfo
 from trade._locks.api import RESUME_WAIT_S
-from trade._timestamps import clock
+from trade.timestamps import clock
 from trade_gateway._usage import asked_for
 from trade_gateway.cli._completion import groups, locked_groups
 from trade_gateway.cli._options import Json

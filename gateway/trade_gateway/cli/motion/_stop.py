@@ -6,7 +6,7 @@ import typer
 from rich.markup import escape
 
 from trade import StopReport
-from trade._stop_line import StopLines, together
+from trade.stop_line import StopLines, together
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain, say_elsewhere, say_unreached

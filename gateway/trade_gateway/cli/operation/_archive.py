@@ -22,7 +22,7 @@ from typing import IO, Annotated, Final, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
-from trade._atomic_file import fresh_beside
+from trade.atomic_files import fresh_beside
 from trade.errors import ConfigurationError
 
 CONFIG: Final = "config"

@@ -16,9 +16,9 @@ import typer
 from rich.markup import escape
 
 from trade import Settings
-from trade._text_file import read_text
-from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
+from trade.toml_files import read_toml_text
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.operation._archive import (

@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import typer
 from rich.markup import escape
 
-from trade._atomic_file import replace
+from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway._usage import UsageError

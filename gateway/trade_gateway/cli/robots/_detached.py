@@ -16,7 +16,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, Settings
-from trade._remote.error_output import as_text
+from trade.command_output import as_text
 from trade.errors import CannotStart
 from trade.starting import Started
 from trade_gateway.cli._output import Output

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trade import Container, ContainerInfo, where
-from trade._atomic_file import claim, fresh_beside
+from trade.atomic_files import claim, fresh_beside
 from trade.errors import ConfigurationError
 from trade_gateway.config._described import ChildTables, Difference, as_toml, described, differences, paths_in
 from trade_gateway.config._gateway_file import read_gateway_file

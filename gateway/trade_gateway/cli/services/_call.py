@@ -16,8 +16,8 @@ from trade import Handle
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import ServiceInfo
 from trade._protocol.schema import read_schema
-from trade._stop_line import StopLines
 from trade.errors import TradeError
+from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError, find
 from trade_gateway.cli._completion import containers, services
 from trade_gateway.cli._options import TIMING, Json, Wait

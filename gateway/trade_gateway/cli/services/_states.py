@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 from msgspec import Struct
 
 from trade import Container, LinkInfo, ListenerInfo, NetworkInfo, StateEvent
-from trade._timestamps import clock
 from trade.errors import AccessDenied
+from trade.timestamps import clock
 from trade_gateway.cli._output import Output, complain
 
 Row = tuple[str, ...]

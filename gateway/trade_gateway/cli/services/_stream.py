@@ -7,7 +7,7 @@ import msgspec
 import typer
 
 from trade import Sample
-from trade._timestamps import clock
+from trade.timestamps import clock
 from trade_gateway._usage import find
 from trade_gateway.cli._completion import services
 from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json, Wait

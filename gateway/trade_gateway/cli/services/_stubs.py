@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from trade._atomic_file import replace
+from trade.atomic_files import replace
 from trade_gateway._usage import asked_for
 from trade_gateway.cli._completion import groups
 from trade_gateway.cli._options import Wait

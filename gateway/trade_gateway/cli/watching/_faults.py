@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from trade import Container, where
-from trade._timestamps import day_and_clock
 from trade.errors import InvalidArgument, TradeError, as_commands
+from trade.timestamps import day_and_clock
 from trade_gateway._usage import UsageError, asked_for
 from trade_gateway.cli._options import FirstByDefault, Json
 from trade_gateway.cli._output import Output, complain

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from trade import LogLine, LogReader
-from trade._timestamps import clock
+from trade.timestamps import clock
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others

@@ -11,10 +11,10 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import CallDeviation, CallModel, Span
-from trade._atomic_file import replace
 from trade._telemetry.call_model import deviations, learn
-from trade._text_file import read_text
+from trade.atomic_files import replace
 from trade.errors import ConfigurationError
+from trade.text_files import read_text
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain

@@ -8,9 +8,9 @@ import typer
 from rich.markup import escape
 
 from trade import Container, where
-from trade._timestamps import clock
 from trade.errors import TradeError
 from trade.rules import GROUP, DryRun, Firing, RuleInfo, Rules, StepResult, read_rules, rehearse
+from trade.timestamps import clock
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from trade import Container, Handle, LoadInfo, where
 from trade._protocol.messages import HEALTHY
-from trade._timestamps import clock
+from trade.timestamps import clock
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, table_lines
 from trade_gateway.cli._system_choice import visitor

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 import typer
 
 from trade import Span, Trace
-from trade._timestamps import clock
+from trade.timestamps import clock
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output

@@ -14,8 +14,8 @@ from rich.markup import escape
 
 from trade import Constraint, Container, Estop, Handle, LockInfo, where
 from trade._protocol.messages import HEALTHY
-from trade._timestamps import clock
 from trade.errors import TradeError
+from trade.timestamps import clock
 from trade_gateway._usage import asked_for
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output

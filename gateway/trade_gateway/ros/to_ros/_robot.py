@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from trade import Container
-from trade._text_file import read_text
+from trade.text_files import read_text
 from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._file import RobotEntry
 from trade_gateway.ros._graph import Graph

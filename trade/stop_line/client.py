@@ -14,10 +14,10 @@ from typing import Final, Generic, TypeVar
 from trade._estop.broadcast import EstopReport, all_of, as_seen_here
 from trade._protocol.messages import Malformed
 from trade._settings import Settings
-from trade._stop_line.group_stop import StopReport, together
-from trade._stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
-from trade._stop_line.places import Place, places
 from trade._transport.endpoints import accepts
+from trade.stop_line.group_stop import StopReport, together
+from trade.stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
+from trade.stop_line.places import Place, places
 
 _logger = logging.getLogger("trade")
 

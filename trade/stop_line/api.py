@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from trade._calls.client import CallClient
 from trade._estop.controller import LIMIT_S, check_limit
 from trade._registry.constraints import where
-from trade._stop_line.client import StopLines
-from trade._stop_line.group_stop import GroupStop, StopReport, session_for, together
+from trade.stop_line.client import StopLines
+from trade.stop_line.group_stop import GroupStop, StopReport, session_for, together
 
 
 class StopApi:

@@ -4,12 +4,12 @@ Each container listens on it; any client that may reach the container may ask it
 docs/wire-protocol.md, "The stop line", describes its messages.
 """
 
-from trade._stop_line.api import StopApi
-from trade._stop_line.client import LineCall, StopLines
-from trade._stop_line.elsewhere import elsewhere
-from trade._stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
-from trade._stop_line.relayed_estop import RelayedEstop
-from trade._stop_line.service import StopLineService
+from trade.stop_line.api import StopApi
+from trade.stop_line.client import LineCall, StopLines
+from trade.stop_line.elsewhere import elsewhere
+from trade.stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
+from trade.stop_line.relayed_estop import RelayedEstop
+from trade.stop_line.service import StopLineService
 
 __all__ = [
     "GroupStop",

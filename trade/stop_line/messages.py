@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from trade._estop.broadcast import EstopReport
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import Estop, Malformed
-from trade._stop_line.group_stop import StopReport
+from trade.stop_line.group_stop import StopReport
 
 VERSION: Final = 1
 LONGEST_REASON: Final = 500

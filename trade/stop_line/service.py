@@ -17,13 +17,13 @@ from trade._protocol.messages import Malformed
 from trade._security.authorizer import Authorizer
 from trade._security.certificates import Certificate, line_context
 from trade._settings import Settings
-from trade._stop_line.group_stop import StopReport
-from trade._stop_line.listener import Listener
-from trade._stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
-from trade._stop_line.places import host_socket, network_socket
 from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import is_deaf
 from trade.errors import LimitExceeded, TradeError
+from trade.stop_line.group_stop import StopReport
+from trade.stop_line.listener import Listener
+from trade.stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
+from trade.stop_line.places import host_socket, network_socket
 
 _logger = logging.getLogger("trade")
 
