@@ -26,8 +26,8 @@
         |   `-- WrongDevice, DeviceAbsent
         `-- CannotConnect, NoContainerFound, CannotStart, LinkStays
 
-Every error carries its data as attributes, crosses the wire with them, and says what to do next. `TradeError.text`
-says it for programs, or for people at a terminal. Each also inherits the builtin that a Python programmer would catch
+Every error carries its data as attributes, crosses the wire with them, and says what to do next: `str` for
+programs, `at_terminal` for people. Each also inherits the builtin that a Python programmer would catch
 for it, so ``except TimeoutError`` catches a deadline that passed.
 
 All errors are in one module, so that a reader sees the whole tree.
@@ -111,18 +111,8 @@ class TradeError(Exception):
     """The root of all errors that this project raises on purpose."""
 
     def __str__(self) -> str:
-        return self.text()
-
-    def text(self, *, at_terminal: bool = False) -> str:
-        """What happened, why, and what to do.
-
-        Args:
-            at_terminal: whether to name commands, instead of functions of Python.
-        """
         advice = self.advice()
-        if advice is None:
-            return self.describe()
-        return f"{self.describe()}{advice.joint}{advice.command if at_terminal else advice.call}"
+        return self.describe() if advice is None else f"{self.describe()}{advice.joint}{advice.call}"
 
     def describe(self) -> str:
         """What happened, and why; also what to do, if that is the same in a program and at a terminal."""
@@ -156,6 +146,15 @@ _METHOD: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
 def as_commands(device: str, remedy: str) -> str:
     """Turns a driver's remedy into commands: ``call enable()`` becomes ``trade call rosie.neck.pan.enable``."""
     return _METHOD.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
+
+
+def at_terminal(error: BaseException) -> str:
+    """The message of an error, with commands instead of functions of Python."""
+    if isinstance(error, DeviceFault):
+        return as_commands(error.device, str(error))
+    if not isinstance(error, TradeError) or (advice := error.advice()) is None:
+        return str(error)
+    return f"{error.describe()}{advice.joint}{advice.command}"
 
 
 def never_ran(error: TradeError, key: object) -> bool:
@@ -783,10 +782,6 @@ class DeviceFault(DeviceError, RuntimeError):
 
     def describe(self) -> str:
         return f"{self.device} on {self.bus}: {self.fault}; {self.remedy}"
-
-    def text(self, *, at_terminal: bool = False) -> str:
-        text = self.describe()
-        return as_commands(self.device, text) if at_terminal else text
 
 
 @dataclass(kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from rich.markup import escape
 from trade import Settings
 from trade._default_system import is_of_user
 from trade._protocol.remote_errors import RemoteTraceback
-from trade.errors import RemoteError, TradeError
+from trade.errors import RemoteError, TradeError, at_terminal
 from trade.stop_line import elsewhere
 
 NOT_FOUND: Final = 3
@@ -151,14 +151,14 @@ def say_error(error: BaseException, *, as_json: bool = False, whole: bool = Fals
     if as_json and isinstance(error, Exception):
         own = isinstance(error, TradeError)
         data = {field.name: getattr(error, field.name) for field in fields(error)} if own else {"traceback": traceback}
-        shown = {"error": type(error).__name__, "message": _with_commands(error), "data": data}
+        shown = {"error": type(error).__name__, "message": at_terminal(error), "data": data}
         print(msgspec.json.encode(shown, enc_hook=str).decode(), file=sys.stderr, flush=True)  # noqa: T201
         return
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if whole and traceback:
         console.print(traceback.rstrip(), markup=False)
     if not whole or not traceback or isinstance(error, TradeError):
-        console.print(f"[bold red]{type(error).__name__}[/]: {escape(_with_commands(error))}")
+        console.print(f"[bold red]{type(error).__name__}[/]: {escape(at_terminal(error))}")
     if not whole and (isinstance(error, RemoteError) or not isinstance(error, TradeError)):
         for line in _place(traceback, rest):
             console.print(line, markup=False)
@@ -172,8 +172,3 @@ def _place(traceback: str, rest: str) -> list[str]:
     file, number, function, code = found[-1]
     place = f"  raised by the provider in {file}, line {number}, in {function}:"
     return [place, *([f"      {code.strip()}"] if code else []), *([f"  {rest}"] if rest else [])]
-
-
-def _with_commands(error: BaseException) -> str:
-    """The message, with remedies as commands."""
-    return error.text(at_terminal=True) if isinstance(error, TradeError) else str(error)

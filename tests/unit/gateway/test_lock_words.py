@@ -18,6 +18,7 @@ from trade.errors import (
     Stopped,
     TooManyServices,
     TradeError,
+    at_terminal,
 )
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
@@ -85,9 +86,8 @@ def _errors() -> list[TradeError]:
 @pytest.mark.parametrize("error", _errors(), ids=lambda error: type(error).__name__)
 def test_no_advice_at_a_terminal_names_python(error: TradeError) -> None:
     python = re.compile(r"trade\.[a-z_]+\(|with_\(|partial=")
-    assert "`trade " in error.text(at_terminal=True) or " --" in error.text(at_terminal=True)
-    assert not python.search(error.text(at_terminal=True))
-    assert str(error) == error.text()
+    assert "`trade " in at_terminal(error) or " --" in at_terminal(error)
+    assert not python.search(at_terminal(error))
     assert python.search(str(error)) or "`trade estop" in str(error)
 
 
