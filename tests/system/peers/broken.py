@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from trade._container import container
+from trade._calls import client
 from trade._context import active_calls
 from trade._discovery.announcer import Announcer
 from trade._estop import broadcast, latch, store
@@ -85,7 +85,7 @@ def _check_numbers(self: resource.Resource, tokens: Any, caller: str, session: s
     _check_lock(self, [messages.Token(self.epoch, token.number) for token in tokens], caller, session)
 
 
-_new_request: Any = container.new_request
+_new_request: Any = client.new_request
 
 
 def _as_long_as_usual(deadline_s: float | None) -> Any:
@@ -133,7 +133,7 @@ BREAK: dict[str, Callable[[], None]] = {
     "stops-in-line": _put(local_service.LocalService, "run", _run_in_line),
     "trusts-its-namesakes": _put(resource.Resource, "_is_of", _of_one_identity),
     "ignores-epochs": _put(resource.Resource, "check_lock", _check_numbers),
-    "outlives-its-caller": _put(container, "new_request", _as_long_as_usual),
+    "outlives-its-caller": _put(client, "new_request", _as_long_as_usual),
     "believes-any-estop": _put(broadcast, "decode_estop_order", _from_anybody),
     "hears-its-own-version-only": _all_of(  # and does not learn of it from the suite's own container either
         _put(broadcast, "decode_estop_order", _of_our_version),
