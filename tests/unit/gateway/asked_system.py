@@ -88,7 +88,7 @@ class World:
         for name in names:
 
             def noted(system: System, *args: Any, _name: str = name, **kwargs: Any) -> list[str]:
-                place = system._member().address.container
+                place = system._components().client.name
                 self.calls.append(" ".join([place, _name, *map(str, args)]))
                 return []
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import gc
 import threading
-from collections.abc import Generator, Sequence, Set
+from collections.abc import Callable, Generator, Sequence, Set
 from typing import ClassVar
 
 from trade._container.container import Container
@@ -96,11 +96,16 @@ def virtual_time(
     start = Container.__init__
 
     def start_in_memory(
-        container: Container, settings: Settings | None = None, *, transport: Transport | None = None
+        container: Container,
+        settings: Settings | None = None,
+        *,
+        transport: Transport | None = None,
+        on_terminate: Callable[[], None] | None = None,
     ) -> None:
         settings = settings or Settings.read()
         network = networks.setdefault(settings.system, Network(seed=seed))
-        start(container, settings, transport=transport or MemoryTransport(network, settings.container))
+        carried_by = transport or MemoryTransport(network, settings.container)
+        start(container, settings, transport=carried_by, on_terminate=on_terminate)
 
     policy = asyncio.get_event_loop_policy()  # pyright: ignore[reportDeprecated] - Python 3.10 has no other way
     with replaced(scheduler, files, packages) as undo:
