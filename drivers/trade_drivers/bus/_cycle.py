@@ -1,6 +1,5 @@
 """The cyclic exchange with the devices of a bus: jobs in their order, and stops immediately."""
 
-import logging
 import sys
 import threading
 import time
@@ -15,8 +14,6 @@ from trade_drivers.bus._attempts import ATTEMPTS
 from trade_drivers.bus._jobs import Device, Work
 from trade_drivers.robotfile import Bus
 
-silences: Final = logging.getLogger("trade.silences")
-"""The logger for devices that do not answer; a program that reports faults itself raises its level."""
 PROBE_NS: Final = 500_000_000
 """The first pause before a device that did not answer is tried again."""
 HALT_NS: Final = 2_000_000_000
@@ -309,7 +306,6 @@ class BusCycle(ABC, Generic[_Device]):
         if device.silent:
             device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - ATTEMPTS + 1))
         elif device.misses >= ATTEMPTS and device.age_ns(now_ns) > self.stale_after_ns:
-            silences.warning("%s does not answer on %s", device.name, device.bus)
             device.silent, device.silent_since_ns = True, now_ns
             device.misses, device.probe_at_ns = ATTEMPTS, now_ns + PROBE_NS
         elif device.misses >= ATTEMPTS:

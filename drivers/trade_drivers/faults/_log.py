@@ -1,5 +1,6 @@
 """The fault log of a robot, with its services."""
 
+import logging
 import secrets
 import threading
 import time
@@ -15,6 +16,8 @@ from trade_drivers.faults._record import Fault, FaultInfo, Moment, info_of, samp
 from trade_drivers.faults._store import FaultStore, Kept, Key
 from trade_drivers.faults._trouble import Found
 
+_logger = logging.getLogger("trade")
+
 _MOST: Final = 200
 """How many kinds of fault are kept; ended and acknowledged ones are dropped first, oldest first."""
 _SAVE_EVERY_S: Final = 1.0
@@ -22,6 +25,8 @@ _AGAIN_S: Final = 5.0
 """A fault that was open when the previous process ended, and is found again within this time, is not counted again."""
 _DISK_S: Final = 10.0
 _MOST_EVIDENCE: Final = 16
+_REPORT_EVERY_S: Final = 10.0
+"""A fault that comes and goes is reported no more often."""
 
 Id = Annotated[str, Meta(description="id of a fault, as faults() returns it: rosie-3f2a")]
 Note = Annotated[str, Meta(min_length=1, max_length=500, description="a finding, and where its evidence is")]
@@ -62,6 +67,10 @@ class FaultLog:
         devices: Collection[str] | None = None,
     ) -> None:
         self._robot, self._store, self._most = robot, store, most
+        self.report: Callable[[str], object] = _logger.warning
+        """Called with the text of each fault that begins; a program that shows faults in its own way replaces it."""
+        self._reported: dict[Key, float] = {}
+        """When each fault was reported last, by the monotonic clock."""
         self._clock, self._wall = clock or time.monotonic, wall or time.time
         self._lock = threading.Lock()
         self._entries: dict[Key, _Entry] = {}
@@ -156,6 +165,12 @@ class FaultLog:
                 self._change(entry, open=True, gone_at=None, text=found.text, remedy=found.remedy)
             elif not entry.fault.open:
                 self._begin_again(entry, found, at, at_s, moments)
+            else:
+                return
+            if at_s < self._reported.get(key, -_REPORT_EVERY_S) + _REPORT_EVERY_S:
+                return
+            self._reported[key] = at_s
+        self.report(found.text)
 
     def end(self, device: str, kind: str, at: float, at_s: float) -> None:
         """Records the end of a fault, if it was open."""
@@ -213,6 +228,7 @@ class FaultLog:
 
     def _drop(self, key: Key) -> None:
         del self._entries[key]
+        self._reported.pop(key, None)
         self._unsaved.add(key)
 
     def _begin_again(self, entry: _Entry, found: Found, at: float, at_s: float, moments: Sequence[Moment]) -> None:

@@ -142,6 +142,18 @@ def test_a_fault_that_flickers_is_one_with_its_count_and_few_writes(bench: Bench
     assert only(bench.open()) == before
 
 
+def test_a_beginning_is_reported_at_once_and_a_fault_that_flickers_every_ten_seconds(bench: Bench) -> None:
+    said: list[str] = []
+    bench.open().report = said.append
+    for _ in range(210):
+        bench.begin()
+        bench.begin()
+        bench.end()
+        bench.clocks.s += 0.1
+    bench.begin(HOT)
+    assert said == [*[LOAD.text] * 3, HOT.text]
+
+
 def test_two_faults_of_one_joint_begin_and_end_one_by_one(bench: Bench) -> None:
     log = bench.open()
     bench.begin(LOAD)

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
-from trade_drivers.bus._cycle import silences
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
 from trade_drivers.joints import Exchange, Steps, Unfit
@@ -130,7 +129,6 @@ class MotorExchange(Exchange[_Axis]):
         for axis in self.devices:
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
-                silences.warning("%s does not answer on %s", axis.name, axis.bus)
                 axis.why_silent = self.why_silent() or axis.why_silent
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns

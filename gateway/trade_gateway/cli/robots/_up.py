@@ -1,6 +1,5 @@
 """``trade up ROBOT.toml``: attaches a robot's devices and offers them as services until it is ended."""
 
-import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
@@ -163,7 +162,7 @@ def up(
         processes = stack.enter_context(BusProcesses(container, whole, own, ports, options))
         _say_attaching(out, whole, robot, ports)
         attached = attach(robot, container, ports={part: port for part, port in ports.items() if part not in own})
-        logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch reports them once, with the time
+        attached.faults.report = lambda _: None  # FaultWatch shows them, with the time
         stack.callback(_say_left, attached)
         stack.enter_context(attached)
         container.measured_by(attached.measures)
