@@ -19,7 +19,26 @@ _FIRST_CYCLES: Final = 3
 
 
 class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
-    """Drives in profile position mode on a CAN bus, through python-can and canopen."""
+    """Drives in profile position mode on a CAN bus, through python-can and canopen.
+
+    In a robot file::
+
+        [bus.arm]
+        driver = "cia402"
+        interface = "socketcan"
+        channel = "can0"
+
+        [joint.elbow]
+        bus = "arm"
+        id = 3
+        model = "ACME-EC60"
+        counts_per_rev = 4096
+        gear = 50
+        min_rad = -1.4
+        max_rad = 1.4
+        max_speed_rad_s = 2.0
+        max_accel_rad_s2 = 10.0
+    """
 
     name = "cia402"
     models = ()

@@ -14,7 +14,24 @@ if TYPE_CHECKING:
 
 
 class DamiaoDriver(CanMotorDriver[DamiaoAxis, "DamiaoExchange"]):
-    """Damiao motors on a CAN bus."""
+    """Damiao motors on a CAN bus.
+
+    In a robot file::
+
+        [bus.arm]
+        driver = "damiao"
+        interface = "socketcan"
+        channel = "can0"
+
+        [joint.elbow]
+        bus = "arm"
+        id = 3
+        model = "DM4310"
+        min_rad = -1.4
+        max_rad = 1.4
+        max_speed_rad_s = 2.0
+        max_accel_rad_s2 = 10.0
+    """
 
     name = "damiao"
     models = MODELS

@@ -21,7 +21,24 @@ _SLOW_ANSWER_S: Final = 100e-6
 
 
 class DynamixelDriver(ServoDriver[DynamixelAxis, "Wire"]):
-    """X-series servos in position control on a serial bus, through dynamixel-sdk."""
+    """X-series servos in position control on a serial bus, through dynamixel-sdk.
+
+    In a robot file::
+
+        [bus.arm]
+        driver = "dynamixel"
+        port = "/dev/serial/by-id/usb-1a86_USB_Single_Serial_58FA083324-if00"
+        baud = 1_000_000
+
+        [joint.elbow]
+        bus = "arm"
+        id = 3
+        model = "XL430-W250"
+        min_rad = -1.4
+        max_rad = 1.4
+        max_speed_rad_s = 2.5
+        max_accel_rad_s2 = 20.0
+    """
 
     name = "dynamixel"
     models = table.BY_MODEL_NAME

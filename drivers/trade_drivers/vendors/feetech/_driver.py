@@ -17,7 +17,24 @@ if TYPE_CHECKING:
 
 
 class FeetechDriver(ServoDriver[FeetechAxis, "Wire"]):
-    """STS servos in position control on a serial bus."""
+    """STS servos in position control on a serial bus.
+
+    In a robot file::
+
+        [bus.arm]
+        driver = "feetech"
+        port = "/dev/serial/by-id/usb-1a86_USB_Single_Serial_58FA083324-if00"
+        baud = 1_000_000
+
+        [joint.elbow]
+        bus = "arm"
+        id = 3
+        model = "STS3215"
+        min_rad = -1.4
+        max_rad = 1.4
+        max_speed_rad_s = 2.5
+        max_accel_rad_s2 = 20.0
+    """
 
     name = "feetech"
     models = table.BY_MODEL_NAME

@@ -14,7 +14,27 @@ if TYPE_CHECKING:
 
 
 class OdriveDriver(CanMotorDriver[OdriveAxis, "OdriveExchange"]):
-    """ODrives with firmware 0.6 on a CAN bus."""
+    """ODrives with firmware 0.6 on a CAN bus.
+
+    In a robot file::
+
+        [bus.arm]
+        driver = "odrive"
+        interface = "socketcan"
+        channel = "can0"
+        leave = "relax"
+
+        [joint.elbow]
+        bus = "arm"
+        id = 3
+        model = "ODrive S1"
+        gear = 8
+        zero = "last"
+        min_rad = -1.4
+        max_rad = 1.4
+        max_speed_rad_s = 2.0
+        max_accel_rad_s2 = 10.0
+    """
 
     name = "odrive"
     models = MODELS

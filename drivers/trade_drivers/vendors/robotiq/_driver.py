@@ -49,7 +49,23 @@ class AttachedGrippers(ThreadedBus[Exchange]):
 
 
 class RobotiqDriver(Driver):
-    """2F-85 grippers on a serial bus, through pymodbus."""
+    """2F-85 grippers on a serial bus, through pymodbus.
+
+    In a robot file::
+
+        [bus.hand]
+        driver = "robotiq"
+        port = "/dev/serial/by-id/usb-FTDI_USB_TO_RS-485-if00-port0"
+        baud = 115200
+
+        [gripper.hand]
+        bus = "hand"
+        id = 9
+        model = "2F-85"
+        max_width_m = 0.085
+        max_speed_m_s = 0.15
+        max_force_n = 100.0
+    """
 
     modules = ("pymodbus", "serial")
     devices = (robotfile.Gripper,)

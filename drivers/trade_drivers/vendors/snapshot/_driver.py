@@ -31,7 +31,16 @@ class Options(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class SnapshotDriver(SenseDriver):
-    """Network cameras that answer an HTTP request with a picture."""
+    """Network cameras that answer an HTTP request with a picture.
+
+    In a robot file::
+
+        [camera.eye]
+        driver = "snapshot"
+        url = "http://192.168.0.20/snapshot.jpg"
+        width_px = 640
+        height_px = 480
+    """
 
     def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
         options = device.options_as(Options)

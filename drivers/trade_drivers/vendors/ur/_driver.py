@@ -62,7 +62,24 @@ class AttachedController(ThreadedBus[Exchange]):
 
 
 class UrDriver(Driver):
-    """Arms of Universal Robots, through ur-rtde."""
+    """Arms of Universal Robots, through ur-rtde.
+
+    In a robot file::
+
+        [bus.ur]
+        driver = "ur"
+        host = "192.168.0.10"
+
+        [arm.right]
+        bus = "ur"
+        model = "UR5e"
+        min_rad = [-3.1, -3.1, -2.8, -3.1, -3.1, -3.1]
+        max_rad = [3.1, 0.1, 2.8, 3.1, 3.1, 3.1]
+        max_speed_rad_s = 1.0
+        max_accel_rad_s2 = 2.5
+        max_speed_m_s = 0.5
+        max_accel_m_s2 = 1.2
+    """
 
     modules = ("rtde_control", "rtde_receive", "rtde_io")
     own_clock = "its library ur-rtde is in C++, waits by itself, and runs in processes of its own"
