@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade_drivers.robotfile import Drill
-from trade_gateway.drill._processes import Actor, DrillFailed
 from trade_gateway.drill._report import Played, Stop
 from trade_gateway.drill._scenes import Scene, limit_s
 from trade_gateway.drill._targets import Target
 from trade_gateway.drill._testbed import Testbed
+from trade_gateway.process._json_child import ChildFailed, JsonChild
 
 _TRIES: Final = 3
 _BEGUN_S: Final = 20.0
@@ -21,6 +21,10 @@ _REST_S: Final = 12.0
 _QUIET_S: Final = 1.0
 """A joint at rest for so long is finally at rest, in seconds."""
 _LOOK_EVERY_S: Final = 0.05
+
+
+class DrillFailed(ChildFailed):
+    """A drill cannot run: a process or device that it needs does not start, or does not move."""
 
 
 def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
@@ -35,7 +39,7 @@ def play(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Drill) 
     while not stops and len(problems) < _TRIES:
         try:
             stops = _played(stand, scene, concerned, given)
-        except DrillFailed as problem:
+        except ChildFailed as problem:
             problems.append(str(problem))
         finally:
             stand.dismiss()
@@ -69,7 +73,7 @@ def _played(stand: Testbed, scene: Scene, targets: Sequence[Target], given: Dril
     ]
 
 
-def _begin(stand: Testbed, caller: Actor, targets: Sequence[Target]) -> None:
+def _begin(stand: Testbed, caller: JsonChild, targets: Sequence[Target]) -> None:
     """Starts the motion. Raises DrillFailed."""
     caller.tell()
 

@@ -18,9 +18,9 @@ import msgspec
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import Robot
 from trade_gateway.drill._caller import Order
-from trade_gateway.drill._processes import Actor, bare_environment
 from trade_gateway.drill._scenes import VALID_S, Scene
 from trade_gateway.drill._targets import Target
+from trade_gateway.process._json_child import JsonChild, bare_environment
 
 
 class _Event(msgspec.Struct, frozen=True):
@@ -97,7 +97,7 @@ class Testbed:
         self._off: list[str] = []
         self._system = f"drill-{secrets.token_hex(3)}"
         self._secret = f"drill:{secrets.token_hex(16)}"
-        self._actors: dict[str, Actor] = {}
+        self._actors: dict[str, JsonChild] = {}
         self.judge = Judge(sim.log_path)
         ports = [word for bus, port in sim.ports.items() for word in ("--port", f"{bus}={port}")]
         without = [word for part in left_out for word in ("--without", part)]
@@ -105,7 +105,7 @@ class Testbed:
         self._near, self._far = _free_ports(2)
 
     def begin(self) -> None:
-        """Starts the processes. Raises DrillFailed."""
+        """Starts the processes. Raises ChildFailed."""
         self._actors["link"] = self._actor(
             "link", ["trade_gateway.drill._tcp_relay", str(self._near), str(self._far)], {}
         )
@@ -115,8 +115,8 @@ class Testbed:
         for name in ("gateway", "lab", "driver"):
             self._start(name)
 
-    def call(self, scene: Scene, targets: Sequence[Target]) -> Actor:
-        """Starts a caller that has found and enabled its targets, and waits for its cue. Raises DrillFailed."""
+    def call(self, scene: Scene, targets: Sequence[Target]) -> JsonChild:
+        """Starts a caller that has found and enabled its targets, and waits for its cue. Raises ChildFailed."""
         orders = [self._order(scene, target) for target in targets]
         words = ["trade_gateway.drill._caller", msgspec.json.encode(orders).decode()]
         caller = self._actors["caller"] = self._actor("caller", words, self._settings("caller", self._far))
@@ -144,7 +144,7 @@ class Testbed:
         return done_at
 
     def recover(self) -> None:
-        """Reverses the failure: resumes, restarts or reconnects. Raises DrillFailed."""
+        """Reverses the failure: resumes, restarts or reconnects. Raises ChildFailed."""
         for actor in self._actors.values():
             actor.wake()
         for bus in self._unplugged:
@@ -181,8 +181,8 @@ class Testbed:
         self._actors[name] = actor = self._actor(name, ["trade_gateway", "--with-stdin", *words], settings)
         actor.read_message(UP_S)
 
-    def _actor(self, name: str, words: Sequence[str], settings: dict[str, str]) -> Actor:
-        return Actor(name, words, {**bare_environment(), **settings}, self._folder / f"{name}.complaints")
+    def _actor(self, name: str, words: Sequence[str], settings: dict[str, str]) -> JsonChild:
+        return JsonChild(name, words, {**bare_environment(), **settings}, self._folder / f"{name}.complaints")
 
     def _places(self, name: str) -> dict[str, str]:
         """The process's own folders, in which it finds no other process of this host."""
@@ -231,7 +231,7 @@ def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], f
 
     Raises:
         ConfigurationError: there is no simulator, or it refuses this robot.
-        DrillFailed: a process does not start.
+        ChildFailed: a process does not start.
     """
     try:
         from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only a drill needs it

@@ -18,7 +18,7 @@ from trade import Container, Handle, Settings
 from trade.errors import NoSuchService, TradeError
 from trade_gateway._usage import find
 from trade_gateway.clients._errors import NoTwin
-from trade_gateway.drill._processes import Actor, DrillFailed, bare_environment
+from trade_gateway.process._json_child import ChildFailed, JsonChild, bare_environment
 
 _UP_S: Final = 60.0
 _SEEN_S: Final = 10.0
@@ -59,7 +59,7 @@ class Twin:
         self._lock = threading.Lock()
         self._folder = Path(tempfile.mkdtemp(prefix="trade-twin-"))
         self._system = f"twin-{secrets.token_hex(4)}"
-        self._process: Actor | None = None
+        self._process: JsonChild | None = None
         self._container: Container | None = None
 
     def call(self, handle: Handle, args: Any, deadline_s: float, states: Mapping[str, Any]) -> Tried:
@@ -99,10 +99,10 @@ class Twin:
         environment = {**bare_environment(), "TRADE_SYSTEM": self._system, "TRADE_STATE_DIR": str(self._folder)}
         environment |= {name: value for name, value in os.environ.items() if name == _PLACES}
         words = ["trade_gateway", "--with-stdin", "up", str(self._robot), "--sim", "--name", "twin", "--json"]
-        self._process = Actor("twin", words, environment, self._folder / "complaints")
+        self._process = JsonChild("twin", words, environment, self._folder / "complaints")
         try:
             self._process.read_message(_UP_S)
-        except DrillFailed as failed:
+        except ChildFailed as failed:
             raise NoTwin(reason=failed.problem) from None
         own = Settings.read(system=self._system, container="tries", connect=[])
         self._container = Container(

@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import CompressedImage, JointStates, RawImage, Time, group_of
 from trade_gateway.recording._reader import Entry, entries
-from trade_gateway.ros._conversion import ros_path
-from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros_messages._conversion import ros_path
+from trade_gateway.ros_messages._types import Message, Types
 
 _VERSION: Final = 9
 _JOINT_STATES: Final = "/joint_states"

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._graph import Graph
-from trade_gateway.ros._types import Types, installed_definitions
+from trade_gateway.ros_messages._conversion import ros_path
+from trade_gateway.ros_messages._types import Types, installed_definitions
 
 
 class _Side(NamedTuple):

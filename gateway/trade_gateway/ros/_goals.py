@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade.errors import InvalidArgument, ToleranceExceeded
-from trade_gateway.ros._conversion import ros_stamp, seconds
 from trade_gateway.ros._joints import JointNames
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.to_ros._served_goals import Unacceptable
+from trade_gateway.ros_messages._conversion import ros_stamp, seconds
+from trade_gateway.ros_messages._types import Message
 
 ACTION: Final = "control_msgs/action/FollowJointTrajectory"
 SUCCESSFUL: Final = 0

@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, Protocol
 
 from trade.errors import CallerError, CallError
-from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros_messages._types import Message, Types
 
 Heard = Callable[[Message, str], object]
 """Receives a message and the name of the node that sent it (``/teleop``; empty if ROS does not say)."""

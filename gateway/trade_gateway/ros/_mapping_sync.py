@@ -8,8 +8,8 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 from trade import Constraint, Container, Handle, where
 from trade.errors import ConfigurationError
-from trade_gateway.ros._conversion import failure
 from trade_gateway.ros._graph import Closes
+from trade_gateway.ros_messages._conversion import failure
 
 _logger = logging.getLogger("trade")
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.endurance.fuzz._target import Target
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros2._node import Attachment
+from trade_gateway.ros_messages._types import Types
 
 _DEFINITIONS: Final = Path(__file__).parents[2] / "unit" / "ros" / "ros2" / "definitions"
 _KINDS: Final = (

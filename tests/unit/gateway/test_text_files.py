@@ -25,7 +25,7 @@ from trade_gateway.config.document import Document
 from trade_gateway.http._authentication import Tokens, add_token
 from trade_gateway.language._lexicon import read_lexicon
 from trade_gateway.ros._file import read_ros_file
-from trade_gateway.ros._types import Types
+from trade_gateway.ros_messages._types import Types
 from trade_hil_sim.robot._robot import read_robot
 
 _EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -19,7 +19,7 @@ from trade_gateway.ros._graph import (
     RosRefused,
     RosUnreachable,
 )
-from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros_messages._types import Message, Types
 
 PATIENCE_S = 60.0
 

@@ -7,8 +7,8 @@ import pytest
 from tests.unit.ros.robots import Stand
 from trade.errors import ConfigurationError
 from trade_gateway.ros._connect import join, planned
-from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._file import read_ros_file
+from trade_gateway.ros_messages._conversion import ros_path
 
 pytestmark = pytest.mark.virtual_time
 

@@ -8,7 +8,7 @@ import pytest
 from tests.unit.ros.robots import Stand
 from trade.errors import ConfigurationError
 from trade_gateway.ros._connect import planned
-from trade_gateway.ros._types import Types, installed_definitions
+from trade_gateway.ros_messages._types import Types, installed_definitions
 
 pytestmark = pytest.mark.virtual_time
 

@@ -12,8 +12,8 @@ from tests.unit.ros.memory_graph import MemoryGraph, MemoryRos
 from tests.unit.ros.robots import PATIENCE_S, Stand
 from trade import where
 from trade.errors import DeviceFault, ToleranceExceeded
-from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused
+from trade_gateway.ros_messages._conversion import ros_stamp
 
 pytestmark = pytest.mark.virtual_time
 

@@ -14,9 +14,9 @@ from trade_drivers import Trajectory
 from trade_gateway.ros._file import FromJoints
 from trade_gateway.ros._goals import ACTION, goal_of
 from trade_gateway.ros._graph import Graph, RosUnreachable
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.from_ros._sent_goals import SentGoals
 from trade_gateway.ros.from_ros._services import Offered
+from trade_gateway.ros_messages._types import Message
 
 _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 _PEAK: Final = 1.5

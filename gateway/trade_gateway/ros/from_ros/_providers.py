@@ -8,7 +8,7 @@ import msgspec
 
 from trade import Resource, service
 from trade.errors import ConfigurationError
-from trade_gateway.ros._types import Field, Message, Types
+from trade_gateway.ros_messages._types import Field, Message, Types
 
 _STAMP: Final = "std_msgs/msg/Header"
 _OCTETS: Final = ("uint8", "byte", "octet", "char")

@@ -7,7 +7,7 @@ from typing import Any, Final
 from trade import Permit, Resource, current_call, permit
 from trade.errors import DeviceFault, MotionStopped
 from trade_gateway.ros._graph import Ended, Graph, Outcome, Pursuit, RosRefused, RosUnreachable
-from trade_gateway.ros._types import Message
+from trade_gateway.ros_messages._types import Message
 
 _STOPPED_WITHIN_S: Final = 1.8
 """Within the time that the end of a session allows (S05)."""

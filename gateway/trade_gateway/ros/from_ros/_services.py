@@ -9,8 +9,8 @@ from trade import Container, Resource, current_call, permit
 from trade.errors import MotionStopped
 from trade_gateway.ros._file import FromParameters, FromPublish, FromService, FromTopic
 from trade_gateway.ros._graph import Graph, RosRefused, RosUnreachable
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.from_ros._providers import Method, Records, plain, provider
+from trade_gateway.ros_messages._types import Message
 
 _STOPPED_WITHIN_S: Final = 2.0
 _STOPS_OWED: Final = 10

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros1._status import ENDED, Status, now
 from trade_gateway.ros.ros1._wire import action_types
+from trade_gateway.ros_messages._types import Message
 
 if TYPE_CHECKING:
     from trade_gateway.ros.ros1._ros1 import Ros1

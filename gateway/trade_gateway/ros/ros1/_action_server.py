@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
 from trade_gateway.ros.ros1._wire import action_types
+from trade_gateway.ros_messages._types import Message
 
 if TYPE_CHECKING:
     from trade_gateway.ros.ros1._ros1 import Ros1

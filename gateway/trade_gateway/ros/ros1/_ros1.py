@@ -23,13 +23,13 @@ from trade_gateway.ros._graph import (
     RosRefused,
 )
 from trade_gateway.ros._mailbox import Mailbox
-from trade_gateway.ros._types import Message, Types, installed_definitions
 from trade_gateway.ros.ros1._action_client import ActionClient
 from trade_gateway.ros.ros1._action_server import ActionServer
 from trade_gateway.ros.ros1._link import Link, Opened
 from trade_gateway.ros.ros1._node._frames import Head
 from trade_gateway.ros.ros1._service import Served
 from trade_gateway.ros.ros1._wire import message_head, service_head
+from trade_gateway.ros_messages._types import Message, Types, installed_definitions
 
 
 class Nodes:

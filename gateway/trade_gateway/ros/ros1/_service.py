@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 from trade_gateway.ros._graph import Answer
 from trade_gateway.ros._mailbox import Mailbox
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._node._frames import Head
+from trade_gateway.ros_messages._types import Types
 
 _MOST: Final = 32
 """Number of requests that wait."""

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
 
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._node._frames import Head
+from trade_gateway.ros_messages._types import Types
 
 _RULE: Final = "=" * 80
 _AROUND: Final = {

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Refuse
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._action import ANY, CANCEL, ENDS, STATUS, Refusal, Status, uuid
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Server, ServiceRequest
 from trade_gateway.ros.ros2._topics import Topic
+from trade_gateway.ros_messages._types import Message
 
 _MOST_ENDED: Final = 32
 """Number of results kept for late requests; a client of ROS 2 asks as soon as its goal is accepted."""

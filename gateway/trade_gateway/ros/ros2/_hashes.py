@@ -18,7 +18,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._types import Types
+from trade_gateway.ros_messages._types import Types
 
 _UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"

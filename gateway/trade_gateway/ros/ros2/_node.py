@@ -7,11 +7,11 @@ from typing import Final, NamedTuple
 
 import zenoh
 
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros2._hashes import Hashes
 from trade_gateway.ros.ros2._link import Declared, Link
 from trade_gateway.ros.ros2._names import Kind, absolute, data_key, gid, node_token, token
 from trade_gateway.ros.ros2._presence import Presence
+from trade_gateway.ros_messages._types import Types
 
 GID_BYTES: Final = 16
 _FORMAT: Final = struct.Struct(f"<qqB{GID_BYTES}s")

@@ -9,9 +9,9 @@ from typing import Any, Final, cast
 
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Answer, RosRefused
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Server, answering
+from trade_gateway.ros_messages._types import Message
 
 Call = Callable[[str, str, Mapping[str, Any], float], Message]
 """Calls a service: its name, its type, the request, a timeout in seconds."""

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._action import CANCEL, ENDS, Refusal, uuid
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Client, Unanswered
 from trade_gateway.ros.ros2._topics import TopicHeard
+from trade_gateway.ros_messages._types import Message
 
 _ACCEPT_S: Final = 5.0
 _CANCEL_S: Final = 5.0

@@ -19,7 +19,6 @@ from trade_gateway.ros._graph import (
     Pursuit,
     Refuse,
 )
-from trade_gateway.ros._types import Message, Types, installed_definitions
 from trade_gateway.ros.ros2 import _parameters
 from trade_gateway.ros.ros2._goals import Action
 from trade_gateway.ros.ros2._link import Link
@@ -27,6 +26,7 @@ from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._pursuit import Pursuing
 from trade_gateway.ros.ros2._services import Client, Server, answering
 from trade_gateway.ros.ros2._topics import Topic, TopicHeard
+from trade_gateway.ros_messages._types import Message, Types, installed_definitions
 
 _Opened = TypeVar("_Opened", bound=Closes)
 

@@ -20,10 +20,10 @@ import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
 from trade_gateway.ros._mailbox import AtOnce, Mailbox
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Endpoint, Node
+from trade_gateway.ros_messages._types import Message
 
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0

@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 from trade import Constraint, Container, Handle, Run, where
 from trade.errors import ConfigurationError, TradeError
 from trade_gateway.clients._clients import Client
-from trade_gateway.ros._conversion import RequestMapping, failure
 from trade_gateway.ros._file import Command
 from trade_gateway.ros._graph import Closes, Graph
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros._nodes import Guest, Nodes
-from trade_gateway.ros._types import Message
+from trade_gateway.ros_messages._conversion import RequestMapping, failure
+from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")
 

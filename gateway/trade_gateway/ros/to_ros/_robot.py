@@ -7,13 +7,13 @@ from typing import Final
 
 from trade import Container
 from trade.text_files import read_text
-from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._file import RobotEntry
 from trade_gateway.ros._graph import Graph
 from trade_gateway.ros._joints import Measured
-from trade_gateway.ros._types import Message
 from trade_gateway.ros._urdf import Transform, UrdfJoint, read_urdf
 from trade_gateway.ros.to_ros._streams import LimbTopic, Topics
+from trade_gateway.ros_messages._conversion import ros_stamp
+from trade_gateway.ros_messages._types import Message
 
 _TF: Final = "tf2_msgs/msg/TFMessage"
 

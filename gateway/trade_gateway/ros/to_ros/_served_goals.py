@@ -8,10 +8,10 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from trade import Handle, Run
 from trade.errors import SessionEnded
-from trade_gateway.ros._conversion import failure
 from trade_gateway.ros._graph import Ended, Goal, Outcome
 from trade_gateway.ros._nodes import Nodes
-from trade_gateway.ros._types import Message
+from trade_gateway.ros_messages._conversion import failure
+from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")
 

@@ -6,12 +6,12 @@ from typing import Final, NamedTuple
 from trade import Constraint, Container, Handle, Lock, where
 from trade.errors import ConfigurationError
 from trade_gateway.clients._clients import Client
-from trade_gateway.ros._conversion import RequestMapping, ResponseMapping, ros_path
 from trade_gateway.ros._file import LockService, ServiceEntry
 from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services
 from trade_gateway.ros._nodes import UNKNOWN, Nodes
-from trade_gateway.ros._types import Message
+from trade_gateway.ros_messages._conversion import RequestMapping, ResponseMapping, ros_path
+from trade_gateway.ros_messages._types import Message
 
 _SET_BOOL: Final = "std_srvs/srv/SetBool"
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 import msgspec
 
 from trade import Constraint, Container, Handle, where
-from trade_gateway.ros._conversion import ros_stamp, seconds
 from trade_gateway.ros._file import TrajectoryEntry
 from trade_gateway.ros._goals import (
     ACTION,
@@ -25,8 +24,9 @@ from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
 from trade_gateway.ros._joints import LIMBS, JointNames, beside, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place
 from trade_gateway.ros._nodes import Nodes
-from trade_gateway.ros._types import Message
 from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, text_of
+from trade_gateway.ros_messages._conversion import ros_stamp, seconds
+from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")
 

@@ -10,9 +10,9 @@ from tests.support.ros1_system import Stand, our_node
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
-from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros1 import Ros1, _link, _service
 from trade_gateway.ros.ros1._service import Served
+from trade_gateway.ros_messages._types import Message, Types
 
 pytestmark = pytest.mark.realtime
 

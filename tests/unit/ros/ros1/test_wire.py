@@ -10,8 +10,8 @@ import pytest
 from tests.support.ros1_system import PYTHON, need_ros1
 from trade.errors import ConfigurationError
 from trade_gateway.ros import ros1
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._wire import action_types, message_head, service_head
+from trade_gateway.ros_messages._types import Types
 
 MESSAGES = [
     "std_msgs/msg/Empty",

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from pamoja import ros2 as pamoja
 
 from tests.support.ros2_processes import DEFINITIONS
-from trade_gateway.ros._types import Types
+from trade_gateway.ros_messages._types import Types
 
 TYPES = Types(2, [DEFINITIONS])
 numbers = st.floats(allow_nan=False)

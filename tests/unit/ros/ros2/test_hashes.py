@@ -13,8 +13,8 @@ from zenoh_ros2_sdk.utils import compute_service_type_hash, compute_type_hash_fr
 
 from tests.support.ros2_processes import DEFINITIONS
 from trade.errors import ConfigurationError
-from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros2._hashes import Hashes
+from trade_gateway.ros_messages._types import Types
 
 MESSAGES = {
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",

@@ -8,7 +8,7 @@ import msgspec
 
 from trade import Handle
 from trade.errors import ConfigurationError
-from trade_gateway.ros._types import Field, Message, Types
+from trade_gateway.ros_messages._types import Field, Message, Types
 
 _BARE: Final = "data"
 """Common names of the only field of a message."""

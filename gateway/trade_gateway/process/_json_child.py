@@ -1,4 +1,4 @@
-"""A child process of a drill: started, read line by line, killed, frozen and resumed."""
+"""A child process that prints JSON: started, read line by line, killed, frozen and resumed."""
 
 import json
 import os
@@ -19,8 +19,8 @@ _END_S: Final = 20.0
 
 
 @dataclass(kw_only=True, eq=False)
-class DrillFailed(TradeError):
-    """A drill cannot run: a process or device that it needs does not start, or does not move."""
+class ChildFailed(TradeError):
+    """A child process does not start, has ended, or reports an error."""
 
     problem: str
 
@@ -28,7 +28,7 @@ class DrillFailed(TradeError):
         return self.problem
 
 
-class Actor:
+class JsonChild:
     """``python -m WORDS`` as a child process that prints one JSON object per line.
 
     Args:
@@ -51,7 +51,7 @@ class Actor:
                 start_new_session=True,  # Ctrl-C is for this process, which ends the others in order
             )
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._reader = threading.Thread(target=self._read, name=f"drill-{name}", daemon=True)
+        self._reader = threading.Thread(target=self._read, name=f"child-{name}", daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
@@ -66,16 +66,16 @@ class Actor:
         return self._process.poll() is None
 
     def read_message(self, within_s: float) -> dict[str, Any]:
-        """Its next message; raises DrillFailed if there is none in time, or if it reports an error."""
+        """Its next message; raises ChildFailed if there is none in time, or if it reports an error."""
         try:
             line = self._lines.get(timeout=within_s)
         except queue.Empty:
-            raise DrillFailed(problem=f"the {self.name} was not ready within {within_s:g} s") from None
+            raise ChildFailed(problem=f"the {self.name} was not ready within {within_s:g} s") from None
         if not line:
-            raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}")
+            raise ChildFailed(problem=f"the {self.name} ended: {self._last_words()}")
         message: dict[str, Any] = json.loads(line)
         if "error" in message:
-            raise DrillFailed(problem=f"the {self.name} says {message['error']}")
+            raise ChildFailed(problem=f"the {self.name} says {message['error']}")
         return message
 
     def objection(self) -> str:
@@ -84,7 +84,7 @@ class Actor:
             return ""
         try:
             self.read_message(0.0)
-        except DrillFailed as failed:
+        except ChildFailed as failed:
             return failed.problem
         return ""
 
@@ -95,7 +95,7 @@ class Actor:
             self._process.stdin.write(b"\n")
             self._process.stdin.flush()
         except BrokenPipeError:
-            raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}") from None
+            raise ChildFailed(problem=f"the {self.name} ended: {self._last_words()}") from None
 
     def kill(self) -> None:
         """Kills it with SIGKILL."""

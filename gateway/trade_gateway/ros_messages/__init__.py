@@ -1,0 +1,1 @@
+"""Messages of ROS: their definitions, and their conversion to the values of services and back."""
