@@ -69,6 +69,8 @@ class LogReader:
     def read(self) -> list[LogLine]:
         """The lines since the last reading, in order of time by the clocks of their hosts.
 
+        Those of one process keep their order, also if its clock was set back between them.
+
         Raises:
             AccessDenied: the policy does not let this container read group ``trade``.
         """
@@ -85,7 +87,16 @@ class LogReader:
                     new.setdefault((line.process, line.number), line)
         for process, number in new:
             self._known[process] = max(number, self._known.get(process, 0))
-        return sorted(new.values(), key=lambda line: (line.at, line.process, line.number))
+        return _in_order(new.values())
+
+
+def _in_order(lines: Iterable[LogLine]) -> list[LogLine]:
+    latest: dict[str, float] = {}
+    placed: list[tuple[float, str, int, LogLine]] = []
+    for line in sorted(lines, key=lambda line: (line.process, line.number)):
+        at = latest[line.process] = max(line.at, latest.get(line.process, line.at))
+        placed.append((at, line.process, line.number, line))
+    return [line for *_, line in sorted(placed, key=lambda one: one[:3])]
 
 
 class TraceApi:

@@ -60,6 +60,15 @@ def test_a_reader_reads_on(here: Container, there: Container) -> None:
     assert read() == []
 
 
+def test_a_clock_that_is_set_back_changes_the_order_of_no_process(here: Container) -> None:
+    hour_ago = _record("after the clock was set back")
+    hour_ago.created -= 3600.0
+    for record in (_record("before"), hour_ago, _record("at last")):
+        _log.handle(record)
+    own = ("before", "after the clock was set back", "at last")
+    assert tuple(line.text for line in here.logs() if line.text in own) == own
+
+
 def test_lines_are_bounded_in_number_and_length() -> None:
     book = Logbook()
     for number in range(2100):
