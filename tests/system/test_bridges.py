@@ -166,7 +166,7 @@ def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMemb
 
     second = member("left2", "second", "0.0.0.0:7450", bridge="net1,lo")
     second.ask("start")
-    with pytest.raises(AssertionError, match=r"^CannotConnect: .* Those link to each other by connect in their sett"):
+    with pytest.raises(AssertionError, match=r"^CannotConnect: .* bridges link to each other by connect in their sett"):
         second.ask("connect", LEFT)
 
 

@@ -114,7 +114,7 @@ def stranger(sshd: Sshd, wait_s: float = 1.0) -> CannotStart:
 
 
 def process_of(error: CannotStart) -> int:
-    return int(error.said.split("process ")[1].split(",")[0])
+    return int(error.output.split("process ")[1].split(",")[0])
 
 
 def gone(pid: int) -> bool:
@@ -123,7 +123,7 @@ def gone(pid: int) -> bool:
 
 def test_a_container_that_does_not_join_the_system_is_ended_again(sshd: Sshd) -> None:
     error = stranger(sshd)
-    assert error.said.endswith("was not visible here within 1 s, and was ended again")
+    assert error.output.endswith("was not visible here within 1 s, and was ended again")
     wait_until(lambda: gone(process_of(error)))
 
 
