@@ -168,7 +168,8 @@ def attach(
             if angles is not None and name not in (ports or {}):
                 bus.remember(angles)
         providers = _providers(robot, buses, senses)
-        poller.start(providers, _unwatched(robot, buses, poller), _healths(robot, providers, faults))
+        healths = {} if home is None else _healths(robot, providers, faults)
+        poller.start(providers, _unwatched(robot, buses, poller), healths)
         if home is not None:
             for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
                 home.register(provider, (name,))

@@ -115,9 +115,9 @@ class FaultPoller:
         for provider, judges in self._healths.items():
             health = next((text for judge in judges if (text := judge()) != HEALTHY), HEALTHY)
             if health != self._reported.get(provider, HEALTHY):
-                self._reported[provider] = health
-                with suppress(TradeError):  # the container has ended, or the provider was withdrawn
+                with suppress(TradeError):  # the provider is not registered yet, or not any more: it is tried again
                     self._set_health(provider, health)
+                    self._reported[provider] = health
 
     def _measure(self, name: str) -> tuple[Found, ...]:
         """Keeps a device's measurement if it is new, and returns the faults that the device itself reports."""

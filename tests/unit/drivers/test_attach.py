@@ -10,8 +10,10 @@ import pytest
 
 import trade_hil_sim as sim
 from tests.support.fake_container import fake_container
+from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig
-from trade.errors import ConfigurationError
+from trade import Container
+from trade.errors import ConfigurationError, DeviceFault
 from trade_drivers import Driver, drivers, load
 from trade_drivers.plugins import _driver as driver_module
 from trade_hil_sim import DynamixelBus, Servo
@@ -199,6 +201,23 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
     closing = [Outcome(robot.close) for _ in range(3)]
     assert [outcome.wait().error for outcome in closing] == [None] * 3
     assert not announced
+
+
+def test_a_container_that_is_closed_leaves_a_silent_bus(head: Rig, start_container: Callable[..., Container]) -> None:
+    from trade_drivers import attach
+
+    def quiet() -> bool:
+        before = len(head.log)
+        time.sleep(0.3)
+        return len(head.log) == before
+
+    driver = start_container("driver")
+    robot = attach(head.robot, driver, ports=head.ports)
+    assert not quiet()
+    driver.close()
+    wait_until(quiet, "the bus is silent")
+    with pytest.raises(DeviceFault, match="its driver's process is not healthy"):  # they are not left as the file says
+        robot.close()
 
 
 def test_the_example_describes_a_robot_that_can_be_attached(rig: Rig) -> None:

@@ -14,7 +14,7 @@ from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome, Rig
 from tests.unit.drivers.gripper_rig import HandRig
 from trade import Container, where
-from trade.errors import DeviceSilent
+from trade.errors import ConfigurationError, DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
 from trade_drivers.faults import FaultPoller
 
@@ -290,3 +290,20 @@ def test_a_camera_is_not_asked_for_pictures_to_see_whether_it_is_healthy() -> No
     wait_until(lambda: log.health("rosie.pan") == "silent", "the others are asked")
     recorder.close()
     camera.image.assert_not_called()
+
+
+def test_the_health_of_a_provider_is_reported_once_it_is_registered() -> None:
+    provider, attempts, reported = object(), list[str](), list[str]()
+
+    def set_health(_: object, health: str) -> None:
+        attempts.append(health)
+        if len(attempts) < 3:
+            raise ConfigurationError(problem="it is not registered here")
+        reported.append(health)
+
+    poller = FaultPoller(FaultLog("rosie"), "faults of a test", set_health)
+    poller.start({}, (), {provider: [lambda: "degraded: overheating"]})
+    wait_until(lambda: reported, "it is reported")
+    time.sleep(2.0)
+    poller.close()
+    assert (attempts, reported) == (["degraded: overheating"] * 3, ["degraded: overheating"])

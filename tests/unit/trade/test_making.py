@@ -424,3 +424,11 @@ def test_the_environment_names_what_may_be_made() -> None:
     assert read.instantiable == ("mypkg.vision:Camera", "mypkg.arms.*")
     assert Settings.read(environment={"TRADE_SYSTEM": "s"}).instantiable == ()
     assert Settings.read(instantiable=["a:B"], environment={"TRADE_INSTANTIABLE": "c:D"}).instantiable == ("a:B",)
+
+
+def test_a_program_says_what_happens_when_a_client_ends_its_container() -> None:
+    ended: list[str] = []
+    with Container(Settings.read(container="cart"), on_terminate=lambda: ended.append("the program ends")) as cart:
+        cart.system.terminate_container("the cart goes home")
+        wait_until(lambda: ended, "the program hears of it")
+        assert (ended, cart.closed) == (["the program ends"], False)
