@@ -4,19 +4,17 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from math import ceil, floor
-from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from msgspec import Struct
 
-from trade import Resource
+from trade import Permit, Resource
 from trade.errors import DeviceFault, LimitExceeded
 from trade_drivers.bus._cycle import BusDevice
+from trade_drivers.bus._jobs import Work
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints._zero import Zero
 from trade_drivers.robotfile import Joint
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._motion import Motion
 
 AxisT = TypeVar("AxisT", bound="Axis")
 """The axis type of one vendor."""
@@ -106,7 +104,7 @@ class Axis(BusDevice[Sample]):
         """The remedy for a fault that the device itself has latched."""
         self.ready = False
         """True after this driver has enabled the joint, with its checks done and its watchdog armed."""
-        self.motion: Motion[Any] | None = None
+        self.motion: AxisMotion[Any] | None = None
         self.held_counts: int | None = None
         """The position of the last hold command."""
         self.zero = Zero(joint, within_turn=self.within_turn)
@@ -268,3 +266,17 @@ class Axis(BusDevice[Sample]):
             measured_at=time.monotonic() - age_s,
             age_s=age_s,
         )
+
+
+class AxisMotion(Work[AxisT]):
+    """A motion of one or more joints, as far as a joint knows it."""
+
+    permit: Permit
+
+    def goal_of(self, axis: AxisT) -> int:
+        """Returns a joint's goal, in counts."""
+        raise NotImplementedError
+
+    def watch(self, now_ns: int) -> None:
+        """Checks the newest measurements, and ends the motion if it is over or must not continue."""
+        raise NotImplementedError

@@ -7,9 +7,8 @@ import pytest
 
 from trade._estop.deadman import Deadman
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.joints import Axis, Exchange, Ramp
+from trade_drivers.joints import Axis, Exchange, Motion, Ramp
 from trade_drivers.joints._jobs import Enable
-from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._zero import Zero
 from trade_drivers.joints.serial import ServoAxis, written

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
-from trade_drivers.joints import Gate, Goal, Motion, Steps, Work
+from trade_drivers.joints import AxisMotion, Gate, Goal, Steps, Work
 from trade_drivers.joints.serial import ServoExchange, health_of
 from trade_drivers.vendors.feetech import _jobs as jobs
 from trade_drivers.vendors.feetech import _table as table
@@ -103,7 +103,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
             axis.sent, axis.sent_ns = goal.position, sent_ns
 
 
-def _due(motion: Motion[FeetechAxis], now_ns: int) -> dict[FeetechAxis, Goal]:
+def _due(motion: AxisMotion[FeetechAxis], now_ns: int) -> dict[FeetechAxis, Goal]:
     """Returns the next goals of a motion's joints, where they differ from the last ones."""
     due: dict[FeetechAxis, Goal] = {}
     for axis in motion.devices:
