@@ -15,8 +15,8 @@ from trade_drivers.robotfile import parse
 from trade_drivers.vendors.cia402 import _sdo as sdo
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
-from trade_drivers.vendors.dynamixel import _frames as dynamixel
-from trade_drivers.vendors.feetech import _frames as feetech
+from trade_drivers.vendors.dynamixel import _wire as dynamixel
+from trade_drivers.vendors.feetech import _wire as feetech
 from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.robotiq._wire import _QuietClient as ModbusClient
 from trade_drivers.vendors.snapshot._picture import picture

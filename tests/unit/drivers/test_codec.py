@@ -17,7 +17,7 @@ from trade_drivers.joints._profile import Leg, together
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, RESOLUTION, SLOW, DynamixelAxis
-from trade_drivers.vendors.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
+from trade_drivers.vendors.dynamixel._wire import Corrupt, crc16, take_status, unstuffed
 from trade_hil_sim.dynamixel import status
 
 pytestmark = pytest.mark.virtual_time
