@@ -92,7 +92,7 @@ def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig
     assert max(arrived) - min(arrived) < 0.3 * (max(arrived) - min(started))
 
 
-@pytest.mark.parametrize(("model", "other"), zip(MODELS, [*MODELS][1:] + [*MODELS][:1], strict=True))
+@pytest.mark.parametrize(("model", "other"), [*zip(MODELS, [*MODELS][1:] + [*MODELS][:1], strict=True)])
 def test_each_model_is_taken_for_itself_and_for_no_other(rig: TailRig, model: str, other: str) -> None:
     rig.configure(('model = "STS3215"', f'model = "{model}"'))
     rig.plug()
