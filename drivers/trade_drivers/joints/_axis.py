@@ -198,7 +198,7 @@ class Axis(BusDevice[Sample]):
         """
         self.check_zero()
         if self.fault:
-            raise self.faulty()
+            raise self.fault_error()
         return self.fresh(now_ns, stale_after_ns)
 
     def _compare_zero(self, sample: Sample, elapsed_s: float) -> None:
@@ -222,23 +222,23 @@ class Axis(BusDevice[Sample]):
         elif self.sample is not None:
             position = self.sample.position
         if position is not None and (doubt := self.zero.doubt(self.scale.angle_rad(position))):
-            raise self._faulty(doubt, self.zero_remedy)
+            raise self._fault_error(doubt, self.zero_remedy)
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
         """Returns the last measurement. Its age alone decides: a joint just found silent has one that is recent."""
         if self.sample is None or self.age_ns(now_ns) > stale_after_ns:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         return self.sample
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         remedy = "remove the cause, then call enable()"
         if not fault and self.zero.in_doubt:
             remedy = self.zero_remedy
         elif not fault and self.remedy:
             remedy = self.remedy
-        return self._faulty(fault or self.fault, remedy)
+        return self._fault_error(fault or self.fault, remedy)
 
-    def _faulty(self, fault: str, remedy: str) -> DeviceFault:
+    def _fault_error(self, fault: str, remedy: str) -> DeviceFault:
         return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
     def measured(

@@ -160,7 +160,7 @@ class Exchange(BusCycle[AxisT]):
     def require_answering(self, axis: AxisT) -> None:
         """Raises ``DeviceSilent`` for a joint that is left out of the cycles because it does not answer."""
         if axis.silent:
-            raise axis.deaf(self.clock())
+            raise axis.silent_error(self.clock())
 
     # --- parts of a cycle
 
@@ -242,12 +242,12 @@ class Motion(AxisMotion[AxisT], Command[AxisT, Exchange[AxisT]]):
         attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
         if held_up := self.exchange.held_up(attended_ns):
             axis = next((axis for axis in self.devices if axis.fault), self.devices[0])
-            return axis.faulty(f"{axis.fault}; {held_up}" if axis.fault else held_up)
+            return axis.fault_error(f"{axis.fault}; {held_up}" if axis.fault else held_up)
         for axis in self.devices:
             if axis.fault:
-                return axis.faulty()
+                return axis.fault_error()
             if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
-                return axis.deaf(now_ns)
+                return axis.silent_error(now_ns)
         if until_ns is not None and now_ns >= until_ns:
             return MotionStopped(device=self.devices[0].name, reason="its call reached its deadline", late=True)
         return None

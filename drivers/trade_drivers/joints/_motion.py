@@ -114,5 +114,5 @@ class Move(Motion[AxisT]):
                 fault = f"it makes no progress, {short_rad:.3g} rad short of its goal, as if blocked"
                 if blocked:  # blocked: latched, so that it does not move until a client enables it
                     axis.fault, axis.ready = fault, False
-                return axis.faulty(fault)
+                return axis.fault_error(fault)
         return None

@@ -130,7 +130,7 @@ class Follow(Motion[AxisT]):
         off = [problem for axis in self.devices if (problem := self._astray(axis, "goal", tolerances.goal_rad))]
         moving = [axis for axis in self.devices if axis.still < 2]
         if late_s > tolerances.goal_time_s and (off or moving):
-            raise off[0] if off else moving[0].faulty("it does not come to rest at the end of its trajectory")
+            raise off[0] if off else moving[0].fault_error("it does not come to rest at the end of its trajectory")
         return not off and not moving
 
     def _astray(self, axis: AxisT, what: TrajectoryPart, tolerance_rad: float) -> ToleranceExceeded | None:

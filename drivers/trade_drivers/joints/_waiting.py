@@ -35,6 +35,6 @@ def until(
     while not condition():
         bus.require_answering(axis)
         if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # it answers, but the condition is not met
-            raise axis.faulty(otherwise)
+            raise axis.fault_error(otherwise)
         bus.idle(_WAIT_S)
         yield

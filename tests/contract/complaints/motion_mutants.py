@@ -30,7 +30,7 @@ def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
     def strict(self: Enable) -> Iterator[None]:
         for axis in self.devices:
             if axis.fault:
-                raise axis.faulty()
+                raise axis.fault_error()
         yield from steps(self)
 
     patch.setattr(Enable, "steps", strict)

@@ -127,7 +127,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         """
         answer = yield from self.retry(axis, lambda: self.wire.read(axis.id, *axis.settings))
         if problem := self.misfit(axis, answer.data):
-            raise axis.faulty(problem)
+            raise axis.fault_error(problem)
         if axis.sample is not None:
             axis.seed(axis.sample.position)
 
@@ -148,7 +148,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
                 asked = axis.doubted = True
                 yield
             except Refused as refused:
-                raise axis.faulty(f"it refused a command: {refused}") from None
+                raise axis.fault_error(f"it refused a command: {refused}") from None
             else:
                 yield
                 return result

@@ -216,7 +216,7 @@ class DriveAxis(MotorAxis):
         low, high = self.own_range or (place, place)
         if not low - self.resolution.arrived <= place <= high + self.resolution.arrived:
             end = self.scale.angle_rad(low if place < low else high)
-            raise self.faulty(
+            raise self.fault_error(
                 f"it is at {self.scale.angle_rad(place):.3f} rad, outside its own range, which ends at {end:.3f} rad "
                 "(607Dh): turn it back by hand, or widen 607Dh"
             )
@@ -224,7 +224,7 @@ class DriveAxis(MotorAxis):
     def absence(self, now_ns: int) -> DeviceError:
         """Returns the error for a drive that is left out."""
         why = _STOPPED if self.stopped else self.unfit
-        return self.faulty(why) if why else self.deaf(now_ns)
+        return self.fault_error(why) if why else self.silent_error(now_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample = self.fresh(now_ns, stale_after_ns)

@@ -82,7 +82,7 @@ class Homing(Motion[DriveAxis]):
     def _trouble(self, now_ns: int) -> TradeError | None:
         axis = self._axis
         if axis.statusword & machine.HOMING_ERROR:
-            return axis.faulty("it has not found its home (statusword bit 13)")
+            return axis.fault_error("it has not found its home (statusword bit 13)")
         if now_ns >= min(self.until_ns or now_ns + 1, self._began_ns + _LONGEST_NS):
-            return axis.faulty("it has not found its home in time")
+            return axis.fault_error("it has not found its home in time")
         return None

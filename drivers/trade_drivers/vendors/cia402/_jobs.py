@@ -35,7 +35,7 @@ def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: 
     if axis.motion is not None and not axis.fault:
         bus.end_motion(axis, f"{axis.name} was enabled again")
     if not axis.statusword & machine.REMOTE:
-        raise axis.faulty("it does not obey the bus (statusword bit 9), as if operated from its panel")
+        raise axis.fault_error("it does not obey the bus (statusword bit 9), as if operated from its panel")
     if axis.state_now is State.FAULT:
         yield from _reset(bus, job, axis)
     yield from _begin_at_rest(bus, job, axis)
@@ -175,4 +175,4 @@ def write(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, entry: En
     except NoAnswer:
         raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9) from None
     except Refused as refused:
-        raise axis.faulty(f"it refused a command: {refused}") from None
+        raise axis.fault_error(f"it refused a command: {refused}") from None

@@ -128,7 +128,7 @@ class DamiaoAxis(MotorAxis):
         """Returns the next set-point and its maximum speed, on the motor's shaft."""
         course = self.course
         if course is None:
-            raise self.faulty("it has no set-point")
+            raise self.fault_error("it has no set-point")
         elapsed_s = min((now_ns - self.stepped_ns) / 1e9, 2 * period_s)  # after a gap, it continues where it was
         self.stepped_ns = now_ns
         if elapsed_s > 0:

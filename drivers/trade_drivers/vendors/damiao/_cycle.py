@@ -78,7 +78,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         frames_out: list[Frame] = []
         for axis, position in positions.items():
             if axis.course is None:
-                raise axis.faulty("it was enabled, but has let go since")
+                raise axis.fault_error("it was enabled, but has let go since")
             aim(axis.course, position)
             frames_out.append(self._there(axis))
         self.port.send_all(frames_out)

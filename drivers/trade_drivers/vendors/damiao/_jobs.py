@@ -78,7 +78,7 @@ def _written(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: i
     """Writes a register and reads it back; raises ``DeviceFault`` if the value was not kept."""
     yield from _heard(bus, axis, set_register(bus, axis, number, value))
     if axis.answer != value:
-        raise axis.faulty(f"it does not keep register {number:d}: {axis.answer}, not {value}")
+        raise axis.fault_error(f"it does not keep register {number:d}: {axis.answer}, not {value}")
 
 
 def _heard(bus: "DamiaoExchange", axis: DamiaoAxis, asking: Steps) -> Steps:
@@ -88,6 +88,6 @@ def _heard(bus: "DamiaoExchange", axis: DamiaoAxis, asking: Steps) -> Steps:
             bus.idle(_WAIT_S)
             yield
     except NoAnswer:
-        raise axis.deaf(bus.clock()) from None
+        raise axis.silent_error(bus.clock()) from None
     except Unfit as unfit:
-        raise axis.faulty(str(unfit)) from None
+        raise axis.fault_error(str(unfit)) from None

@@ -76,11 +76,11 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         self.require_answering(axis)
         health = yield from self.read_health(axis)
         if health.error and health.torque:
-            raise axis.faulty(f"{axis.fault}, and it has not let go: call relax() before enable()")
+            raise axis.fault_error(f"{axis.fault}, and it has not let go: call relax() before enable()")
         if health.error:
             health = yield from self._restart(job, axis)
         if health.error:
-            raise axis.faulty()
+            raise axis.fault_error()
         yield from self.verify_settings(axis)
         if health.watchdog:
             yield from self.write_register(job, axis, table.BUS_WATCHDOG, 0)
@@ -92,7 +92,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         health = yield from self.read_health(axis)
         kept = yield from self.retry(axis, lambda: self.wire.read(axis.id, *_GOAL_BLOCK).data)
         if not health.torque or health.watchdog != armed or kept != block:
-            raise axis.faulty("it did not keep what enabling it wrote")
+            raise axis.fault_error("it did not keep what enabling it wrote")
         axis.fault, axis.ready = "", True
 
     def relaxing(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
@@ -101,7 +101,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
         yield from self.write_register(job, axis, table.BUS_WATCHDOG, 0)
         health = yield from self.read_health(axis)
         if health.torque:
-            raise axis.faulty("it did not relax: its torque is still on")
+            raise axis.fault_error("it did not relax: its torque is still on")
 
     def leaving(self, job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
         health = yield from self.read_health(axis)
@@ -137,7 +137,7 @@ class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
             if heard is not None and (not heard.error or now_ns - began_ns > _BOOT_NS):
                 return heard
             if now_ns - began_ns > 2 * _BOOT_NS:
-                raise axis.deaf(now_ns)
+                raise axis.silent_error(now_ns)
 
     # --- from the bus thread
 

@@ -102,7 +102,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
             DeviceSilent: the servo was never measured.
         """
         if self.sample is None:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         here, resolution = self.sample.position, self.resolution
         speed_rad_s = aim.speed * resolution.rad_s
         lead_rad = speed_rad_s * self._lead_s + speed_rad_s**2 / (2 * aim.accel * resolution.rad_s2)

@@ -59,7 +59,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
             yield from self.write_register(job, axis, table.TORQUE, 0)
             health = yield from self.read_health(axis)
         if health.error:
-            raise axis.faulty()
+            raise axis.fault_error()
         yield from self.verify_settings(axis)
         if not health.locked:
             yield from self.write_register(job, axis, table.LOCK, 1)
@@ -70,7 +70,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         health = yield from self.read_health(axis)
         kept = yield from self.retry(axis, lambda: self.wire.read(axis.id, *GOAL_BLOCK).data)
         if not health.torque or kept != block:
-            raise axis.faulty("it did not keep what enabling it wrote")
+            raise axis.fault_error("it did not keep what enabling it wrote")
         axis.fault, axis.ready = "", True
 
     def relaxing(self, job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
@@ -78,7 +78,7 @@ class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
         yield from self.write_register(job, axis, table.TORQUE, 0)
         health = yield from self.read_health(axis)
         if health.torque:
-            raise axis.faulty("it did not relax: its torque is still on")
+            raise axis.fault_error("it did not relax: its torque is still on")
 
     def leaving(self, job: Work[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
         """Switches torque off or leaves it on; there is no watchdog to disarm."""

@@ -54,7 +54,7 @@ def _arm(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Step
     since_ns = bus.clock()
     yield from until(bus, axis, lambda: axis.armed or _reported_since(axis, since_ns), "it does not answer")
     if not axis.armed:
-        raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+        raise axis.fault_error(f"it cannot be enabled: {axis.refusal}")
 
 
 def _reported_since(axis: OdriveAxis, since_ns: int) -> bool:
@@ -103,16 +103,16 @@ def _await_watchdog(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAx
         bus.require_answering(axis)
         if axis.beat_ns > give_up_ns:
             if not axis.armed:
-                raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+                raise axis.fault_error(f"it cannot be enabled: {axis.refusal}")
             most_s = bus.watchdog_ns / 1e9
-            raise axis.faulty(
+            raise axis.fault_error(
                 f"its watchdog does not let go within {most_s:g} s; set axis0.config.enable_watchdog and "
                 f"watchdog_timeout = {most_s:g}, or watchdog_s to what it is"
             )
         bus.idle(_WAIT_S)
         yield
     if not axis.errors & Errors.WATCHDOG:
-        raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+        raise axis.fault_error(f"it cannot be enabled: {axis.refusal}")
 
 
 def relaxing(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:

@@ -145,7 +145,7 @@ class Exchange(BusCycle[GripperDevice]):
             except NoAnswer:
                 yield
             except Refused as refused:
-                raise device.faulty(f"it is no 2F-85: {refused}") from None
+                raise device.fault_error(f"it is no 2F-85: {refused}") from None
             else:
                 yield
                 return
@@ -155,7 +155,7 @@ class Exchange(BusCycle[GripperDevice]):
     def require_answering(self, device: GripperDevice) -> None:
         """Raises ``DeviceSilent`` for a gripper that does not answer."""
         if device.silent:
-            raise device.deaf(self.clock())
+            raise device.silent_error(self.clock())
 
     def _exchanged(self, device: GripperDevice, act: Callable[[], object]) -> None:
         try:
@@ -261,7 +261,7 @@ class GripperCommand(Command[GripperDevice, Exchange]):
         until_ns = exchange.clock() + _RESET_NS
         while not (status := (yield from self.read_status())).reset or table.fault_text(status.fault):
             if exchange.clock() > until_ns:
-                raise device.faulty(device.fault or "it was reset, but keeps its activation")
+                raise device.fault_error(device.fault or "it was reset, but keeps its activation")
         device.fault = ""
 
 
@@ -324,14 +324,14 @@ class Motion(GripperMotion, GripperCommand):
         if self._patience_s > 0 and self._waiting_s <= _STUCK_S:
             return None
         self.device.fault = "it says that it moves, but its fingers stand: its position sensor may be broken"
-        return self.device.faulty()
+        return self.device.fault_error()
 
     def _trouble(self, now_ns: int) -> TradeError | None:
         device = self.device
         if device.silent or device.age_ns(now_ns) > self.exchange.stale_after_ns:
-            return device.deaf(now_ns)
+            return device.silent_error(now_ns)
         if device.fault:
-            return device.faulty()
+            return device.fault_error()
         if self.until_ns is not None and now_ns >= self.until_ns:
             return MotionStopped(device=device.name, reason="its call reached its deadline", late=True)
         return None
@@ -358,7 +358,7 @@ class Activate(Motion):
         problem = super().stuck(sample)
         if problem is not None:
             self.device.fault = "its activation does not end: something may be in the way of its fingers"
-            return self.device.faulty()
+            return self.device.fault_error()
         return None
 
 
@@ -392,5 +392,5 @@ class Move(Motion):
         if not sample.activated:
             return self.device.inactive("it has lost its activation; did its power fail?")
         if (sample.echo != self._goal or not sample.going) and sample.at_ns - self._began_ns > _TAKEN_NS:
-            return self.device.faulty("it does not take a command")
+            return self.device.fault_error("it does not take a command")
         return super().stuck(sample)

@@ -92,7 +92,7 @@ class GripperDevice(BusDevice[Status]):
         """
         sample = self.fresh(now_ns, stale_after_ns)
         if self.fault:
-            raise self.faulty()
+            raise self.fault_error()
         if not sample.activated:
             raise self.inactive()
         return sample
@@ -102,7 +102,7 @@ class GripperDevice(BusDevice[Status]):
         remedy = "call activate(): it moves the fingers all the way, and what they hold falls"
         return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=_REMEDY)
 
     def state(self, now_ns: int, stale_after_ns: int) -> GripperState:

@@ -72,7 +72,7 @@ class ArmStatus(BusDevice[Sample]):
         """
         sample = self.fresh(now_ns, stale_after_ns)
         if self.fault:
-            raise self.faulty()
+            raise self.fault_error()
         return sample
 
     @property
@@ -118,9 +118,9 @@ class ArmStatus(BusDevice[Sample]):
 
     def lagging(self, fault: str) -> DeviceFault:
         """Returns the error of an arm that is behind, with what slows it."""
-        return self.faulty(f"{fault}; {self.slowed}" if self.slowed else fault)
+        return self.fault_error(f"{fault}; {self.slowed}" if self.slowed else fault)
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         """Returns the error of an arm that does not follow a command; by default with its current fault."""
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=self.remedy)
 

@@ -140,7 +140,7 @@ class Exchange(BusCycle[ArmStatus]):
         self.link.renew_control()
         if self.limb.motion is not None:
             self.limb.halting_since_ns = self.clock()
-            self._forget(self.limb.motion, self.limb.faulty("" if self.limb.fault else why))
+            self._forget(self.limb.motion, self.limb.fault_error("" if self.limb.fault else why))
 
     # --- orders
 
@@ -152,7 +152,7 @@ class Exchange(BusCycle[ArmStatus]):
         while not self._control.ready or (self._stop_sender is not None and self._stop_sender.is_alive()):
             job.gate()
             if self.clock() > until_ns:
-                raise self.limb.faulty("the process that commands it does not start")
+                raise self.limb.fault_error("the process that commands it does not start")
             yield
         hz, step_s = self._watchdog_hz, self.period_ns / 1e9
         done = yield from self._answered(
@@ -160,7 +160,7 @@ class Exchange(BusCycle[ArmStatus]):
         )
         if done.problem:
             self.drop_control(done.problem)
-            raise self.limb.faulty("" if self.limb.fault else f"control was not granted: {done.problem}")
+            raise self.limb.fault_error("" if self.limb.fault else f"control was not granted: {done.problem}")
         self.taken, self._taken_ns = True, self.clock()
         self._feed()
 
@@ -173,7 +173,7 @@ class Exchange(BusCycle[ArmStatus]):
         until_ns = self.clock() + HALT_NS
         while self.limb.halting_since_ns:
             if self.clock() > until_ns:
-                raise self.limb.faulty("a stop was sent, but it is still moving")
+                raise self.limb.fault_error("a stop was sent, but it is still moving")
             yield
 
     def carrying_out(self, job: "ArmCommand", make: Callable[[int], Order]) -> Generator[None, None, Done]:
@@ -188,25 +188,25 @@ class Exchange(BusCycle[ArmStatus]):
             raise job.expired()
         if done.problem:
             self.drop_control(done.problem)
-            raise self.limb.faulty("" if self.limb.fault else done.problem)
+            raise self.limb.fault_error("" if self.limb.fault else done.problem)
         return done
 
     def scaling(self, job: "ArmCommand", fraction: float, expires_ns: int) -> Steps:
         """Sets the speed slider, which needs no control."""
         states = self.link.states
         if states is None:
-            raise self.limb.deaf(self.clock())
+            raise self.limb.silent_error(self.clock())
         job.gate()
         number, until_ns = states.number(), self.clock() + _ANSWER_NS
         self._tell(states, Scale(number=number, expires_ns=expires_ns, fraction=fraction))
         while (done := states.answer(number)) is None:
             if self.clock() > until_ns:
-                raise self.limb.faulty("the speed slider was not set: no answer")
+                raise self.limb.fault_error("the speed slider was not set: no answer")
             yield
         if done.late:
             raise job.expired()
         if done.problem:
-            raise self.limb.faulty(f"the speed slider was not set: {done.problem}")
+            raise self.limb.fault_error(f"the speed slider was not set: {done.problem}")
 
     def stream(self, positions: list[float]) -> None:
         """Sends one set-point of a stream."""
@@ -215,7 +215,7 @@ class Exchange(BusCycle[ArmStatus]):
     @property
     def _control(self) -> Child:
         if self.link.control is None:
-            raise self.limb.deaf(self.clock())
+            raise self.limb.silent_error(self.clock())
         return self.link.control
 
     def _answered(self, job: "ArmCommand", make: Callable[[int], Order], until_ns: int) -> Generator[None, None, Done]:
@@ -226,10 +226,10 @@ class Exchange(BusCycle[ArmStatus]):
         while (done := control.answer(number)) is None:
             if control is not self.link.control:
                 job.gate()  # raises if a stop is the cause
-                raise self.limb.faulty("the process that commands it has ended")
+                raise self.limb.fault_error("the process that commands it has ended")
             if self.clock() > until_ns:
                 self.drop_control("the process that commands it is stuck")
-                raise self.limb.faulty("the process that commands it was stuck, and was replaced")
+                raise self.limb.fault_error("the process that commands it was stuck, and was replaced")
             yield
         return done
 
@@ -239,7 +239,7 @@ class Exchange(BusCycle[ArmStatus]):
         except Disconnected as gone:
             if child is self.link.control:
                 self.drop_control(f"the process that commands it is gone: {gone}")
-            raise self.limb.faulty(f"the command could not be sent: {gone}") from None
+            raise self.limb.fault_error(f"the command could not be sent: {gone}") from None
 
     # --- parts of a cycle
 

@@ -74,7 +74,7 @@ class Motion(ArmCommand):
         """Returns why the motion must end: an interrupted driver, no answer, a fault, or the call's deadline."""
         attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
         if held_up := self.exchange.held_up(attended_ns):
-            return self.limb.faulty(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
+            return self.limb.fault_error(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
         try:
             self.usable()
         except TradeError as problem:
@@ -174,7 +174,7 @@ class Move(Motion):
         ending = self.trouble(now_ns, self.until_ns) or self.astray(sample) or self._stuck(sample)
         over = ending is None and control.pulses > self._pulses + 1 and not control.running and self.limb.still > 2
         if over and self.off(sample) > _NEAR:
-            ending = self.limb.faulty("its move ended before it was there")
+            ending = self.limb.fault_error("its move ended before it was there")
         if over or ending is not None:
             self.exchange.release(self, ending)
 

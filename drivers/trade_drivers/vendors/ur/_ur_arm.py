@@ -117,7 +117,7 @@ class UrArm(Arm):
             problem = unheard
         ticket.wait(self._thread.alive)
         if problem is not None and not self._limb.at_rest(self._exchange.clock(), self._exchange.stale_after_ns):
-            raise self._limb.deaf(self._exchange.clock()) from problem
+            raise self._limb.silent_error(self._exchange.clock()) from problem
 
     def freedrive(self, on: bool) -> None:
         with admitted(f"{self._name}.freedrive", self.resources, self._at_once()) as terms:
@@ -137,7 +137,7 @@ class UrArm(Arm):
 
     def release_brakes(self) -> None:
         if self.state().fault and not self.state().powered:
-            raise self._limb.faulty()
+            raise self._limb.fault_error()
         self._switch("brake release", "Brake releasing", lambda: self._mode() == RUNNING)
 
     # --- parts
@@ -196,6 +196,6 @@ class UrArm(Arm):
         try:
             answer = ask(self._limb.bus, line, _ASK_S)
         except DashboardError as problem:
-            raise self._limb.deaf(self._exchange.clock()) from problem
+            raise self._limb.silent_error(self._exchange.clock()) from problem
         if not answer.startswith(expected):
-            raise self._limb.faulty(f"asked to {line}, its controller says: {answer}")
+            raise self._limb.fault_error(f"asked to {line}, its controller says: {answer}")
