@@ -24,7 +24,7 @@ from trade_drivers.joints.can._driver import AttachedMotors
 from trade_drivers.robotfile import CanBus, parse
 from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._motor import Drive
+from trade_drivers.vendors.cia402._homing import Drive
 from trade_hil_sim import SimProcess
 
 _COUNT = 6

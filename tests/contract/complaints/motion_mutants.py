@@ -13,7 +13,8 @@ from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._zero import Zero
 from trade_drivers.joints.serial import ServoAxis, written
-from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+from trade_drivers.vendors.cia402._exchange import DriveExchange
+from trade_drivers.vendors.damiao._exchange import DamiaoExchange
 from trade_drivers.vendors.dynamixel import _table as dynamixel
 from trade_drivers.vendors.feetech import _table as feetech
 
@@ -44,7 +45,7 @@ def enabling_restarts_no_servo(patch: pytest.MonkeyPatch) -> None:
 
 
 def enabling_resets_no_fault_of_a_drive(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.cia402._jobs._reset", lambda *_: iter(()))
+    patch.setattr(DriveExchange, "_reset", lambda *_: iter(()))
 
 
 def the_end_of_a_session_stops_nothing(patch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from tests.endurance.fuzz._target import Target
 from trade.errors import DeviceError
 from trade_drivers.bus.can._netlink import parse_link
 from trade_drivers.robotfile import parse
-from trade_drivers.vendors.cia402 import _sdo as sdo
+from trade_drivers.vendors.cia402 import _wire as sdo
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.dynamixel import _frames as dynamixel

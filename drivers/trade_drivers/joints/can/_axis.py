@@ -38,7 +38,19 @@ class Another(Unfit):
         self.expected, self.found = expected, found
 
 
-def check_zero_known(axis: "MotorAxis") -> None:
+def check_keys(axis: "MotorAxis", kind: str, unit: str) -> None:
+    """Raises ``Unfit`` for keys that such motors do not have, and for a zero that is not known."""
+    joint = axis.joint
+    if joint.counts_per_rev is not None:
+        raise Unfit(f"{kind} reports {unit}, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
+    if joint.serial_number is not None:
+        raise Unfit(f"{kind} reports no serial number here; leave this key out", ".serial_number")
+    _check_zero_known(axis)
+
+
+def _check_zero_known(axis: "MotorAxis") -> None:
     """Raises ``Unfit`` for a range wider than a turn of the motor, if the file does not say how the zero is known."""
     joint, turn_rad = axis.joint, tau / axis.joint.gear
     wide_rad = joint.max_rad - joint.min_rad

@@ -1,4 +1,4 @@
-"""The base class of drivers for motors on a CAN bus."""
+"""The base classes of drivers for motors on a CAN bus, and of scans for such motors."""
 
 import time
 from abc import abstractmethod
@@ -11,6 +11,7 @@ from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers._validation import not_installed
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
+from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
 from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
@@ -18,6 +19,7 @@ from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort, Talk
+    from trade_drivers.commissioning._can_scan import CanBench
     from trade_drivers.joints.can._cycle import MotorExchange
 
 _PATIENCE_S: Final = 1.0
@@ -25,9 +27,28 @@ _PATIENCE_S: Final = 1.0
 _FIRST_CYCLES: Final = 5
 """The number of measurements needed to detect motion."""
 
-
 _Motor = TypeVar("_Motor", bound=MotorAxis)
 _Exchange = TypeVar("_Exchange", bound="MotorExchange[Any]")
+
+
+class CanMotorCommissioner(Commissioner):
+    """Motors on a CAN bus, given as ``INTERFACE:CHANNEL``; only the vendor's tool can set their ids."""
+
+    wire = "can"
+    bauds = (1_000_000,)
+    """The system sets the rate of an interface; frames at another rate would disturb the bus."""
+    libraries: ClassVar[str] = "python-can"
+    ports = "is the interface up? `ip link show type can` lists the interfaces"
+
+    @abstractmethod
+    def bench(self) -> "type[CanBench]":
+        """Returns the class of its bench; raises ImportError if a library is missing."""
+
+    def open(self, port: str, baud: int) -> Bench:
+        try:
+            return self.bench().open(port, baud)
+        except ImportError as missing:
+            raise not_installed(self.driver, self.libraries, missing) from None
 
 
 class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
@@ -174,3 +195,19 @@ def axes_of(
         kind(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
         for joint in robot.joints_on(bus.name)
     ]
+
+
+def check_load(bus: CanBus, where: str, devices: str, cycle_bits: float, other_bits: int = 0) -> None:
+    """Raises ``ConfigurationError`` for a rate whose cycles, of so many bits, leave no room on the bus.
+
+    Args:
+        bus: the bus in the robot file.
+        where: the robot file.
+        devices: their number and name.
+        cycle_bits: bits of one cycle.
+        other_bits: bits per second that the devices send by themselves.
+    """
+    if cycle_bits * bus.rate_hz > bus.bitrate - other_bits:
+        most_hz = max(0, bus.bitrate - other_bits) / cycle_bits
+        problem = f"{devices} at {bus.bitrate} bit/s: at most {most_hz:.0f} Hz"
+        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)

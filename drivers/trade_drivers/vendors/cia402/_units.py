@@ -12,8 +12,8 @@ from trade_drivers.joints import Steps, Unfit, check_least
 from trade_drivers.joints.can import STILL_RAD_S
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._net import Answer, Net, Refused
 from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.cia402._wire import Answer, Net, Refused
 
 _SAME: Final = 1e-6
 _LARGEST: Final = 2**31 - 1

@@ -3,31 +3,16 @@
 from collections.abc import Callable, Sequence
 from math import isfinite
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
-from typing import Final, NamedTuple
+from typing import Final
 
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints.can import MotorAxis, resolution_of
 from trade_drivers.robotfile import Joint
-from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
+from trade_drivers.vendors.odrive._frames import Health, Heartbeat, Version, two_floats
+from trade_drivers.vendors.odrive._table import MODELS, Command, Errors, Result, State
 
 COUNTS_PER_TURN: Final = 1 << 16
 """Counts per turn of the motor in this driver, finer than any encoder; frames contain turns."""
-
-
-class Model(NamedTuple):
-    """A kind of ODrive."""
-
-    line: int
-    """Product line, as the device reports it."""
-    peak_a: float
-    """Maximum motor current (data sheet)."""
-
-
-MODELS: Final = {
-    "ODrive Pro": Model(4, 120.0),
-    "ODrive S1": Model(5, 80.0),
-    "ODrive Micro": Model(6, 7.0),
-}
 
 
 class OdriveAxis(MotorAxis):

@@ -1,22 +1,19 @@
-"""The cyclic exchange with all drives of one CAN bus: heartbeat, SYNC, measurements, handshakes, work."""
+"""The cyclic exchange with the drives of a bus: heartbeat, SYNC, measurements, handshakes; commands, step by step."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade_drivers.bus._cycle import PROBE_NS
+from trade.errors import DeviceSilent
+from trade_drivers.bus._cycle import HALT_NS, PROBE_NS
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import ControlMode, Gate, Goal, Motion, Steps, Work, until
+from trade_drivers.joints import ControlMode, Gate, Goal, Motion, Steps, Work, next_measurement, until
 from trade_drivers.joints.can._cycle import MotorExchange
-from trade_drivers.vendors.cia402 import _jobs as jobs
-from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._admission import Admission
-from trade_drivers.vendors.cia402._axis import DriveAxis, Stage
-from trade_drivers.vendors.cia402._inspect import heartbeat_ms
-from trade_drivers.vendors.cia402._machine import State
-from trade_drivers.vendors.cia402._net import Net
-from trade_drivers.vendors.cia402._stream import Following, Turning
+from trade_drivers.vendors.cia402._axis import DriveAxis, Following, Stage, Turning
+from trade_drivers.vendors.cia402._table import Entry, State
+from trade_drivers.vendors.cia402._verify import Admission, heartbeat_ms
+from trade_drivers.vendors.cia402._wire import Net, NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
@@ -25,6 +22,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
 _MEASURED: Final = (Stage.SET_UP, Stage.HERE)
+_WAIT_S: Final = 0.001
+_TAKEN_BACK_NS: Final = 5_000_000_000
+_AT_REST: Final = 2
+"""Consecutive measurements without motion."""
 _HANDSHAKE: Final = 3
 """Cycles of a set-point in profile position: bit raised, acknowledged, lowered."""
 
@@ -39,12 +40,12 @@ class DriveExchange(MotorExchange[DriveAxis]):
     ) -> None:
         super().__init__(port, bus, axes, clock)
         self.nodes = Net(self.net)
-        self.admissions = tuple(Admission(self, axis, bus) for axis in axes)
+        self.admissions = tuple(Admission(self, self.nodes, axis, bus, self.beat_next) for axis in axes)
         self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
         self._synced_ns = self.clock()
-        self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
+        self.silent_after_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         self.rival = False
         """True if the heartbeats of another driver were received."""
         self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
@@ -86,7 +87,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
             match axis.stream:
                 case None:
                     axis.raised_ns = self.clock()
-                    self.command(axis, machine.GO, position)
+                    self.command(axis, table.GO, position)
                 case Following() as following:
                     following.aim = position
                 case Turning() as turning:
@@ -109,21 +110,18 @@ class DriveExchange(MotorExchange[DriveAxis]):
         """
         for axis, position in positions.items():
             axis.raised_ns = 0
-            if axis.stream is not None or axis.controlword == machine.QUICK_STOP:
+            if axis.stream is not None or axis.controlword == table.QUICK_STOP:
                 self._quick_stop(axis)
             elif axis.state_now is State.ENABLED:
                 self.port.send(table.BRAKING.base + axis.id, axis.braking(axis.accel_counts))
-                self.command(axis, machine.HOLD, position)
+                self.command(axis, table.HOLD, position)
 
     def _quick_stop(self, axis: DriveAxis) -> None:
         """Requires a new enable(), since a target other than the last one would be a jump."""
         target = axis.stream.target if isinstance(axis.stream, Following) else None
         axis.stream, axis.ready = None, False
         if axis.state_now is State.ENABLED:
-            self.command(axis, machine.QUICK_STOP, target)
-
-    def enabling(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-        return jobs.enabling(self, job, axis, self.mode_for(job, axis))
+            self.command(axis, table.QUICK_STOP, target)
 
     def require_answering(self, axis: DriveAxis) -> None:
         if axis.silent:
@@ -167,22 +165,150 @@ class DriveExchange(MotorExchange[DriveAxis]):
             case _:
                 return None
 
-    def relaxing(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
-        return jobs.relaxing(self, job, axis)
-
-    def looking(self, axis: DriveAxis) -> Steps:
-        return jobs.looking(self, axis)
+    # --- commands, one exchange after the other
 
     def making_way(self, job: Motion[DriveAxis]) -> Steps:
         for axis in job.devices:
             if axis.entered != self.mode_for(job, axis):
-                yield from jobs.resting(self, job, axis)
+                yield from self.resting(job, axis)
                 yield from self.enabling(job, axis)
             elif axis.stream is None:
                 yield from until(self, axis, lambda: axis.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
 
+    def enabling(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Switches torque on at the measured position, halted or with that as its target; confirms each step.
+
+        A drive that is already enabled must be at rest: then only its mode changes. A homing ends.
+        """
+        mode = self.mode_for(job, axis)
+        if axis.stopped:
+            yield from self._take_back(job, axis)
+        yield from self.looking(axis)
+        axis.check_zero()
+        axis.check_place(axis.fresh(self.clock(), self.stale_after_ns))
+        if axis.motion is not None and not axis.fault:
+            self.end_motion(axis, f"{axis.name} was enabled again")
+        if not axis.statusword & table.REMOTE:
+            raise axis.faulty("it does not obey the bus (statusword bit 9), as if operated from its panel")
+        if axis.state_now is State.FAULT:
+            yield from self._reset(job, axis)
+        yield from self._begin_at_rest(job, axis)
+        yield from self.set_mode(job, axis, mode)
+        for entry, value in (
+            (table.PROFILE_VELOCITY, axis.speed_counts),
+            (table.ACCELERATION, axis.accel_counts),
+            (table.DECELERATION, axis.accel_counts),
+        ):
+            yield from self.write(job, axis, entry, value)
+        yield from self._climb(job, axis, mode)
+        axis.fault, axis.ready, axis.entered, axis.raised_ns = "", True, mode, 0
+        axis.stream = self.stream_for(axis, mode, axis.target)
+
+    def _take_back(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Restarts a drive stopped by network management, and sets it up like one that was offline."""
+        give_up_ns = self.clock() + _TAKEN_BACK_NS
+        axis.recalled = True
+        try:
+            while axis.silent:
+                job.gate()
+                if self.clock() > give_up_ns:
+                    raise axis.absence(self.clock())
+                self.recall(axis)
+                self.idle(_WAIT_S)
+                yield
+        finally:
+            axis.recalled = False
+        job.note("taken back from network management's stop: pre-operational, and set up")
+
+    def _begin_at_rest(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Clears old targets, which could move it in another mode."""
+        if axis.may_hold_torque:
+            yield from until(
+                self, axis, lambda: axis.still >= _AT_REST, "its mode cannot be changed while it moves", HALT_NS
+            )
+        sample = axis.fresh(self.clock(), self.stale_after_ns)
+        job.gate()
+        self.port.send(table.BRAKING.base + axis.id, axis.braking(axis.accel_counts))
+        if axis.state_now is State.ENABLED:
+            target = axis.stream.target if isinstance(axis.stream, Following) else sample.position
+            self.command(axis, table.HOLD, target)
+        axis.entered, axis.stream = 0, None
+
+    def resting(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Ends its motion on the drive's own ramp."""
+        job.gate()
+        self.halt([axis], "another kind of motion took over")
+        yield from until(self, axis, lambda: axis.still >= _AT_REST, "a halt was sent, but it is still moving", HALT_NS)
+
+    def _climb(self, job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
+        """Steps through the states to enabled, with the measured position as goal.
+
+        The drive is then halted, except in a mode without a goal, where not all drives support halt.
+        """
+        while True:
+            yield from until(
+                self, axis, lambda: table.command_towards_enabled(axis.state_now) is not None, _stays(axis)
+            )
+            word = table.command_towards_enabled(axis.state_now) or 0
+            if mode != table.PROFILE_POSITION:
+                word &= ~table.HALT
+            sample = axis.fresh(self.clock(), self.stale_after_ns)
+            before = axis.state_now
+            job.gate()
+            self.command(axis, word, sample.position)
+            if before is State.ENABLED:
+                return
+            yield from until(self, axis, lambda: axis.state_now is not before, _stays(axis))  # noqa: B023 - over before the next round
+
+    def _reset(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Clears the drive's own fault, without enabling it."""
+        for word in (table.DISABLE_VOLTAGE, table.RESET_FAULT):
+            job.gate()
+            self.command(axis, word)
+            yield from next_measurement(self, axis)
+        stays = f"its fault cannot be cleared: {axis.fault or 'it stays'}"
+        yield from until(self, axis, lambda: axis.state_now is not State.FAULT, stays)
+
+    def set_mode(self, job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
+        """Changes the mode of operation, and waits until the drive reports it."""
+        yield from self.write(job, axis, table.MODE, mode)
+        yield from until(self, axis, lambda: axis.mode == mode, f"it does not enter mode {mode} (6061h)")
+
+    def relaxing(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        """Switches torque off; the watchdog stays armed."""
+        axis.ready = False
+        if axis.may_hold_torque:
+            job.gate()
+            self.command(axis, table.DISABLE_VOLTAGE)
+        yield from until(self, axis, lambda: not axis.may_hold_torque, "it did not relax: its torque is still on")
+
     def leaving(self, job: Work[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
-        return jobs.leaving(self, job, axis, relax=relax)
+        """Switches torque off, or leaves it on for a joint seen at rest, and only then disarms the watchdog."""
+        if relax:
+            yield from self.relaxing(job, axis)
+        elif axis.still == 0 and axis.may_hold_torque:
+            return
+        yield from self.write(job, axis, table.CONSUMER_HEARTBEAT, 0)
+        axis.ready = False
+
+    def write(self, job: Work[DriveAxis], axis: DriveAxis, entry: Entry, value: int) -> Steps:
+        """Writes to its dictionary, with confirmation.
+
+        Raises:
+            DeviceFault: the drive refused.
+            DeviceSilent: the drive did not answer.
+        """
+        began_ns = self.clock()
+        self.require_answering(axis)
+        try:
+            for _ in self.nodes.write(axis.id, entry, value, job.gate):
+                self.net.take_in(_WAIT_S)
+                yield
+                self.require_answering(axis)
+        except NoAnswer:
+            raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(self.clock() - began_ns) / 1e9) from None
+        except Refused as refused:
+            raise axis.faulty(f"it refused a command: {refused}") from None
 
     # --- from the bus thread
 
@@ -232,7 +358,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
         for axis in self.devices:
             if axis.raised_ns and axis.acknowledged and axis.state_now is State.ENABLED:
                 axis.raised_ns = 0
-                self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
+                self.command(axis, axis.controlword & ~table.NEW_SET_POINT)
 
     def admit(self) -> None:
         """Continues the admission of drives without waiting. An unhealthy process admits none (S06)."""
@@ -245,3 +371,10 @@ class DriveExchange(MotorExchange[DriveAxis]):
 
 def _all_follow(axes: Sequence[DriveAxis]) -> bool:
     return all(table.CYCLIC_POSITION in axis.modes for axis in axes)
+
+
+def _stays(axis: DriveAxis) -> str:
+    if axis.fault and axis.state_now is State.FAULT:
+        return axis.fault
+    state = axis.state_now.name.lower().replace("_", " ") if axis.state_now else f"{axis.statusword:04X}h"
+    return f"it cannot be enabled: it stays at {state}; is its power stage supplied, and its safe torque off released?"

@@ -1,24 +1,25 @@
-"""Checks and frame set-up of a drive before anything is commanded. Enables and moves nothing."""
+"""The verification of drives before they join the cycle, at attach and after losses. Enables and moves nothing."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
+from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus.can import frame_bits
 from trade_drivers.joints import Steps, Unfit, check_joints, check_least, check_rate
 from trade_drivers.joints.can import STILL_RAD_S, Another
-from trade_drivers.vendors.cia402 import _machine as machine
+from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._machine import State, state_of
-from trade_drivers.vendors.cia402._net import Answer, Net, Refused
-from trade_drivers.vendors.cia402._stream import interpolation_period
-from trade_drivers.vendors.cia402._table import Entry, Pdo
+from trade_drivers.vendors.cia402._axis import DriveAxis, Stage
+from trade_drivers.vendors.cia402._table import Entry, Pdo, State, state_of
 from trade_drivers.vendors.cia402._units import check_units, read_optional
+from trade_drivers.vendors.cia402._wire import Answer, Net, NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
 
+_log = logging.getLogger("trade")
 _QUICK_STOP: Final = 3
 """Value of 6007h: quick stop after a lost heartbeat."""
 _BRAKE_AND_STAY: Final = 6
@@ -26,6 +27,8 @@ _BRAKE_AND_STAY: Final = 6
 _BRAKE: Final = 1
 """Value of 605Dh: brake on the ramp of 6084h, and hold with torque."""
 _LARGEST: Final = 2**31 - 1
+_UNHEARD_NS: Final = 2_000_000_000
+"""The wait for a drive's frames after set-up, before it is set up again."""
 
 
 def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
@@ -81,7 +84,7 @@ def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
         yield from _map_first(net, axis)
         yield from _map(net, axis.id, table.MOTION, motion_every(bus), table.NO_REMOTE)
         for pdo in (table.COMMAND, table.PROFILE):
-            yield from _map(net, axis.id, pdo, table.AT_ONCE, 0)
+            yield from _map(net, axis.id, pdo, table.AT_EVENT, 0)
         yield from _map_streams(net, axis, bus)
     except Refused as refused:
         raise Unfit(f"it refuses to be set up: {refused}") from None
@@ -162,10 +165,10 @@ def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     if abs((yield from net.read(axis.id, table.VELOCITY))) * axis.resolution.rad_s <= STILL_RAD_S:
         return
     if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
-        yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)
+        yield from net.write(axis.id, table.CONTROLWORD, table.HOLD)
         return
     yield from _try_write(net, axis.id, table.QUICK_STOP_OPTION, _BRAKE_AND_STAY)
-    yield from net.write(axis.id, table.CONTROLWORD, machine.QUICK_STOP)
+    yield from net.write(axis.id, table.CONTROLWORD, table.QUICK_STOP)
 
 
 def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
@@ -202,11 +205,11 @@ def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
         axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
     if axis.turning_mode != table.PROFILE_POSITION:
         try:
-            yield from _map(net, axis.id, table.TURNING, table.AT_ONCE, 0)
+            yield from _map(net, axis.id, table.TURNING, table.AT_EVENT, 0)
         except Refused:
             axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY}
     if axis.turning_mode == table.PROFILE_POSITION:
-        yield from _map(net, axis.id, table.BRAKING, table.AT_ONCE, 0)
+        yield from _map(net, axis.id, table.BRAKING, table.AT_EVENT, 0)
     if table.CYCLIC_POSITION in axis.modes:
         try:
             for entry, value in zip(table.INTERPOLATION_PERIOD, interpolation_period(bus.rate_hz), strict=True):
@@ -253,3 +256,100 @@ def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:
         yield from net.write(node, entry, value)
     except Refused:
         return
+
+
+def interpolation_period(rate_hz: float) -> tuple[int, int]:
+    """Returns a period for object 60C2h: a number below 256, and a power of ten in s."""
+    for exponent in (-3, -4, -5, -6):  # all drives accept whole milliseconds
+        count = 10.0**-exponent / rate_hz
+        if abs(count - round(count)) < 1e-3 and round(count) < 256:
+            return round(count), exponent
+    exponent = next(exponent for exponent in (-5, -4, -3, -2, -1, 0) if 10.0**-exponent / rate_hz < 255)
+    return round(10.0**-exponent / rate_hz), exponent
+
+
+class Admission:
+    """The admission of one drive. It enables nothing and moves nothing.
+
+    | stage       | what happens                           | and then                                              |
+    |-------------|----------------------------------------|-------------------------------------------------------|
+    | AWAY        | nothing, until its turn comes          | VERIFYING                                             |
+    | VERIFYING   | one request after the other            | SET_UP; AWAY for a while, if it is silent or unfit    |
+    | SET_UP      | its heartbeat and measurements awaited | HERE; AWAY, with that as its fault, if they stay away |
+    | HERE        | it is measured in every cycle          |                                                       |
+
+    Each stage changes to AWAY when the drive restarts, or when the drive or the port is gone.
+    """
+
+    def __init__(
+        self,
+        exchange: MotorExchange[DriveAxis],
+        net: Net,
+        axis: DriveAxis,
+        bus: "CanBus",
+        beat_next: Callable[[], None],
+    ) -> None:
+        self.axis = axis
+        self._exchange, self._net, self._bus, self._beat_next = exchange, net, bus, beat_next
+        self._recall_at_ns = 0
+        self._steps = set_up(net, axis, bus)
+
+    def advance(self) -> None:
+        """Advances as far as possible without waiting."""
+        match self.axis.stage:
+            case Stage.AWAY:
+                self._begin()
+            case Stage.VERIFYING:
+                self._verify()
+            case Stage.SET_UP:
+                self._await()
+            case Stage.HERE:
+                pass
+
+    def recall(self) -> None:
+        """Restarts a drive that network management has stopped; repeats, since the command has no confirmation."""
+        axis, now_ns = self.axis, self._exchange.clock()
+        if axis.stopped and now_ns >= self._recall_at_ns:
+            _log.warning("%s: network management has stopped it; it is put to pre-operational and set up", axis.name)
+            self._net.command(axis.id, table.NMT_PREOPERATIONAL)
+            self._recall_at_ns, axis.probe_at_ns = now_ns + PROBE_NS, now_ns
+
+    def _begin(self) -> None:
+        axis, exchange = self.axis, self._exchange
+        busy = exchange.worked_on(axis) and not axis.recalled  # a drive answers only one of two requests
+        if exchange.clock() >= axis.probe_at_ns and not busy:
+            axis.stage, self._steps = Stage.VERIFYING, set_up(self._net, axis, self._bus)
+            self._verify()
+
+    def _verify(self) -> None:
+        try:
+            next(self._steps)
+        except StopIteration:
+            self.axis.be_awaited(self._exchange.clock())
+            self._beat_next()
+        except NoAnswer as silent:
+            self.axis.unfit = ""
+            self._try_later(silent)
+        except (Unfit, Refused) as unfit:
+            self.axis.fault = self.axis.unfit = str(unfit)  # replaces an earlier fault, as this must be fixed first
+            self._try_later(unfit)
+
+    def _await(self) -> None:
+        axis, now_ns = self.axis, self._exchange.clock()
+        if axis.to_start:
+            axis.to_start = False
+            self._net.command(axis.id, table.NMT_START)
+        if not axis.unheard:
+            _log.info("%s answers on %s", axis.name, axis.bus)
+            axis.welcome(now_ns)
+        elif now_ns - axis.set_up_ns > max(_UNHEARD_NS, 2 * self._exchange.silent_after_ns):
+            problem = Unfit(f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used")
+            self._exchange.problems[axis] = problem
+            axis.fault, axis.ready = str(problem), False
+            axis.forget(now_ns)
+
+    def _try_later(self, problem: Exception) -> None:
+        self._exchange.problems[self.axis] = problem
+        now_ns = self._exchange.clock()
+        self.axis.forget(now_ns)
+        self.axis.probe_at_ns = now_ns + PROBE_NS
