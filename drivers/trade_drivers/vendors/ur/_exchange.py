@@ -3,20 +3,17 @@
 import logging
 import threading
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final
 
 from trade.errors import MotionStopped, TradeError
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
+from trade_drivers.bus._gate import Command
 from trade_drivers.bus._jobs import Device, PortLost, Steps
 from trade_drivers.robotfile import UrBus
-from trade_drivers.vendors.ur._arm_state import ArmStatus
-from trade_drivers.vendors.ur._child import Child
+from trade_drivers.vendors.ur._arm_state import ArmMotion, ArmStatus
 from trade_drivers.vendors.ur._dashboard import tell
-from trade_drivers.vendors.ur._link import Link
+from trade_drivers.vendors.ur._link import Child, Link
 from trade_drivers.vendors.ur._messages import Disconnected, Done, Halt, Heartbeat, Order, Scale, Servo, TakeControl
-
-if TYPE_CHECKING:
-    from trade_drivers.vendors.ur._jobs import ArmCommand, Motion
 
 _log = logging.getLogger("trade")
 _BEAT_NS: Final = 20_000_000
@@ -29,6 +26,8 @@ _SHOWN_NS: Final = 100_000_000
 """The time after the start of the script until each measurement shows it."""
 _SERVO_NS: Final = 50_000_000
 """The delay after which a set-point of a stream is void."""
+
+_ArmCommand = Command[ArmStatus, Any]
 
 
 class Exchange(BusCycle[ArmStatus]):
@@ -98,7 +97,7 @@ class Exchange(BusCycle[ArmStatus]):
         self._brake()
         self.end_motion(reason)
 
-    def take_over(self, motion: "Motion") -> None:
+    def take_over(self, motion: ArmMotion) -> None:
         """Ends the previous motion immediately before its replacement starts."""
         if self.limb.motion not in {None, motion}:
             self.end_motion("another move took over")
@@ -111,7 +110,7 @@ class Exchange(BusCycle[ArmStatus]):
         if self.limb.motion is not None:
             self._forget(self.limb.motion, MotionStopped(device=self.limb.name, reason=reason))
 
-    def release(self, motion: "Motion", error: TradeError | None) -> None:
+    def release(self, motion: ArmMotion, error: TradeError | None) -> None:
         """Completes a motion, with or without an error; brakes an ended stream in both cases."""
         if self.limb.motion is motion and (error is not None or motion.streams):
             self._brake()
@@ -144,7 +143,7 @@ class Exchange(BusCycle[ArmStatus]):
 
     # --- orders
 
-    def taking_control(self, job: "ArmCommand") -> Steps:
+    def taking_control(self, job: _ArmCommand) -> Steps:
         """Starts the control script, which stops any other program on the controller."""
         if self.taken:
             return
@@ -155,7 +154,7 @@ class Exchange(BusCycle[ArmStatus]):
                 raise self.limb.faulty("the process that commands it does not start")
             yield
         hz, step_s = self._watchdog_hz, self.period_ns / 1e9
-        done = yield from self._answered(
+        done = yield from self._await_reply(
             job, lambda number: TakeControl(number=number, watchdog_hz=hz, step_s=step_s), until_ns
         )
         if done.problem:
@@ -176,14 +175,14 @@ class Exchange(BusCycle[ArmStatus]):
                 raise self.limb.faulty("a stop was sent, but it is still moving")
             yield
 
-    def carrying_out(self, job: "ArmCommand", make: Callable[[int], Order]) -> Generator[None, None, Done]:
+    def carrying_out(self, job: _ArmCommand, make: Callable[[int], Order]) -> Generator[None, None, Done]:
         """Sends an order with an immediate answer.
 
         Raises:
             DeviceFault: the order was refused, or not answered; then the process that commands is replaced.
             DeadlineExceeded: the order arrived too late, and did not run.
         """
-        done = yield from self._answered(job, make, self.clock() + _ANSWER_NS)
+        done = yield from self._await_reply(job, make, self.clock() + _ANSWER_NS)
         if done.late:
             raise job.expired()
         if done.problem:
@@ -191,7 +190,7 @@ class Exchange(BusCycle[ArmStatus]):
             raise self.limb.faulty("" if self.limb.fault else done.problem)
         return done
 
-    def scaling(self, job: "ArmCommand", fraction: float, expires_ns: int) -> Steps:
+    def scaling(self, job: _ArmCommand, fraction: float, expires_ns: int) -> Steps:
         """Sets the speed slider, which needs no control."""
         states = self.link.states
         if states is None:
@@ -218,7 +217,9 @@ class Exchange(BusCycle[ArmStatus]):
             raise self.limb.deaf(self.clock())
         return self.link.control
 
-    def _answered(self, job: "ArmCommand", make: Callable[[int], Order], until_ns: int) -> Generator[None, None, Done]:
+    def _await_reply(
+        self, job: _ArmCommand, make: Callable[[int], Order], until_ns: int
+    ) -> Generator[None, None, Done]:
         control = self._control
         job.gate()
         number = control.number()
@@ -307,7 +308,7 @@ class Exchange(BusCycle[ArmStatus]):
     def _end_program(self) -> None:
         self._stop_sender = tell(self.link.path, "stop", _ASK_S)
 
-    def _forget(self, motion: "Motion", error: TradeError | None) -> None:
+    def _forget(self, motion: ArmMotion, error: TradeError | None) -> None:
         if self.limb.motion is motion:
             self.limb.motion = None
             self.limb.tell_moving()

@@ -12,8 +12,8 @@ from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.motion._plan import JointLimits, Plan
 from trade_drivers.vendors.ur._arm_state import IDLE, RUNNING, ArmStatus
-from trade_drivers.vendors.ur._cycle import Exchange
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask
+from trade_drivers.vendors.ur._exchange import Exchange
 from trade_drivers.vendors.ur._jobs import (
     ArmCommand,
     EndFreedrive,
@@ -184,14 +184,14 @@ class UrArm(Arm):
         until_ns = until_ns or clock() + _SWITCH_NS
         self.state()
         with permit(self.resources) as permitted:
-            self._ordered(line, expected, permitted)
+            self._order(line, expected, permitted)
             while not reached():
                 permitted.gate()
                 if clock() >= until_ns:
                     raise DeadlineExceeded(service=service, deadline_s=_SWITCH_NS / 1e9)
                 threading.Event().wait(_LOOK_S)
 
-    def _ordered(self, line: str, expected: str, permitted: Permit) -> None:
+    def _order(self, line: str, expected: str, permitted: Permit) -> None:
         permitted.gate()
         try:
             answer = ask(self._limb.bus, line, _ASK_S)
