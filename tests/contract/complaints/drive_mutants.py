@@ -15,7 +15,7 @@ def all_speeds_are_counts(patch: pytest.MonkeyPatch) -> None:
     def counts(axis: DriveAxis, *_: object) -> float:
         return axis.resolution.rad
 
-    patch.setattr("trade_drivers.vendors.cia402._units._converted", counts)
+    patch.setattr("trade_drivers.vendors.cia402._units._unit_in_rad", counts)
 
 
 def the_file_alone_has_the_scale(patch: pytest.MonkeyPatch) -> None:

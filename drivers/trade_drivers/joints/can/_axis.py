@@ -77,9 +77,9 @@ class MotorAxis(Axis):
     """When the open request for a measurement was sent; 0 if there is none."""
     since_ns = 0
     """When the motor was accepted."""
-    stranger = False
-    """True directly after it was accepted, when it may be moving."""
-    hushed = False
+    unowned = False
+    """True directly after it was accepted, when it may be moving by no client's order."""
+    unfed = False
     """True while the driver sends it nothing, to test its watchdog."""
 
     @property
@@ -97,7 +97,7 @@ class MotorAxis(Axis):
         Its time is that of the request, not of the arrival, as a frozen process would take old values for new.
         """
         asked_ns, self.asked_ns = self.asked_ns, 0
-        at_ns = now_ns if self.hushed else asked_ns
+        at_ns = now_ns if self.unfed else asked_ns
         values = (position, velocity, effort)
         if not all(isfinite(value) and abs(value) <= _LARGEST for value in values):
             given = ", ".join(f"{value:.6g}" for value in values)
@@ -121,7 +121,7 @@ class MotorAxis(Axis):
         self.tell_moving()
         if not self.silent:
             self.silent, self.silent_since_ns = True, now_ns
-        self.asked_ns, self.hushed = 0, False
+        self.asked_ns, self.unfed = 0, False
 
     def welcome(self, now_ns: int) -> None:
         """Accepts a motor that answers and has passed its checks."""
@@ -129,5 +129,5 @@ class MotorAxis(Axis):
             self.latch("it was away")
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
         self.beat_ns = self.since_ns = now_ns
-        self.asked_ns, self.stranger = 0, True
+        self.asked_ns, self.unowned = 0, True
         self.zero.interrupted()

@@ -68,7 +68,7 @@ class MotorExchange(Exchange[_Axis]):
         self.require_answering(axis)
         yield from next_measurement(self, axis)
 
-    def asked(self, axis: _Axis, frames: Sequence[Frame], there: Callable[[], bool]) -> Steps:
+    def request(self, axis: _Axis, frames: Sequence[Frame], answered: Callable[[], bool]) -> Steps:
         """Sends a request and waits for the answer.
 
         Raises:
@@ -76,7 +76,7 @@ class MotorExchange(Exchange[_Axis]):
         """
         self.port.send_all(frames)
         began = time.monotonic()
-        while not there():
+        while not answered():
             if self.net.heard_until(began + _ANSWER_S):
                 raise NoAnswer(axis.id, _ANSWER_S)
             yield
@@ -84,7 +84,7 @@ class MotorExchange(Exchange[_Axis]):
     def look_after(self, axis: _Axis) -> None:
         """Runs further requests and checks of a motor once per cycle."""
 
-    def opened(self) -> None:
+    def on_open(self) -> None:
         """Called after the port was first opened and had listened for other drivers."""
 
     # --- from the bus thread
@@ -116,7 +116,7 @@ class MotorExchange(Exchange[_Axis]):
 
     def measure(self, began_ns: int) -> None:
         """Requests a measurement from each motor, and processes the answers."""
-        here = [axis for axis in self.devices if not axis.silent and not axis.hushed]
+        here = [axis for axis in self.devices if not axis.silent and not axis.unfed]
         for axis in here:
             axis.asked_ns = began_ns
         if here:
@@ -131,7 +131,7 @@ class MotorExchange(Exchange[_Axis]):
         if now_ns - self._listening_ns <= self.stale_after_ns:
             return  # on a busy host, this thread itself was late
         for axis in self.devices:
-            old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
+            old = not axis.unfed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.silent_after_ns):
                 axis.why_silent = self.why_silent() or axis.why_silent
                 axis.forget(now_ns)
@@ -143,8 +143,8 @@ class MotorExchange(Exchange[_Axis]):
         A subclass that detects such motion elsewhere may override this method for other work, once per cycle.
         """
         for axis in self.devices:
-            if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
-                axis.stranger = False
+            if axis.unowned and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
+                axis.unowned = False
                 if axis.motion is None and axis.still == 0 and axis.may_hold_torque:
                     self.hold([axis], now_ns)
 

@@ -127,7 +127,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
             undo.callback(wire.close)
             try:
                 wire.open()
-                exchange.opened()
+                exchange.on_open()
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
                 raise DeviceAbsent(where=f"{where}.channel", problem=f"{port}: {lost}") from None

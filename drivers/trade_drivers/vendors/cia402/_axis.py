@@ -205,7 +205,7 @@ class DriveAxis(MotorAxis):
         self.controlword = self.raised_ns = 0
         self.entered, self.stream = 0, None
 
-    def be_awaited(self, now_ns: int) -> None:
+    def await_frames(self, now_ns: int) -> None:
         """Starts the wait for its frames after set-up."""
         if self.ready:
             self.latch("it was away")

@@ -312,7 +312,7 @@ class DriveExchange(MotorExchange[DriveAxis]):
 
     # --- from the bus thread
 
-    def opened(self) -> None:
+    def on_open(self) -> None:
         for axis in self.devices:
             for data in self.port.talk.frames.get(table.HEARTBEAT + axis.id, ()):
                 axis.take_heartbeat(data, self.clock())
@@ -346,12 +346,12 @@ class DriveExchange(MotorExchange[DriveAxis]):
     def measure(self, began_ns: int) -> None:
         self._beat(began_ns)
         self._synced_ns = began_ns
-        asked = [axis for axis in self.devices if not axis.silent]
+        expected = [axis for axis in self.devices if not axis.silent]
         for axis in self.devices:
             if axis.stage in _MEASURED:
                 axis.asked_ns = began_ns  # not the arrival, as a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
-        self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.asked_ns for axis in asked))
+        self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.asked_ns for axis in expected))
 
     def after_measuring(self, now_ns: int) -> None:  # noqa: ARG002 - the same at any time
         """Lowers the bit of an acknowledged set-point, so that the next one has an edge."""

@@ -47,7 +47,7 @@ class DriveBench(CanBench):
         return self._known.pop(device_id)
 
     def _ask(self, nodes: Iterable[int]) -> None:
-        asking = {node: self._looking(node) for node in nodes}
+        asking = {node: self._identify(node) for node in nodes}
         while asking:
             for node, steps in list(asking.items()):
                 try:
@@ -57,7 +57,7 @@ class DriveBench(CanBench):
                     del asking[node]
             self._listeners.take_in(_SLICE_S)
 
-    def _looking(self, node: int) -> Answer[Found | None]:
+    def _identify(self, node: int) -> Answer[Found | None]:
         try:
             kind = (yield from self._net.read(node, table.DEVICE_TYPE)) & 0xFFFF
         except NoAnswer:

@@ -102,7 +102,7 @@ def _check_identity(net: Net, axis: DriveAxis) -> Steps:
     for entry in table.IDENTITY:
         identity += ((yield from _read(net, axis.id, entry)),)
     if axis.identity and identity != axis.identity:
-        raise Unfit(f"another drive answers as node {axis.id}: {_named(identity)}, not {_named(axis.identity)}")
+        raise Unfit(f"another drive answers as node {axis.id}: {_name_of(identity)}, not {_name_of(axis.identity)}")
     try:
         name = yield from net.read_text(axis.id, table.DEVICE_NAME)
     except Refused:
@@ -128,7 +128,7 @@ def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> St
         raise Another("firmware", joint.firmware, firmware, "drive")
 
 
-def _named(identity: Sequence[int]) -> str:
+def _name_of(identity: Sequence[int]) -> str:
     vendor, product, _, serial = identity
     return f"vendor {vendor:X}h, product {product:X}h, serial number {serial}"
 
@@ -325,7 +325,7 @@ class Admission:
         try:
             next(self._steps)
         except StopIteration:
-            self.axis.be_awaited(self._exchange.clock())
+            self.axis.await_frames(self._exchange.clock())
             self._beat_next()
         except NoAnswer as silent:
             self.axis.unfit = ""

@@ -74,13 +74,13 @@ def upload(index: int, sub: int) -> Transfer:
         Aborted: the drive refused.
     """
     address = _address(index, sub)
-    first = yield from _exchanged(Request(bytes((_UPLOAD,)) + address + bytes(4), address))
+    first = yield from _answer_to(Request(bytes((_UPLOAD,)) + address + bytes(4), address))
     if first[0] & 2:
         unused = first[0] >> 2 & 3 if first[0] & 1 else 0
         return first[4 : _SIZE - unused]
     data, toggle = b"", 0
     for _ in range(_MOST_SEGMENTS):
-        segment = yield from _exchanged(Request(bytes((_SEGMENT | toggle,)) + bytes(7), address))
+        segment = yield from _answer_to(Request(bytes((_SEGMENT | toggle,)) + bytes(7), address))
         data += segment[1 : _SIZE - (segment[0] >> 1 & 7)]
         if segment[0] & 1:
             break
@@ -96,7 +96,7 @@ def download(index: int, sub: int, data: bytes) -> Transfer:
     """
     address = _address(index, sub)
     command = _DOWNLOAD | _EXPEDITED - len(data) << 2 | 3
-    yield from _exchanged(Request(bytes((command,)) + address + data.ljust(_EXPEDITED, b"\0"), address))
+    yield from _answer_to(Request(bytes((command,)) + address + data.ljust(_EXPEDITED, b"\0"), address))
     return b""
 
 
@@ -105,7 +105,7 @@ def abort(request: Request, code: int) -> bytes:
     return bytes((_ABORT,)) + request.address + struct.pack("<I", code)
 
 
-def _exchanged(request: Request) -> Transfer:
+def _answer_to(request: Request) -> Transfer:
     answer = yield request
     if answer[0] == _ABORT:
         raise Aborted(int.from_bytes(answer[4:], "little"))

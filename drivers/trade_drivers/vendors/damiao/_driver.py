@@ -79,7 +79,7 @@ class DamiaoBench(CanBench):
             value = frames.answer(frame.data, motor, number) if frame.id != table.BROADCAST else None
             return None if value is None else (frame.id, value)
 
-        return self._asked(frames.read(motor, number), decode)
+        return self._ask(frames.read(motor, number), decode)
 
     def _status(self, motor: int) -> int:
         def decode(frame: "Frame") -> int | None:
@@ -87,9 +87,9 @@ class DamiaoBench(CanBench):
                 return None
             return Feedback.decode(frame.data, Ranges(0, 0, 0)).status
 
-        return self._asked(frames.refresh(motor), decode)[0]
+        return self._ask(frames.refresh(motor), decode)[0]
 
-    def _asked(self, question: bytes, decode: "Callable[[Frame], _Value | None]") -> list[_Value]:
+    def _ask(self, question: bytes, decode: "Callable[[Frame], _Value | None]") -> list[_Value]:
         """Returns the answers, including a second one if there are two motors. Raises ``_Silent``."""
         answers = self.ask(table.BROADCAST, question, decode, _ANSWER_S, _WHOLE_SECOND_ANSWER_S)
         if not answers:

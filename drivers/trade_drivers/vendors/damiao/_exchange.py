@@ -87,7 +87,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     # --- commands
 
-    def _there(self, axis: DamiaoAxis) -> Frame:
+    def _set_point(self, axis: DamiaoAxis) -> Frame:
         """Returns the frame with the next set-point."""
         return Frame(table.POSITION_VELOCITY + axis.id, axis.step(self.lasting_clock(), self.period_ns / 1e9))
 
@@ -97,17 +97,17 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def stand(self, axis: DamiaoAxis) -> None:
         """Starts set-points at the measured position."""
-        axis.course = self._standing(axis, axis.fresh(self.clock(), self.stale_after_ns).position)
+        axis.course = self._ramp_from(axis, axis.fresh(self.clock(), self.stale_after_ns).position)
         axis.stepped_ns = self.lasting_clock()
 
-    def _standing(self, axis: DamiaoAxis, position: int) -> Ramp:
+    def _ramp_from(self, axis: DamiaoAxis, position: int) -> Ramp:
         accel = float(axis.accel_counts)
         return Ramp(position, fastest=axis.speed_counts, accel=accel, braking=accel)
 
     def enable(self, axis: DamiaoAxis) -> None:
         """Switches torque on between set-points at the measured position, so that it does not move to an old one."""
-        there = self._there(axis)
-        self.port.send_all([there, Frame(axis.id, frames.ENABLE), there])
+        set_point = self._set_point(axis)
+        self.port.send_all([set_point, Frame(axis.id, frames.ENABLE), set_point])
 
     def write_goals(self, goals: Mapping[DamiaoAxis, Goal], gate: Gate) -> None:
         for axis, goal in goals.items():
@@ -126,7 +126,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             if axis.course is None:
                 raise axis.faulty("it was enabled, but has let go since")
             aim(axis.course, position)
-            frames_out.append(self._there(axis))
+            frames_out.append(self._set_point(axis))
         self.port.send_all(frames_out)
 
     def reached_ns(self, axes: Sequence[DamiaoAxis]) -> int | None:  # noqa: ARG002 - the same for all
@@ -147,14 +147,14 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             if not self.held_up(axis.stepped_ns):
                 self._brake(axis, axis.course, position)
             elif axis.age_ns(self.clock()) <= self.watchdog_ns:
-                axis.course = self._standing(axis, position)
+                axis.course = self._ramp_from(axis, position)
             else:
                 continue
-            self.port.send_all([self._there(axis)])
+            self.port.send_all([self._set_point(axis)])
 
     def _brake(self, axis: DamiaoAxis, course: Ramp, position: int) -> None:
         if abs(course.position - position) > axis.resolution.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
-            axis.course = self._standing(axis, position)
+            axis.course = self._ramp_from(axis, position)
             return
         course.accel = course.braking = axis.accel_counts
         rests = course.position + course.speed * abs(course.speed) / (2 * axis.accel_counts)
@@ -190,16 +190,16 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
 
     def _set_up(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
         """Compares its scale, sets timeout and mode, each time: a restart, which is not reported, may change all."""
-        yield from self._heard(axis, self.check_ranges(axis))
+        yield from self._run_requests(axis, self.check_ranges(axis))
         job.gate()
-        yield from self._written(axis, Register.TIMEOUT, self.timeout)
-        yield from self._heard(axis, self.register(axis, Register.CONTROL_MODE))
+        yield from self._write(axis, Register.TIMEOUT, self.timeout)
+        yield from self._run_requests(axis, self.register(axis, Register.CONTROL_MODE))
         if axis.answer == table.IN_POSITION_VELOCITY:
             return
         if axis.torque:  # it would move to its last set-point in that mode, however old
             yield from self.relaxing(job, axis)
         job.gate()
-        yield from self._written(axis, Register.CONTROL_MODE, table.IN_POSITION_VELOCITY)
+        yield from self._write(axis, Register.CONTROL_MODE, table.IN_POSITION_VELOCITY)
 
     def relaxing(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
         """Switches torque off, which also idles the watchdog."""
@@ -217,16 +217,16 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             return
         if axis.still == 0 and axis.may_hold_torque:
             return
-        yield from self._written(axis, Register.TIMEOUT, 0)
+        yield from self._write(axis, Register.TIMEOUT, 0)
         axis.ready, axis.course = False, None
 
-    def _written(self, axis: DamiaoAxis, number: Register, value: int) -> Steps:
+    def _write(self, axis: DamiaoAxis, number: Register, value: int) -> Steps:
         """Writes a register and reads it back; raises ``DeviceFault`` if the value was not kept."""
-        yield from self._heard(axis, self.set_register(axis, number, value))
+        yield from self._run_requests(axis, self.set_register(axis, number, value))
         if axis.answer != value:
             raise axis.faulty(f"it does not keep register {number:d}: {axis.answer}, not {value}")
 
-    def _heard(self, axis: DamiaoAxis, asking: Steps) -> Steps:
+    def _run_requests(self, axis: DamiaoAxis, asking: Steps) -> Steps:
         """Runs register exchanges; raises ``DeviceSilent`` for a missing answer, and ``DeviceFault`` for ``Unfit``."""
         try:
             for _ in asking:
@@ -257,7 +257,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         if axis.answer != self.timeout:
             raise Unfit(f"it does not keep its time-out (register 9): {axis.answer}, not {self.timeout}")
         axis.heard_ns = 0
-        yield from self.asked(axis, [self.refresh(axis)], lambda: axis.heard_ns > 0)
+        yield from self.request(axis, [self.refresh(axis)], lambda: axis.heard_ns > 0)
 
     def check_ranges(self, axis: DamiaoAxis) -> Steps:
         """Compares the registers that scale positions, speeds and torques with those of the model.
@@ -278,13 +278,13 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         """Requests a register; ``answer`` is then its value."""
         axis.answer, axis.asks = None, number
         question = Frame(table.BROADCAST, frames.read(axis.id, number))
-        yield from self.asked(axis, [question], lambda: axis.asks is None)
+        yield from self.request(axis, [question], lambda: axis.asks is None)
 
     def set_register(self, axis: DamiaoAxis, number: Register, value: int) -> Steps:
         """Writes a register and reads it back."""
         axis.answer, axis.asks = None, number
         order = Frame(table.BROADCAST, frames.write(axis.id, number, value))
-        yield from self.asked(axis, [order], lambda: axis.asks is None)
+        yield from self.request(axis, [order], lambda: axis.asks is None)
         yield from self.register(axis, number)
 
     # --- requests
@@ -293,7 +293,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         """Returns the next set-point; a request only after an interruption, as the motor has stopped by itself."""
         if axis.course is None or self.held_up(axis.stepped_ns):
             return self.refresh(axis)
-        return self._there(axis)
+        return self._set_point(axis)
 
     def watch(self) -> None:
         """Ends motions whose call has ended, as their set-points are generated step by step."""

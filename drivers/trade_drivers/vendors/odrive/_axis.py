@@ -93,7 +93,7 @@ class OdriveAxis(MotorAxis):
         self._volts, _ = two_floats(data)
 
     def _judge(self) -> None:
-        if self.hushed:
+        if self.unfed:
             return  # the watchdog test handles this itself
         if self.errors:
             self.latch(f"error: {self.errors.text}")
@@ -126,7 +126,7 @@ class OdriveAxis(MotorAxis):
             self.fresh(now_ns, stale_after_ns),
             now_ns,
             load=max(-1.0, min(1.0, sign * self._amperes / self.model.peak_a)) if isfinite(self._amperes) else 0.0,
-            enabled=self.armed and not self.hushed,
+            enabled=self.armed and not self.unfed,
             temperature_c=self._celsius,
             voltage_v=self._volts,
         )

@@ -50,9 +50,9 @@ def check_bus(bus: "CanBus", axes: Sequence[OdriveAxis], where: str) -> None:
         problem = f"{bus.watchdog_s:g} is above {_LONGEST_S:g}: enable() waits once for it, to see that it works"
         raise ConfigurationError(where=f"{key}.watchdog_s", problem=problem)
     check_rate(bus, where, 4)
-    spoken = len(axes) * (_BEATS_HZ + _STREAM_HZ) * frame_bits(8)
+    unrequested = len(axes) * (_BEATS_HZ + _STREAM_HZ) * frame_bits(8)
     cycle = len(axes) * (2 * frame_bits(0) + 3 * frame_bits(8))
-    check_load(bus, where, f"{len(axes)} axes", cycle, spoken)
+    check_load(bus, where, f"{len(axes)} axes", cycle, unrequested)
 
 
 def _check_joint(axis: OdriveAxis) -> None:
@@ -123,7 +123,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     def write_holds(self, positions: Mapping[OdriveAxis, int]) -> None:
         """Sends a trajectory to the measured position at full deceleration, only to axes with torque."""
         for axis, position in positions.items():
-            if axis.armed and not axis.hushed:
+            if axis.armed and not axis.unfed:
                 self.limit(axis, axis.speed_counts, axis.accel_counts)
                 self.send_to(axis, position)
 
@@ -177,7 +177,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         """Tests the watchdogs, which no reading shows: arms axes without torque, and is silent until they disarm."""
         job.gate()
         for axis in axes:
-            axis.hushed = True
+            axis.unfed = True
         try:
             for axis in axes:
                 self.tell(axis, Command.SET_MODE, frames.set_mode(Control.TORQUE, Input.PASSTHROUGH))
@@ -192,7 +192,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
             raise
         finally:
             for axis in axes:
-                axis.hushed = False
+                axis.unfed = False
         for axis in axes:
             yield from self._clear(job, axis)
             axis.proven = True
@@ -238,11 +238,11 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         """
         first = axis.identity is None
         axis.version, since_ns = None, self.clock()
-        yield from self.asked(axis, [_question(axis, Command.VERSION)], lambda: axis.version is not None)
+        yield from self.request(axis, [_question(axis, Command.VERSION)], lambda: axis.version is not None)
         _check_version(axis)
-        yield from self.asked(axis, [_question(axis, Command.ERRORS)], lambda: axis.health_ns > since_ns)
+        yield from self.request(axis, [_question(axis, Command.ERRORS)], lambda: axis.health_ns > since_ns)
         if axis.state_now is None or axis.beat_ns <= since_ns:
-            yield from self.asked(axis, [_question(axis, Command.ERRORS)], lambda: axis.beat_ns > since_ns)
+            yield from self.request(axis, [_question(axis, Command.ERRORS)], lambda: axis.beat_ns > since_ns)
         if first and axis.torque:
             self.tell(axis, Command.SET_MODE, frames.set_mode(Control.VELOCITY, Input.VELOCITY_RAMP))
             self.tell(axis, Command.SET_VELOCITY, frames.set_velocity(0.0))

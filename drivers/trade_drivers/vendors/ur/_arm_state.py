@@ -131,7 +131,7 @@ class ArmStatus(BusDevice[Sample]):
         fraction = 1.0 if self.sample is None else self.sample.speed_fraction
         return f"its speed slider is at {100 * fraction:.3g} %" if fraction < 1 else ""
 
-    def lagging(self, fault: str) -> DeviceFault:
+    def lag_error(self, fault: str) -> DeviceFault:
         """Returns the error of an arm that is behind, with what slows it."""
         return self.faulty(f"{fault}; {self.slowed}" if self.slowed else fault)
 

@@ -20,7 +20,7 @@ from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
 from trade_drivers.robotfile import Bus, Robot, UrBus
 from trade_drivers.vendors.ur._arm import UrArm
 from trade_drivers.vendors.ur._arm_state import ArmStatus
-from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded, probe
+from trade_drivers.vendors.ur._dashboard import DashboardError, ask, is_commanded, probe
 from trade_drivers.vendors.ur._exchange import Exchange
 from trade_drivers.vendors.ur._link import Link
 
@@ -153,7 +153,7 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> ArmStatus:
 def _refuse_company(port: str, where: str) -> None:
     """Refuses an arm that another program controls; a killed process keeps control for a short time."""
     until = time.monotonic() + _RELEASED_WITHIN_S
-    while commanded(port, _ASK_S):
+    while is_commanded(port, _ASK_S):
         if time.monotonic() > until:
             _wrong(f"{where}.host", f"{port}: another program has control of this arm; stop it first")
         time.sleep(_AGAIN_S)

@@ -180,7 +180,7 @@ class Move(Motion):
         """Returns the fault for measurements without any change: the arm is blocked or paused, or values are old."""
         if sample.positions != self._place or not self._moved_ns:
             self._place, self._moved_ns = sample.positions, sample.at_ns
-        return self.limb.lagging("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
+        return self.limb.lag_error("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
 
 
 class LineMove(Move):
@@ -326,7 +326,7 @@ class Follow(Motion):
             self.exchange.release(self, None)
             return
         if late_s > tolerances.goal_time_s:
-            raise self.limb.lagging("it does not come to rest at the end of its trajectory")
+            raise self.limb.lag_error("it does not come to rest at the end of its trajectory")
         self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
         self._sent_ns = now_ns
 
