@@ -1,7 +1,7 @@
 """The common base of drivers for motors with their own controllers on a CAN bus, polled in each cycle."""
 
 from trade_drivers.joints.can._axis import STILL_RAD_S, Another, MotorAxis, check_keys, resolution_of
-from trade_drivers.joints.can._driver import CanMotorCommissioner, CanMotorDriver, axes_of, check_load
+from trade_drivers.joints.can._driver import CanMotorCommissioner, CanMotorDriver, check_load
 
 __all__ = [
     "STILL_RAD_S",
@@ -9,7 +9,6 @@ __all__ = [
     "CanMotorCommissioner",
     "CanMotorDriver",
     "MotorAxis",
-    "axes_of",
     "check_keys",
     "check_load",
     "resolution_of",

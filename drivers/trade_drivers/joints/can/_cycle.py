@@ -2,8 +2,9 @@
 
 import logging
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
-from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
@@ -12,7 +13,7 @@ from trade_drivers.joints.can._axis import MotorAxis
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_drivers.robotfile import CanBus, Joint
 
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25
@@ -28,6 +29,8 @@ _Axis = TypeVar("_Axis", bound=MotorAxis)
 class MotorExchange(Exchange[_Axis]):
     """The exchange with the motors of one CAN bus."""
 
+    axis_type: ClassVar[Callable[[str, str, "Joint", float, Sequence[str]], Any]]
+    """Makes the state of a motor: its name, port, table in the robot file, cycles per second, and coupled joints."""
     silent_after_ns: int
     """A motor without any frame for this time is left out."""
     again_ns: ClassVar[int] = _AGAIN_NS
@@ -48,7 +51,16 @@ class MotorExchange(Exchange[_Axis]):
             axis.forget(self.clock())
             axis.probe_at_ns = self.clock()
 
-    # --- requests, which depend on the kind of motor
+    # --- checks and requests, which depend on the kind of motor
+
+    @staticmethod
+    @abstractmethod
+    def check_bus(bus: "CanBus", axes: Sequence[Any], where: str) -> None:
+        """Checks the robot file: keys, limits, and whether a cycle is long enough for its frames.
+
+        Raises:
+            ConfigurationError: a check failed; names the key and the right value.
+        """
 
     def question(self, axis: _Axis) -> Frame:
         """Returns the request for a measurement, which also feeds the watchdog."""

@@ -2,7 +2,7 @@
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
@@ -12,7 +12,7 @@ from trade_drivers._validation import not_installed
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
-from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
+from trade_drivers.joints import AttachedJoints, BusMotor, BusThread, PortLost, Unfit, start_thread
 from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
@@ -62,8 +62,8 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
     libraries: ClassVar[str] = "python-can"
 
     @abstractmethod
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> _Exchange:
-        """Checks the file and returns an exchange with a closed port. Raises ``ConfigurationError``."""
+    def exchange_type(self) -> type[_Exchange]:
+        """Returns the class of its exchange, imported now, as its libraries are optional."""
 
     @staticmethod
     @abstractmethod
@@ -104,9 +104,15 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
 
             where = f"{robot.where}: bus.{bus.name}"
             wire = CanPort.of(port, bus, where, partial(self.orders, nodes=nodes))
-            return self.exchange(robot, bus, wire, port)
+            kind = self.exchange_type()
         except ImportError as missing:
             raise not_installed(self.name, self.libraries, missing) from None
+        axes = [
+            kind.axis_type(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
+            for joint in robot.joints_on(bus.name)
+        ]
+        kind.check_bus(bus, axes, robot.where)
+        return kind(wire, bus, axes)
 
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
@@ -185,16 +191,6 @@ class AttachedMotors(AttachedJoints):
 
     def monitor(self, name: str) -> CanMonitor:
         return CanMonitor(partial(self._port.look, name))
-
-
-def axes_of(
-    kind: Callable[[str, str, Joint, float, Sequence[str]], AxisT], robot: Robot, bus: CanBus, port: str
-) -> list[AxisT]:
-    """Returns the axes of a bus from the robot file."""
-    return [
-        kind(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
-        for joint in robot.joints_on(bus.name)
-    ]
 
 
 def check_load(bus: CanBus, where: str, devices: str, cycle_bits: float, other_bits: int = 0) -> None:

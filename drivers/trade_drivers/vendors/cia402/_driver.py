@@ -4,12 +4,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.joints import BusMotor
-from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
+from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.cia402._table import orders
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort
     from trade_drivers.commissioning._can_scan import CanBench
     from trade_drivers.vendors.cia402._axis import DriveAxis
     from trade_drivers.vendors.cia402._exchange import DriveExchange
@@ -60,14 +58,10 @@ class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
     commissioner = Cia402Commissioner
     orders = staticmethod(orders)
 
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DriveExchange":
-        from trade_drivers.vendors.cia402._axis import DriveAxis  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._exchange import DriveExchange  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._verify import check_bus  # noqa: PLC0415 - the libraries are optional
+    def exchange_type(self) -> "type[DriveExchange]":
+        from trade_drivers.vendors.cia402._exchange import DriveExchange  # noqa: PLC0415 - the libraries are optional
 
-        axes = axes_of(DriveAxis, robot, bus, port)
-        check_bus(bus, axes, robot.where)
-        return DriveExchange(wire, bus, axes)
+        return DriveExchange
 
     def motor(self) -> type[BusMotor[Any, Any]]:
         from trade_drivers.vendors.cia402._homing import Drive  # noqa: PLC0415 - the libraries are optional

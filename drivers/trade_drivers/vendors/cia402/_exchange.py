@@ -12,7 +12,7 @@ from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis, Following, Stage, Turning
 from trade_drivers.vendors.cia402._table import Entry, State
-from trade_drivers.vendors.cia402._verify import Admission, heartbeat_ms
+from trade_drivers.vendors.cia402._verify import Admission, check_bus, heartbeat_ms
 from trade_drivers.vendors.cia402._wire import Net, NoAnswer, Refused
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ _HANDSHAKE: Final = 3
 class DriveExchange(MotorExchange[DriveAxis]):
     """The exchange with the drives of one bus."""
 
+    axis_type = DriveAxis
+    check_bus = staticmethod(check_bus)
     again_ns = PROBE_NS
 
     def __init__(

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
-from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
+from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _table as table
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
@@ -15,7 +14,7 @@ from trade_drivers.vendors.damiao._frames import Feedback
 from trade_drivers.vendors.damiao._table import MASTER, MODELS, Ranges, Register, Status
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort, Frame
+    from trade_drivers.bus.can import Frame
     from trade_drivers.vendors.damiao._exchange import DamiaoExchange
 
 _ANSWER_S: Final = 0.05
@@ -136,12 +135,7 @@ class DamiaoDriver(CanMotorDriver[DamiaoAxis, "DamiaoExchange"]):
     commissioner = DamiaoCommissioner
     orders = staticmethod(table.orders)
 
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DamiaoExchange":
-        from trade_drivers.vendors.damiao._exchange import (  # noqa: PLC0415 - python-can is optional
-            DamiaoExchange,
-            check_bus,
-        )
+    def exchange_type(self) -> "type[DamiaoExchange]":
+        from trade_drivers.vendors.damiao._exchange import DamiaoExchange  # noqa: PLC0415 - python-can is optional
 
-        axes = axes_of(DamiaoAxis, robot, bus, port)
-        check_bus(bus, axes, robot.where)
-        return DamiaoExchange(wire, bus, axes)
+        return DamiaoExchange

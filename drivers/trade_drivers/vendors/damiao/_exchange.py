@@ -73,6 +73,9 @@ def _check_joint(axis: DamiaoAxis) -> None:
 class DamiaoExchange(MotorExchange[DamiaoAxis]):
     """The exchange with the Damiao motors of one bus."""
 
+    axis_type = DamiaoAxis
+    check_bus = staticmethod(check_bus)
+
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] | None = None
     ) -> None:

@@ -5,14 +5,12 @@ from typing import TYPE_CHECKING, Final
 
 from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
-from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
+from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.odrive._frames import Heartbeat, Version, frame_id
 from trade_drivers.vendors.odrive._table import MODELS, NODES, Command, State, orders
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort
     from trade_drivers.vendors.odrive._exchange import OdriveExchange
 
 _ANSWER_S: Final = 0.25
@@ -106,12 +104,7 @@ class OdriveDriver(CanMotorDriver[OdriveAxis, "OdriveExchange"]):
     commissioner = OdriveCommissioner
     orders = staticmethod(orders)
 
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "OdriveExchange":
-        from trade_drivers.vendors.odrive._exchange import (  # noqa: PLC0415 - python-can is optional
-            OdriveExchange,
-            check_bus,
-        )
+    def exchange_type(self) -> "type[OdriveExchange]":
+        from trade_drivers.vendors.odrive._exchange import OdriveExchange  # noqa: PLC0415 - python-can is optional
 
-        axes = axes_of(OdriveAxis, robot, bus, port)
-        check_bus(bus, axes, robot.where)
-        return OdriveExchange(wire, bus, axes)
+        return OdriveExchange

@@ -67,6 +67,9 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
     The requests in each cycle feed the watchdogs of the axes.
     """
 
+    axis_type = OdriveAxis
+    check_bus = staticmethod(check_bus)
+
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] | None = None
     ) -> None:
