@@ -139,6 +139,9 @@ class Components:
             lambda until: self.events.note("certificate_ends", self._address.identity, until),
         )
         leaving.callback(self.transport.close)
+        self._timers = Scheduler("trade-timers", self.transport.clock)
+        """Has a fixed number of tasks, fewer than it may have threads. So none waits for another one that blocks."""
+        leaving.callback(self._timers.close)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
         own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
@@ -182,7 +185,7 @@ class Components:
         self.event_loop = AsyncLoop()
         leaving.callback(self.event_loop.close)
         self.lock_api = LockApi(self.client, self.transport.clock)
-        self.locks = LockTable(address.epoch, self._address.container, self.transport.clock, self.audit)
+        self.locks = LockTable(address.epoch, self._address.container, self._timers, self.audit)
         leaving.callback(self.locks.close)
         self.remote_locks = RemoteLocks(self.locks, address.epoch)
 

@@ -17,8 +17,7 @@ from trade._context.sessions import EndedSessions, foreign, within
 from trade._protocol.messages import Token
 from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, StopInfo, Waiter, withheld
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
-from trade._threads.alarm import Alarm
-from trade._transport.wait_clock import WaitClock
+from trade._threads.scheduler import Scheduler
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
@@ -26,27 +25,29 @@ _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock tha
 _REMEMBERED: Final = 256
 """How many ended grants it remembers, with the reasons."""
 _LEASE_ENDED: Final = "its lease ended"
+_END_S: Final = 2.0
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
 """Stops resources for a reason, without waiting; reports each stop when it is over, and why if it failed."""
 
 
 class LockTable:
-    """The resources of one container, and the locks that hold on them."""
+    """The resources of one container, and the locks that hold on them.
 
-    def __init__(
-        self,
-        epoch: str,
-        container: str,
-        clock: WaitClock | None = None,
-        audit: Audit | None = None,
-    ) -> None:
+    Args:
+        epoch: of the container.
+        container: its name.
+        timers: ends leases, on the clock of locks.
+        audit: records locks.
+    """
+
+    def __init__(self, epoch: str, container: str, timers: Scheduler, audit: Audit | None = None) -> None:
         self._audit = audit or Audit()
         self._epoch = epoch
         self._container = container
         self._stop: Stop = _leave_it
         self._on_loss: Callable[[int, str], None] = lambda _number, _reason: None
-        self._wait_clock = clock or WaitClock()
+        self._wait_clock = timers.clock
         self._clock = self._wait_clock.now
         self._resources: dict[str, tuple[Resource, int]] = {}
         """Resources by name, with the number of services that use them."""
@@ -60,7 +61,7 @@ class LockTable:
         """Requests that wait for their turn, or for running calls and motion."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
-        self._leases = Alarm("trade-leases", lambda: self.expire() * 1e9, self._wait_clock)
+        self._leases = timers.due(self._end_leases)
         self._closed = False
         self._estop: Latch | None = None
 
@@ -409,12 +410,16 @@ class LockTable:
             self.lose(number, _LEASE_ENDED)
         return soonest
 
+    def _end_leases(self) -> int | None:
+        soonest = self.expire()
+        return None if soonest == math.inf else math.ceil(soonest * 1e9)
+
     def close(self) -> None:
         """Ends every wait. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._leases.close()
+        self._leases.cancel(_END_S)
 
 
 def _leave_it(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:

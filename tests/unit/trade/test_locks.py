@@ -14,6 +14,7 @@ from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import _STOPPING, LockTable
 from trade._resources.resource import Holder, Permit, Resource
+from trade._threads.scheduler import Scheduler
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
 
 
@@ -115,16 +116,23 @@ def test_S12_a_renewed_lease_restarts_and_a_lost_one_never_does(table: Table) ->
     assert table.table.infos() == []
 
 
-def test_a_lease_ends_on_its_own_thread_too() -> None:
-    real = LockTable(EPOCH, "home")
+@pytest.fixture
+def real() -> Iterator[LockTable]:
+    """A lock table whose leases end on the clock of this computer."""
+    timers = Scheduler("trade-timers")
+    table = LockTable(EPOCH, "home", timers)
+    yield table
+    table.close()
+    timers.close()
+
+
+def test_a_lease_ends_without_a_question(real: LockTable) -> None:
     real.adopt("a")
     real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), LockRequest(lease_s=0.1))
     wait_until(lambda: real.infos() == [])
-    real.close()
 
 
-def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends() -> None:
-    real = LockTable(EPOCH, "home")
+def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends(real: LockTable) -> None:
     for name in "ab":
         real.adopt(name)
     holder = Holder("tester", "one", "one", "", 0.0)
@@ -132,7 +140,6 @@ def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longe
     wait_until(lambda: real._leases.next_ns < math.inf)
     real.acquire(["b"], holder, LockRequest(lease_s=0.1))
     wait_until(lambda: [info.resources for info in real.infos()] == [("a",)])
-    real.close()
 
 
 def test_leases_continue_to_end_after_a_stop_that_raised(table: Table) -> None:
