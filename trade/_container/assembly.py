@@ -158,7 +158,7 @@ class Components:
         self.client = CallClient(address, self.settings.system, self.registry, self.dialer, self.access)
         self.codec = handle_codec(lambda handle: handle.key, self.client.handle)
         self.local_path = self._local_path()
-        self.caller = Caller(self.transport, address, self.local_path)
+        self.caller = Caller(self.transport, address, self._timers, self.local_path)
         leaving.callback(self.caller.close)
         self.scheduler = Scheduler("trade-clock")
         leaving.callback(self.scheduler.close)

@@ -61,7 +61,7 @@ class LockTable:
         """Requests that wait for their turn, or for running calls and motion."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
-        self._leases = timers.due(self._end_leases)
+        self._leases = timers.due(lambda: self.expire() * 1e9)
         self._closed = False
         self._estop: Latch | None = None
 
@@ -409,10 +409,6 @@ class LockTable:
         for number in over:
             self.lose(number, _LEASE_ENDED)
         return soonest
-
-    def _end_leases(self) -> int | None:
-        soonest = self.expire()
-        return None if soonest == math.inf else math.ceil(soonest * 1e9)
 
     def close(self) -> None:
         """Ends every wait. Idempotent."""

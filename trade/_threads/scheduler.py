@@ -23,8 +23,8 @@ _IDLE_S: Final = 10.0
 _END_S: Final = 2.0
 NEVER: Final = math.inf
 
-Callback = Callable[[], "int | None"]
-"""Runs when it is due; returns when it is due again, in nanoseconds of the clock, or None."""
+Callback = Callable[[], "float | None"]
+"""Runs when it is due; returns when it is due again, in nanoseconds of the clock, or None, or `NEVER`."""
 
 
 class ScheduledTask:
@@ -100,7 +100,7 @@ class Scheduler:
         """A task that runs once its time is set."""
         return ScheduledTask(self, act)
 
-    def begin(self, act: Callback, due_ns: int) -> ScheduledTask:
+    def begin(self, act: Callback, due_ns: float) -> ScheduledTask:
         """Runs something at a time of the clock, in nanoseconds; a time in the past means now."""
         due = self.due(act)
         due.at(due_ns)
@@ -192,7 +192,7 @@ class Scheduler:
         due._running, due._asked_ns = threading.current_thread(), None  # pyright: ignore[reportPrivateUsage]
         due.next_ns = NEVER
         self._lock.release()
-        again_ns: int | None = None
+        again_ns: float | None = None
         try:
             again_ns = due._act()  # pyright: ignore[reportPrivateUsage]
         except BaseException:
@@ -202,9 +202,9 @@ class Scheduler:
             due._running = None  # pyright: ignore[reportPrivateUsage]
             if due.cancelled:
                 self._ended.notify_all()
-            wanted = [ns for ns in (again_ns, due._asked_ns) if ns is not None]  # pyright: ignore[reportPrivateUsage]
-            if wanted:
-                self._push(due, min(wanted), ran=True)
+            wanted = (again_ns, due._asked_ns)  # pyright: ignore[reportPrivateUsage]
+            if (next_ns := min((ns for ns in wanted if ns is not None), default=NEVER)) < NEVER:
+                self._push(due, next_ns, ran=True)
 
     def close(self) -> None:
         """Runs no more tasks; waits a little for running ones. Idempotent."""

@@ -184,6 +184,22 @@ def test_a_task_that_is_alone_needs_one_thread_however_often_it_runs() -> None:
     scheduler.close()
 
 
+def test_a_task_wanted_by_two_times_while_it_runs_runs_by_the_sooner_one() -> None:
+    scheduler, began, may_end = Scheduler("model-clock"), threading.Event(), threading.Event()
+
+    def act() -> None:
+        began.set()
+        may_end.wait(PATIENCE_S)
+
+    task = scheduler.begin(act, 0)
+    assert began.wait(PATIENCE_S)
+    for when in (2**61, 2**60, 2**62):
+        task.by(when)
+    may_end.set()
+    wait_until(lambda: task.next_ns == 2**60)
+    scheduler.close()
+
+
 def test_a_cancelled_task_is_waited_for_only_as_long_as_was_said_and_not_by_itself() -> None:
     scheduler, began, may_end = Scheduler("model-clock"), threading.Event(), threading.Event()
 
