@@ -184,7 +184,7 @@ class Components:
             leaving.callback(handed_down.pop, address)
         self.event_loop = AsyncLoop()
         leaving.callback(self.event_loop.close)
-        self.lock_api = LockApi(self.client, self.transport.clock)
+        self.lock_api = LockApi(self.client, self._timers)
         self.locks = LockTable(address.epoch, self._address.container, self._timers, self.audit)
         leaving.callback(self.locks.close)
         self.remote_locks = RemoteLocks(self.locks, address.epoch)
