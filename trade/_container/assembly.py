@@ -142,6 +142,9 @@ class Components:
         self._timers = Scheduler("trade-timers", self.transport.clock)
         """Has a fixed number of tasks, fewer than it may have threads. So none waits for another one that blocks."""
         leaving.callback(self._timers.close)
+        self._real_timers = Scheduler("trade-timers") if self._given else self._timers
+        """The same on the computer's clock, where a test may move the other one."""
+        leaving.callback(self._real_timers.close)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
         own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
@@ -381,6 +384,7 @@ class Components:
                 self.locks.session_back,
                 self._beat,
                 self.estop.learn,
+                self._real_timers,
             )
             self._leaving.callback(self.watch.close)
             if self.access.path is not None:
