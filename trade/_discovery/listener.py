@@ -55,7 +55,7 @@ class RegistryListener:
         self.malformed = 0
         self._beat = beat
         self._stays_from = time.monotonic() + _STAYS_S
-        self._asker = Resynchronizer(transport, registry, self._answer, self._regularly)
+        self._asker = Resynchronizer(transport, registry, self._answer, self._regularly, timers)
         self._transport = transport
         self._absences = GracePeriods(self._gone, transport.bridge_lost, timers)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)

@@ -120,6 +120,8 @@ class Scheduler:
         """Implements `ScheduledTask.cancel`."""
         with self._lock:
             self._ended.wait_for(lambda: due._running is None, most_s)  # pyright: ignore[reportPrivateUsage]
+            if (stuck := due._running) is not None:  # pyright: ignore[reportPrivateUsage]
+                self._threads.discard(stuck)  # `close` does not wait for it once more
 
     def _push(self, due: ScheduledTask, due_ns: float, *, ran: bool = False) -> None:
         """Queues a task. Requires the lock. If it ran just now, its thread leads unless another one does."""

@@ -212,10 +212,11 @@ def test_a_cancelled_task_is_waited_for_only_as_long_as_was_said_and_not_by_itse
     assert began.wait(PATIENCE_S)
     task.cancel(0.01)
     assert task._running
+    scheduler.close()  # does not wait for it once more
+    assert task._running
     may_end.set()
     task.cancel(PATIENCE_S)
     assert not task._running
-    scheduler.close()
 
 
 TestModel = Model.TestCase
