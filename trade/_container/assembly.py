@@ -288,7 +288,13 @@ class Components:
 
     def _build_dispatch(self, leaving: contextlib.ExitStack) -> None:
         self.dispatcher = Dispatcher(
-            self.transport, self._address, self.providers, self.event_loop, self.access, self.audit
+            self.transport,
+            self._address,
+            self.providers,
+            self.event_loop,
+            self.access,
+            self.audit,
+            self._real_timers,
         )
         leaving.callback(self.dispatcher.close)
         self.local_server: LocalServer | None = None
