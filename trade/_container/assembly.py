@@ -15,6 +15,7 @@ from trade._calls.handle import handle_codec
 from trade._calls.local_path import MARK, LocalPath
 from trade._calls.sessions import Sessions
 from trade._calls.target_cache import Targets
+from trade._container.certificate_end import ExpiryWatch
 from trade._container.policy_reload import begin_watching
 from trade._container.registration import Registration
 from trade._container.shutdown import Shutdown
@@ -132,12 +133,7 @@ class Components:
         """Whether the transport was given: then it carries everything."""
         self.events = EventLog(self._address.container)
         self._certificate = None if self._given else self.settings.certificate()
-        self.transport = transport or join(
-            self.settings,
-            self._certificate,
-            leaving,
-            lambda until: self.events.note("certificate_ends", self._address.identity, until),
-        )
+        self.transport = transport or join(self.settings, self._certificate, leaving)
         leaving.callback(self.transport.close)
         self._timers = Scheduler("trade-timers", self.transport.clock)
         """Has a fixed number of tasks, fewer than it may have threads. So none waits for another one that blocks."""
@@ -145,6 +141,9 @@ class Components:
         self._real_timers = Scheduler("trade-timers") if self._given else self._timers
         """The same on the computer's clock, where a test may move the other one."""
         leaving.callback(self._real_timers.close)
+        if self._certificate is not None:
+            ends = partial(self.events.note, "certificate_ends", self._address.identity)
+            ExpiryWatch(self._certificate, self._real_timers, ends)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
         own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
