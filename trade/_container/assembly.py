@@ -151,7 +151,9 @@ class Components:
         """The secret of this user on this host, if the container's links use it."""
         self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
         if isinstance(self.transport, ZenohTransport):
-            self.dialer = Dialer(self.transport.links, self.settings.check_may_dial, self.settings.connect)
+            self.dialer = Dialer(
+                self.transport.links, self.settings.check_may_dial, self._timers, self.settings.connect
+            )
             leaving.callback(self.dialer.close)
 
     def _build_calls(self, leaving: contextlib.ExitStack) -> None:
