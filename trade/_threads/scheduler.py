@@ -89,7 +89,8 @@ class Scheduler:
         self._followers = threading.Condition(self._lock)
         self._ended = threading.Condition(self._lock)
         """Notified when the run of a cancelled task has ended."""
-        self._threads: set[threading.Thread] = set()
+        self._threads: dict[threading.Thread, None] = {}
+        """In the order of their start: `close` joins them in the same order each time."""
         self._leading = False
         self._following = 0
         self._called = False
@@ -121,7 +122,7 @@ class Scheduler:
         with self._lock:
             self._ended.wait_for(lambda: due._running is None, most_s)  # pyright: ignore[reportPrivateUsage]
             if (stuck := due._running) is not None:  # pyright: ignore[reportPrivateUsage]
-                self._threads.discard(stuck)  # `close` does not wait for it once more
+                self._threads.pop(stuck, None)  # `close` does not wait for it once more
 
     def _push(self, due: ScheduledTask, due_ns: float, *, ran: bool = False) -> None:
         """Queues a task. Requires the lock. If it ran just now, its thread leads unless another one does."""
@@ -153,7 +154,7 @@ class Scheduler:
             else:
                 self._called = True
                 self.clock.expect(self._sooner)
-                self._threads.add(thread)
+                self._threads[thread] = None
 
     def _main(self) -> None:
         with self._lock:
@@ -161,7 +162,7 @@ class Scheduler:
             self._called = False
             while (due := self._next()) is not None:
                 self._do(due)
-            self._threads.discard(threading.current_thread())
+            self._threads.pop(threading.current_thread(), None)
         self.clock.arrived()
 
     def _next(self) -> ScheduledTask | None:
