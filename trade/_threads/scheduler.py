@@ -157,16 +157,39 @@ class Scheduler:
                 self._threads[thread] = None
 
     def _main(self) -> None:
+        due = self._first()
+        while due is not None:
+            due = self._next(due, self._run(due))
+        self.clock.arrived()
+
+    def _first(self) -> ScheduledTask | None:
         with self._lock:
             self.clock.expect()
             self._called = False
-            while (due := self._next()) is not None:
-                self._do(due)
-            self._threads.pop(threading.current_thread(), None)
-        self.clock.arrived()
+            return self._take()
 
-    def _next(self) -> ScheduledTask | None:
+    def _next(self, ran: ScheduledTask, again_ns: float | None) -> ScheduledTask | None:
+        """Notes that a task ran, and takes the next one."""
+        with self._lock:
+            ran._running = None  # pyright: ignore[reportPrivateUsage]
+            if ran.cancelled:
+                self._ended.notify_all()
+            wanted = (again_ns, ran._asked_ns)  # pyright: ignore[reportPrivateUsage]
+            if (next_ns := min((ns for ns in wanted if ns is not None), default=NEVER)) < NEVER:
+                self._push(ran, next_ns, ran=True)
+            return self._take()
+
+    def _take(self) -> ScheduledTask | None:
         """The next task, once due; None if this thread is not needed. Requires the lock, and releases it to wait."""
+        due = self._wait()
+        if due is None:
+            self._threads.pop(threading.current_thread(), None)
+        else:
+            due._running, due._asked_ns = threading.current_thread(), None  # pyright: ignore[reportPrivateUsage]
+            due.next_ns = NEVER
+        return due
+
+    def _wait(self) -> ScheduledTask | None:
         while not self._closed:
             left_ns = self._queue[0][0] - self.clock.now_ns() if self._queue else None
             if left_ns is not None and left_ns <= 0:
@@ -190,24 +213,13 @@ class Scheduler:
                     return None
         return None
 
-    def _do(self, due: ScheduledTask) -> None:
-        """Runs the task without the lock, and schedules its next run."""
-        due._running, due._asked_ns = threading.current_thread(), None  # pyright: ignore[reportPrivateUsage]
-        due.next_ns = NEVER
-        self._lock.release()
-        again_ns: float | None = None
+    def _run(self, due: ScheduledTask) -> float | None:
+        """Runs a task; returns when it is due again."""
         try:
-            again_ns = due._act()  # pyright: ignore[reportPrivateUsage]
+            return due._act()  # pyright: ignore[reportPrivateUsage]
         except BaseException:
             _logger.exception("%s: a scheduled task failed and is not repeated", self._name)
-        finally:
-            self._lock.acquire()
-            due._running = None  # pyright: ignore[reportPrivateUsage]
-            if due.cancelled:
-                self._ended.notify_all()
-            wanted = (again_ns, due._asked_ns)  # pyright: ignore[reportPrivateUsage]
-            if (next_ns := min((ns for ns in wanted if ns is not None), default=NEVER)) < NEVER:
-                self._push(due, next_ns, ran=True)
+            return None
 
     def close(self) -> None:
         """Runs no more tasks; waits a little for running ones. Idempotent."""
