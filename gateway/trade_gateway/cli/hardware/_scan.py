@@ -14,9 +14,9 @@ from trade.errors import ConfigurationError
 from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import CONNECTION, OUTPUT, SELECT, Json
-from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.hardware._robot_file_template import first_file
+from trade_gateway.terminal._options import CONNECTION, OUTPUT, SELECT, Json
+from trade_gateway.terminal._output import Output, complain
 
 _PORTS: Final = ("/dev/serial/by-id/*", "/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 _CAN: Final = re.compile(r"[a-z0-9_]+:.+")

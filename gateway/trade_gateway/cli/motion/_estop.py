@@ -10,9 +10,9 @@ from trade._estop.controller import new_estop_id
 from trade.errors import NoSuchEstop
 from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
-from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, say_elsewhere, say_unreached
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 
 def estop(

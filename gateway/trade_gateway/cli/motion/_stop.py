@@ -7,10 +7,10 @@ from rich.markup import escape
 
 from trade import StopReport
 from trade.stop_line import StopLines, together
-from trade_gateway.cli._completion import groups
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain, say_elsewhere, say_unreached
-from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.terminal._completion import groups
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain, say_elsewhere, say_unreached
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 _LINE_S: Final = 0.3
 """The time before it also stops over links, in seconds."""

@@ -8,8 +8,8 @@ from rich.markup import escape
 
 from trade.policies import VERBS, Decision, Policy, decide_call, read_policy
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
 
 app = typer.Typer(
     no_args_is_help=True,

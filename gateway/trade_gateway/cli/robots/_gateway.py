@@ -12,11 +12,7 @@ from rich.markup import escape
 from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli.robots._child_news import say_news
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.cli.robots._hub import allow_many_links
 from trade_gateway.config._changes import Named, digest, named_by
 from trade_gateway.config._described import described
@@ -25,6 +21,10 @@ from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
 from trade_gateway.sharing._guests import Guests, opened
 from trade_gateway.supervisor import ChildServices, News, Supervisor
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._sd_notify import Notifier
 
 _LOOK_EVERY_S: Final = 1.0
 

@@ -21,11 +21,12 @@ from trade_gateway.ros._goals import (
     trajectory_of,
 )
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
-from trade_gateway.ros._joints import LIMBS, JointNames, beside, joints_of, limbs, measured
+from trade_gateway.ros._joints import LIMBS, beside, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, text_of
 from trade_gateway.ros_messages._conversion import ros_stamp, seconds
+from trade_gateway.ros_messages._joint_names import JointNames
 from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")

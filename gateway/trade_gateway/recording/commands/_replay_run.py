@@ -12,10 +12,10 @@ from trade import Container, Handle, Stream, where
 from trade.errors import ConfigurationError, DeviceError
 from trade_drivers import JointLimits, Tolerances
 from trade_gateway._usage import UsageError
-from trade_gateway.cli.services._call import run_to_end
 from trade_gateway.recording._channels import JointStates
 from trade_gateway.recording._motion import Motion, deviation, fitted, motion_of, motions, moving
 from trade_gateway.recording._sources import joint_states
+from trade_gateway.terminal._calls import run_to_end
 
 _LIMBS: Final = where(kind="JointGroup") | where(kind="Arm")
 _FIND_S: Final = 5.0

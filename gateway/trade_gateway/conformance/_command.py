@@ -2,16 +2,18 @@
 
 import signal
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json, chosen
-from trade_gateway.cli._output import Output
 from trade_gateway.conformance import CHECKS, Check, Outcome, Result, run
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json, chosen
+from trade_gateway.terminal._output import Output
 
+SECTION: Final = sections.OPERATION
 _COLOURS = {Result.OK: "green", Result.FAILED: "bold red", Result.LEFT_OUT: "yellow"}
 
 

@@ -1,17 +1,20 @@
 """``trade stubs GROUP``: writes typed Python classes for the services of a group."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from trade.atomic_files import replace
 from trade_gateway._usage import asked_for
-from trade_gateway.cli._completion import groups
-from trade_gateway.cli._options import Wait
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.stubs import write_stubs
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._completion import groups
+from trade_gateway.terminal._options import Wait
+from trade_gateway.terminal._system_choice import visitor_among_others
 
+SECTION: Final = sections.SERVICES
+PLACE: Final = 5
 _MODE = 0o644
 
 

@@ -1,18 +1,21 @@
 """``trade mcp``: a Model Context Protocol (MCP) server for agents, on standard input and output."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
-import anyio
 import typer
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_gateway.cli._options import room_of_extra
-from trade_gateway.cli._output import complain
-from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.language import read_lexicon
 from trade_gateway.process._signals import settle
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import room_of_extra
+from trade_gateway.terminal._output import complain
+from trade_gateway.terminal._system_choice import SystemChoice
+
+SECTION: Final = sections.SERVICES
+PLACE: Final = 7
 
 
 def mcp(
@@ -35,6 +38,8 @@ def mcp(
     For example: trade mcp --twin rosie.toml --ask-first rosie.legs
     """
     room = room_of_extra("mcp", "trade mcp")
+    from anyio import run  # noqa: PLC0415 - the extra installs it
+
     choice: SystemChoice = context.obj
     if twin is not None and not twin.exists():
         raise ConfigurationError(where=str(twin), problem="there is no such robot file")
@@ -53,6 +58,6 @@ def mcp(
 
         settle()
         try:
-            anyio.run(room.serve, container, approvals, read_lexicon(lexicon), trying, leave)
+            run(room.serve, container, approvals, read_lexicon(lexicon), trying, leave)
         finally:
             leave()

@@ -9,11 +9,11 @@ from typing import Final
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli.robots._detached import ready
 from trade_gateway.recording._fault_trigger import SavedAtFault
 from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._recorder import Recorder, Ring, about
+from trade_gateway.terminal._detached import ready
+from trade_gateway.terminal._output import Output, complain
 
 __all__ = ["Recorder", "Ring", "about", "kept_for_faults", "to_file"]
 

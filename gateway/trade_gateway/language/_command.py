@@ -8,11 +8,14 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_error
-from trade_gateway.cli._system_choice import choice_of, visitor_among_others
 from trade_gateway.language import Lexicon, Memory, Model, Reply, Talk, read_lexicon
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, say_error
+from trade_gateway.terminal._system_choice import choice_of, visitor_among_others
 
+SECTION: Final = sections.SERVICES
+PLACE: Final = 6
 _FILE: Final = "asked.json"
 
 

@@ -7,7 +7,7 @@ from typing import Final
 import typer
 
 from trade import Container, Settings
-from trade_gateway.cli._output import complain
+from trade_gateway.terminal._output import complain
 
 _PATIENCE_S: Final = 3.0
 """How long to wait for a container at the endpoints of the settings, in seconds."""

@@ -19,7 +19,7 @@ from trade import Container, Settings
 from trade.command_output import as_text
 from trade.errors import CannotStart
 from trade.starting import Started
-from trade_gateway.cli._output import Output
+from trade_gateway.terminal._output import Output
 
 _UP_S: Final = 45.0
 """The longest start in seconds; less than a start through ssh may take."""

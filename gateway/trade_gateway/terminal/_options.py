@@ -9,7 +9,7 @@ from typer.core import TyperGroup
 
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._completion import groups
+from trade_gateway.terminal._completion import groups
 
 SELECT: Final = "What to select"
 CONNECTION: Final = "Connection"
@@ -58,11 +58,14 @@ def chosen(cases: Sequence[C], names: Sequence[str], what: str) -> list[C]:
 
 def room_of_extra(extra: str, command: str) -> Any:
     """Imports the subpackage whose libraries the extra of the same name installs. Raises ConfigurationError."""
+    room = import_module(f"trade_gateway.{extra}")
     try:
-        return import_module(f"trade_gateway.{extra}")
+        for name in room.__all__:
+            getattr(room, name)
     except ImportError as missing:
         problem = f"needs {missing.name}; pip install 'trade-gateway[{extra}]'"
         raise ConfigurationError(where=command, problem=problem) from None
+    return room
 
 
 class FirstByDefault(TyperGroup):

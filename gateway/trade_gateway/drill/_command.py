@@ -6,7 +6,7 @@ import tempfile
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 import typer
@@ -15,10 +15,12 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 from trade_drivers import load, without
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json, chosen
-from trade_gateway.cli._output import Output
 from trade_gateway.drill import SCENES, Played, Report, as_data, page, play, standing, targets_of
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json, chosen
+from trade_gateway.terminal._output import Output
 
+SECTION: Final = sections.HARDWARE
 _COLOURS = {True: "green", False: "bold red"}
 
 

@@ -2,21 +2,24 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.markup import escape
 
 from trade import Container
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import choice_of, visitor_among_others
-from trade_gateway.cli.robots._system_diff import compared, snapshot, write
-from trade_gateway.cli.robots._system_up import Report, SystemStarter, check_hosts
 from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
+from trade_gateway.supervisor._system_diff import compared, snapshot, write
+from trade_gateway.supervisor._system_up import Report, SystemStarter, check_hosts
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import choice_of, visitor_among_others
 
+SECTION: Final = sections.ROBOTS
+PLACE: Final = 9
 app = typer.Typer(
     no_args_is_help=True,
     help="Start, show and end the system of a file, on all its hosts.\n\n"

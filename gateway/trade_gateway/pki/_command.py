@@ -9,12 +9,15 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import CONNECTION, TIMING, Json
-from trade_gateway.cli._output import Output
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import CONNECTION, TIMING, Json
+from trade_gateway.terminal._output import Output
 
 if TYPE_CHECKING:
     from trade_gateway.pki._authority import Authority, Issued
 
+SECTION: Final = sections.RIGHTS
+PLACE: Final = 0
 _PURPOSES: Final = ("container", "gateway")
 _LONGEST_HOURS: Final = 366 * 24.0
 _DEFAULT: Final = Path("pki")

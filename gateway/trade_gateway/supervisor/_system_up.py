@@ -15,12 +15,12 @@ from msgspec import Struct
 from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
-from trade_gateway.cli.robots._detached import detached
 from trade_gateway.config._entry import LOCAL, ContainerSpec
 from trade_gateway.config._system import SystemPlan
 from trade_gateway.process._signals import SignalEvent
 from trade_gateway.supervisor import ChildInfo
 from trade_gateway.supervisor._objects import GROUP, lacking, make
+from trade_gateway.terminal._detached import detached
 
 _LEFT_S: Final = 20.0
 """How long a container may take to shut down, in seconds: a robot is brought to rest first."""

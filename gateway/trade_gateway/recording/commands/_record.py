@@ -7,13 +7,16 @@ from typing import Annotated, Final
 import typer
 
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import TIMING, Groups, Json, Readers
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._signals import leaving, refuse_twice
 from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import TIMING, Groups, Json, Readers
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
+SECTION: Final = sections.RECORDINGS
+PLACE: Final = 0
 MB: Final = 1_000_000
 _RATES: Final = "Rates"
 _RING: Final = "Last seconds before a fault"
@@ -80,7 +83,7 @@ def record(
     wanted = Wanted(group or [], services or [], hz, camera_hz, service_hz)
     attachments = [_read(path) for path in attach or []]
     require("mcap", "record")
-    from trade_gateway.cli.recordings import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
+    from trade_gateway.recording.commands import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
     with (

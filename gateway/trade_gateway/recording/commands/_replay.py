@@ -7,11 +7,14 @@ import typer
 from rich.markup import escape
 
 from trade import where
-from trade_gateway.cli._options import SELECT, TIMING, Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
 from trade_gateway.recording import require
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import SELECT, TIMING, Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
+SECTION: Final = sections.RECORDINGS
+PLACE: Final = 2
 _WAIT_S: Final = 10.0
 
 
@@ -44,7 +47,7 @@ def replay(
     For example: trade replay walk.mcap --group rosie.head --speed 0.5
     """
     require("mcap", "record")
-    from trade_gateway.cli.recordings import _replay_run as room  # noqa: PLC0415 - loads what the other commands do not need
+    from trade_gateway.recording.commands import _replay_run as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
     motion = room.chosen(file, group)

@@ -12,7 +12,7 @@ from typing import Final
 import typer
 
 from trade import Container, Handle
-from trade_gateway.cli._system_choice import SystemChoice, visitor_of
+from trade_gateway.terminal._system_choice import SystemChoice, visitor_of
 
 Complete = Callable[[typer.Context, str], list[str]]
 _OWN: Final = "trade"

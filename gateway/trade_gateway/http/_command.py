@@ -10,12 +10,15 @@ from rich.markup import escape
 from trade import Container
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import CONNECTION, SECURITY, Json, room_of_extra
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import SystemChoice
-from trade_gateway.cli.robots._detached import ready
 from trade_gateway.process._signals import leaving, refuse_twice, settle
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._detached import ready
+from trade_gateway.terminal._options import CONNECTION, SECURITY, Json, room_of_extra
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import SystemChoice
 
+SECTION: Final = sections.ROBOTS
+PLACE: Final = 8
 _LOOK_EVERY_S: Final = 1.0
 _TOKENS: Final = Path("http-tokens.toml")
 _NAME: Final = "http"

@@ -1,22 +1,26 @@
 """``trade foxglove``: shows live what ``trade record`` would write, over the Foxglove WebSocket protocol."""
 
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._options import Groups, Json, Readers
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import visitor
 from trade_gateway.process._addresses import is_loopback
 from trade_gateway.process._signals import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Groups, Json, Readers
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import visitor
 
 if TYPE_CHECKING:
     from trade_gateway.recording._live import Live
+
+SECTION: Final = sections.RECORDINGS
+PLACE: Final = 1
 
 
 def foxglove(

@@ -7,13 +7,16 @@ import typer
 from rich.markup import escape
 
 from trade import Container
-from trade_gateway.cli._options import Json, room_of_extra
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._sd_notify import Notifier
-from trade_gateway.cli._system_choice import SystemChoice
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.process._signals import leaving, refuse_twice, settle
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json, room_of_extra
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._sd_notify import Notifier
+from trade_gateway.terminal._system_choice import SystemChoice
 
+SECTION: Final = sections.ROBOTS
+PLACE: Final = 7
 _LOOK_EVERY_S: Final = 0.5
 _UP_WITHIN_S: Final = 30.0
 

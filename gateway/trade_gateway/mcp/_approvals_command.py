@@ -9,11 +9,14 @@ from rich.markup import escape
 
 from trade import Container, Handle, where
 from trade.errors import ConfigurationError, TradeError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.clients._schemas import APPROVALS
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import visitor_among_others
 
+SECTION: Final = sections.RIGHTS
+PLACE: Final = 2
 _COLUMNS: Final = ("id", "agent", "service", "arguments", "why", "waits")
 
 app = typer.Typer(

@@ -10,10 +10,13 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
 from trade_gateway.recording import require
+from trade_gateway.terminal import sections
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
 
+SECTION: Final = sections.RECORDINGS
+PLACE: Final = 3
 _DATASET: Final = "LeRobot dataset"
 
 
@@ -110,7 +113,7 @@ def _export_bag(out: Output, file: Path, folder: Path, asked: list[str] | None, 
     require("rosbags", "ros")
     from trade_gateway.recording import _ros2_bag  # noqa: PLC0415 - loads what the other commands do not need
     from trade_gateway.recording._motion import motions  # noqa: PLC0415 - likewise
-    from trade_gateway.ros._joints import JointNames  # noqa: PLC0415 - likewise
+    from trade_gateway.ros_messages._joint_names import JointNames  # noqa: PLC0415 - likewise
 
     found = motions(file)
     groups = _groups(file, asked, found)
