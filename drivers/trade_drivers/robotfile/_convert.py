@@ -9,10 +9,8 @@ import msgspec
 from msgspec import Struct
 
 from trade.errors import ConfigurationError
+from trade.toml_files import mismatch
 
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _CHOICES: Final = {"leave": '"hold" or "relax"', "process": '"shared" or "own"', "zero": '"last" or "kept"'}
 
 _EXAMPLES: Final = {
@@ -45,24 +43,22 @@ def record_of(key: str, name: str | None, table: Mapping[str, object], record: t
 
 
 def explain(
-    bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str
+    bad: msgspec.ValidationError, table: Mapping[str, object], key: str, record: type[Struct], where: str
 ) -> ConfigurationError:
     """Returns the error for an invalid table."""
-    text = str(bad)
+    found = mismatch(bad)
     keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
-    if missing := _MISSING.search(text):
-        example = _EXAMPLES.get(missing.group(1))
-        hint = f"write {missing.group(1)} = {example}" if example else f"the keys are {keys}"
-        return wrong(where, key, f"missing required key {missing.group(1)!r}; {hint}")
-    if unknown := _UNKNOWN.search(text):
-        return wrong(where, f"{key}.{unknown.group(1)}", f"unknown key; the keys are {keys}")
-    at = _AT.search(text)
-    field = re.split(r"[.\[]", at.group(1))[0] if at else ""
+    if found.missing:
+        example = _EXAMPLES.get(found.missing)
+        hint = f"write {found.missing} = {example}" if example else f"the keys are {keys}"
+        return wrong(where, key, f"missing required key {found.missing!r}; {hint}")
+    if found.unknown:
+        return wrong(where, f"{key}.{found.unknown}", f"unknown key; the keys are {keys}")
+    field = re.split(r"[.\[]", found.place)[0]
     value = table.get(field)
     if (choices := _CHOICES.get(field)) and isinstance(value, str):
         return wrong(where, f"{key}.{field}", f"must be {choices}, but it is {value!r}")
-    problem = text[: at.start()] if at else text
-    return wrong(where, f"{key}.{field}", f"{problem}, but it is {value!r}")
+    return wrong(where, f"{key}.{field}", f"{found.problem}, but it is {value!r}")
 
 
 def _check_finite(record: Struct, key: str, where: str) -> None:

@@ -15,7 +15,8 @@ from trade_gateway.config._children import Supervised
 from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._supervised_system import is_supervised
-from trade_gateway.config._tables import Tables, at, converted, line_of, read_toml
+from trade_gateway.config._tables import Tables, converted
+from trade_gateway.config._toml_file import at, line_of, read_toml
 
 _SET_BY_GATEWAY: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
 """Keys that a gateway file sets instead of the system file."""

@@ -8,7 +8,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, Final, NoReturn, TypeVar, cast
+from typing import Final, NoReturn, TypeVar, cast
 
 import msgspec
 from msgspec import Struct
@@ -17,8 +17,7 @@ from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
-from trade.text_files import read_text
-from trade.toml_files import read_toml_text
+from trade.toml_files import mismatch
 from trade_drivers import check, load, without
 from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_gateway.config._entry import (
@@ -32,12 +31,7 @@ from trade_gateway.config._entry import (
     HttpSpec,
     RecordSpec,
 )
-
-_HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
-_NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
+from trade_gateway.config._toml_file import at
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _DEFAULTS: Final = Entry()
@@ -270,54 +264,20 @@ def _options(values: Mapping[str, Sequence[str]]) -> list[str]:
     return [word for option, named in values.items() for value in named for word in (option, value)]
 
 
-def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
-    """Reads a TOML file; returns its text and its contents. Raises ConfigurationError."""
-    try:
-        text = read_text(path)
-        return text, read_toml_text(text)
-    except FileNotFoundError:
-        raise ConfigurationError(where=str(path), problem="there is no such file") from None
-    except OSError as bad:
-        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
-    except ValueError as bad:  # no TOML, or no UTF-8
-        raise ConfigurationError(where=str(path), problem=f"not valid TOML: {bad}") from None
-
-
 def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...]) -> _Read:
     """Converts a table to its type. Raises ConfigurationError with the line."""
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
-        message = str(bad)
-    place = _AT.search(message)
-    inside = place.group(1) if place else ""
-    key = re.split(r"[.\[]", inside, maxsplit=1)[0]
+        found = mismatch(bad)
+    key = re.split(r"[.\[]", found.place, maxsplit=1)[0]
     fields = INSIDE.get(key, kind).__struct_encode_fields__
-    problem = message[: place.start()] if place else message
-    if unknown := _UNKNOWN.search(message):
-        key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"
-    elif missing := _MISSING.search(message):
-        problem = f"{missing.group(1)} is missing"
+    problem = found.problem
+    if found.unknown:
+        key, problem = key or found.unknown, f"unknown key {found.unknown!r}; there is {', '.join(fields)}"
+    elif found.missing:
+        problem = f"{found.missing} is missing"
     raise ConfigurationError(where=at(path, text, table, key), problem=problem)
-
-
-def at(path: Path, text: str, table: tuple[str, ...], key: str) -> str:
-    """Returns a place in a file, for errors."""
-    return f"{path}:{line_of(text, table, key)}: {'.'.join((*table, key) if key else table)}"
-
-
-def line_of(text: str, table: Sequence[str], key: str = "") -> int:
-    """Returns the line of a key in a table of a TOML text; else of the table's header; else 1."""
-    inside, found = False, 1
-    wanted = re.compile(rf"""\s*["']?{re.escape(key)}["']?\s*=""")
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := _HEADER.match(line):
-            names = [quoted or bare for quoted, bare in _NAME.findall(header.group(1))]
-            inside = names[: len(table)] == list(table)
-            found = number if inside and found == 1 else found
-        elif inside and key and wanted.match(line):
-            return number
-    return found
 
 
 def _some(names: Mapping[str, object]) -> str:

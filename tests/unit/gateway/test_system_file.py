@@ -11,7 +11,7 @@ from tests.support.simulated_robots import HEAD as SERVO_HEAD
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
 from trade_gateway.config._system import read_system_file
-from trade_gateway.config._tables import line_of
+from trade_gateway.config._toml_file import line_of
 
 pytestmark = pytest.mark.virtual_time
 
