@@ -9,9 +9,9 @@ from rich.markup import escape
 
 from trade import Container
 from trade_gateway._usage import UsageError
-from trade_gateway.config._system import SystemPlan, read_system_file
 from trade_gateway.process._signals import leaving
 from trade_gateway.supervisor._system_diff import compared, snapshot, write
+from trade_gateway.supervisor._system_file import SystemPlan, read_system_file
 from trade_gateway.supervisor._system_up import Report, SystemStarter, check_hosts
 from trade_gateway.terminal import sections
 from trade_gateway.terminal._options import Json

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from trade import current_call, service
 from trade.errors import ConfigurationError
-from trade_gateway.config._described import ChildTables
 from trade_gateway.supervisor._child_state import ChildInfo
+from trade_gateway.supervisor._described import ChildTables
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._supervisor import Supervisor
 

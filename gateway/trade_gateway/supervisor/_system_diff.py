@@ -8,10 +8,10 @@ from typing import NamedTuple
 from trade import Container, ContainerInfo, where
 from trade.atomic_files import claim, fresh_beside
 from trade.errors import ConfigurationError
-from trade_gateway.config._described import ChildTables, Difference, as_toml, described, differences, paths_in
 from trade_gateway.config._gateway_file import read_gateway_file
-from trade_gateway.config._system import SystemPlan, read_system_file
+from trade_gateway.supervisor._described import ChildTables, Difference, as_toml, described, differences, paths_in
 from trade_gateway.supervisor._objects import GROUP
+from trade_gateway.supervisor._system_file import SystemPlan, read_system_file
 
 
 class Snapshot(NamedTuple):

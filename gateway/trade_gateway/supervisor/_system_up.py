@@ -16,10 +16,10 @@ from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway.config._entry import LOCAL, ContainerSpec
-from trade_gateway.config._system import SystemPlan
 from trade_gateway.process._signals import SignalEvent
 from trade_gateway.supervisor import ChildInfo
 from trade_gateway.supervisor._objects import GROUP, lacking, make
+from trade_gateway.supervisor._system_file import SystemPlan
 from trade_gateway.terminal._detached import detached
 
 _LEFT_S: Final = 20.0

@@ -23,8 +23,8 @@ from trade._transport.endpoints import loopback_interface
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
 from trade_gateway.cli.robots import _gateway
+from trade_gateway.cli.robots._file_changes import Named, digest, named_by
 from trade_gateway.config import _gateway_file
-from trade_gateway.config._changes import Named, digest, named_by
 from trade_gateway.config._children import Child
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.pki._authority import Authority

@@ -20,12 +20,12 @@ from trade.text_files import as_before, as_text
 from trade_drivers import load
 from trade_gateway.cli.watching._profile import read as read_profile
 from trade_gateway.config._gateway_file import read_gateway_file
-from trade_gateway.config._system import read_system_file
 from trade_gateway.config.document import Document
 from trade_gateway.http._authentication import Tokens, add_token
 from trade_gateway.language._lexicon import read_lexicon
 from trade_gateway.ros._file import read_ros_file
 from trade_gateway.ros_messages._types import Types
+from trade_gateway.supervisor._system_file import read_system_file
 from trade_hil_sim.robot._robot import read_robot
 
 _EXAMPLES = Path(__file__).parents[3] / "examples"

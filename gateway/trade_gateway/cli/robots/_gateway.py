@@ -13,14 +13,14 @@ from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
 from trade_gateway.cli.robots._child_news import say_news
+from trade_gateway.cli.robots._file_changes import Named, digest, named_by
 from trade_gateway.cli.robots._hub import allow_many_links
-from trade_gateway.config._changes import Named, digest, named_by
-from trade_gateway.config._described import described
 from trade_gateway.config._gateway_file import Plan, read_gateway_file
 from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
 from trade_gateway.sharing._guests import Guests, opened
 from trade_gateway.supervisor import ChildServices, News, Supervisor
+from trade_gateway.supervisor._described import described
 from trade_gateway.terminal._detached import Detach, detach_now, ready
 from trade_gateway.terminal._options import Json
 from trade_gateway.terminal._output import Output, complain

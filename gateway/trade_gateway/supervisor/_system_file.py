@@ -15,7 +15,7 @@ from trade_gateway.config._children import Supervised
 from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.config._supervised_system import is_supervised
-from trade_gateway.config._tables import Tables, converted
+from trade_gateway.config._tables import Tables, converted, read_entry
 from trade_gateway.config._toml_file import at, line_of, read_toml
 
 _SET_BY_GATEWAY: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
@@ -75,7 +75,7 @@ def read_system_file(path: Path) -> SystemPlan:
     named = cast("dict[str, object]", tables)
     supervised = {name for name, table in named.items() if system.supervisor and is_supervised(table)}
     entries = {
-        name: converted(table, Supervised if name in supervised else Entry, path, text, ("container", name))
+        name: read_entry(table, Supervised if name in supervised else Entry, path, text, ("container", name))
         for name, table in named.items()
     }
     defaults = FileDefaults(

@@ -11,9 +11,10 @@ from msgspec import Struct
 
 from trade_gateway.config._entry import Entry
 from trade_gateway.config._gateway_file import Plan
+from trade_gateway.config._kind import PRODUCTS, kind_of_product
 
 _PATHS: Final = ("robot", "gateway", "rules", "ros", "tls", "policy", "audit", "folder")
-_INNER_PATHS: Final = {"http": ("tokens", "tls", "twin"), "record": ("folder",)}
+_INNER_PATHS: Final = {key: kind_of_product(key).paths for key in PRODUCTS}
 _COMMANDS: Final = (("program",), ("health", "command"))
 _MADE: Final = ("audit", "record.folder")
 """Folders that are made when they are missing, or by the user before a start."""
