@@ -1,14 +1,12 @@
-"""Parts that commands share: options, a default command, cases chosen by name, and packages of an extra."""
+"""Parts that commands share: options, a default command, and packages of an extra."""
 
-from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, Final, Protocol, TypeVar
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
 
 from trade.errors import ConfigurationError
-from trade_gateway._usage import UsageError
 from trade_gateway.terminal._completion import groups
 
 SELECT: Final = "What to select"
@@ -35,25 +33,6 @@ Readers = Annotated[
         help="Also sample this read-only service: rosie.hand.state; * and ? are wildcards. Repeatable.",
     ),
 ]
-
-
-class Case(Protocol):
-    """A check or a scene, known by its name."""
-
-    @property
-    def name(self) -> str: ...
-
-
-C = TypeVar("C", bound=Case)
-
-
-def chosen(cases: Sequence[C], names: Sequence[str], what: str) -> list[C]:
-    """Returns the cases that ``--only`` names, in the order of the table; by default all. Raises UsageError."""
-    known = [case.name for case in cases]
-    if unknown := [name for name in names if name not in known]:
-        problem = f"there is no such {what}; there is {', '.join(known)}"
-        raise UsageError(where=f"--only {unknown[0]}", problem=problem)
-    return [case for case in cases if not names or case.name in names]
 
 
 def room_of_extra(extra: str, command: str) -> Any:

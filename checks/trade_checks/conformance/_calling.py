@@ -7,10 +7,10 @@ from typing import Any, Final
 
 from trade import errors
 from trade._protocol.messages import CANCEL, Status
-from trade_gateway.conformance._assertions import eventually, require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._raw_client import DEADLINE_S, NEVER, SYSTEM, error_of
+from trade_checks.conformance._assertions import eventually, require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._raw_client import DEADLINE_S, NEVER, SYSTEM, error_of
 
 _LATEST_NS: Final = 2**63 - 1
 

@@ -9,11 +9,11 @@ from trade import errors, where
 from trade._protocol.estop_messages import decode_estop_confirmed
 from trade._protocol.keys import estop_confirmed_key, estop_key
 from trade._protocol.messages import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
-from trade_gateway.conformance._assertions import PATIENCE_S, eventually, require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._peer import GROUP
-from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, error_of
+from trade_checks.conformance._assertions import PATIENCE_S, eventually, require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._peer import GROUP
+from trade_checks.conformance._raw_client import NEVER, SYSTEM, Voice, error_of
 
 _CONFIRMED_WITHIN_S = 3.0
 _WATCHED_S = 0.5

@@ -2,10 +2,10 @@
 
 from trade import errors
 from trade._protocol.messages import Status
-from trade_gateway.conformance._assertions import require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, body_of, error_of
+from trade_checks.conformance._assertions import require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._raw_client import NEVER, SYSTEM, Voice, body_of, error_of
 
 
 @check("turns", "Writing a container in another language")

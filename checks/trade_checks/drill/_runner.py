@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade_checks.drill._report import Played, Stop
+from trade_checks.drill._scenes import Scene, limit_s
+from trade_checks.drill._targets import Target
+from trade_checks.drill._testbed import Testbed
 from trade_drivers.robotfile import Drill
-from trade_gateway.drill._report import Played, Stop
-from trade_gateway.drill._scenes import Scene, limit_s
-from trade_gateway.drill._targets import Target
-from trade_gateway.drill._testbed import Testbed
 from trade_gateway.process._json_child import ChildFailed, JsonChild
 
 _TRIES: Final = 3

@@ -22,9 +22,9 @@ from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
 from trade.records import Granted, Token
-from trade_gateway.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
-from trade_gateway.conformance._peer import Peer, end_group
-from trade_gateway.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice
+from trade_checks.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
+from trade_checks.conformance._peer import Peer, end_group
+from trade_checks.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice
 
 IDENTITY: Final = "peer"
 NAME: Final = "peer"

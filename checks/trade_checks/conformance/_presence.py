@@ -5,11 +5,11 @@ from typing import Final
 
 from trade._protocol.keys import is_chunk, registry_key, tally_key
 from trade._protocol.messages import ServiceInfo, Tally, decode_tally
-from trade_gateway.conformance._assertions import NotHeld, eventually, require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._peer import GROUP, Offer
-from trade_gateway.conformance._raw_client import NEVER, SYSTEM
+from trade_checks.conformance._assertions import NotHeld, eventually, require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._peer import GROUP, Offer
+from trade_checks.conformance._raw_client import NEVER, SYSTEM
 
 ARM: Final = {
     "echo": ("read", ("value",)),

@@ -7,10 +7,11 @@ from typing import Annotated, Final
 import typer
 from rich.markup import escape
 
+from trade_checks._cases import chosen
+from trade_checks.conformance import CHECKS, Check, Outcome, Result, run
 from trade_gateway._usage import UsageError
-from trade_gateway.conformance import CHECKS, Check, Outcome, Result, run
 from trade_gateway.terminal import sections
-from trade_gateway.terminal._options import Json, chosen
+from trade_gateway.terminal._options import Json
 from trade_gateway.terminal._output import Output
 
 SECTION: Final = sections.OPERATION

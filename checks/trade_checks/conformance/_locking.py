@@ -7,11 +7,11 @@ import msgspec
 
 from trade import LockInfo, errors, where
 from trade._protocol.messages import Status, Token
-from trade_gateway.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._peer import GROUP
-from trade_gateway.conformance._raw_client import SYSTEM, Voice, body_of, error_of
+from trade_checks.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._peer import GROUP
+from trade_checks.conformance._raw_client import SYSTEM, Voice, body_of, error_of
 
 _ARM = ["peer.arm"]
 _LEASE_S = 1.0

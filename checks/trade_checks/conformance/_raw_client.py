@@ -24,7 +24,7 @@ from trade._protocol.messages import (
 )
 from trade._protocol.remote_errors import unpack_error
 from trade._transport.base import ChannelClosed, Publisher, Transport
-from trade_gateway.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
+from trade_checks.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
 
 Place = tuple[str, str]
 """Domain and provider."""

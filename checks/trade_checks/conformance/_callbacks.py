@@ -10,10 +10,10 @@ import msgspec
 from trade import Resource, current_call, errors, service, where
 from trade._protocol.keys import ServiceKey
 from trade._protocol.messages import Status
-from trade_gateway.conformance._assertions import eventually, require
-from trade_gateway.conformance._check import check
-from trade_gateway.conformance._environment import Stage
-from trade_gateway.conformance._raw_client import DEADLINE_S, Voice, error_of
+from trade_checks.conformance._assertions import eventually, require
+from trade_checks.conformance._check import check
+from trade_checks.conformance._environment import Stage
+from trade_checks.conformance._raw_client import DEADLINE_S, Voice, error_of
 
 _EXTENSION = 1
 _SHORT_S = 2.0

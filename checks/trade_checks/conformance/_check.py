@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from trade_gateway.conformance._environment import Stage
+from trade_checks.conformance._environment import Stage
 
 
 class Check(Struct, frozen=True):

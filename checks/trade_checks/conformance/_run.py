@@ -11,10 +11,10 @@ from typing import Final
 from msgspec import Struct
 
 from trade.errors import TradeError
-from trade_gateway.conformance import _callbacks, _calling, _estopping, _locking, _moving, _presence
-from trade_gateway.conformance._assertions import NotHeld
-from trade_gateway.conformance._check import Check
-from trade_gateway.conformance._environment import Stage
+from trade_checks.conformance import _callbacks, _calling, _estopping, _locking, _moving, _presence
+from trade_checks.conformance._assertions import NotHeld
+from trade_checks.conformance._check import Check
+from trade_checks.conformance._environment import Stage
 
 CHECKS: Final[tuple[Check, ...]] = (
     _presence.presence,

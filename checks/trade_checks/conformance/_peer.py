@@ -14,8 +14,8 @@ from msgspec import Struct
 from trade._protocol.keys import Address, registry_key
 from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, decode_tally
 from trade._transport.base import Answer
-from trade_gateway.conformance._assertions import NotHeld, eventually, require
-from trade_gateway.conformance._raw_client import SYSTEM, Place
+from trade_checks.conformance._assertions import NotHeld, eventually, require
+from trade_checks.conformance._raw_client import SYSTEM, Place
 
 GROUP: Final = "peer"
 _OFFERED_S: Final = 5.0

@@ -13,11 +13,12 @@ import typer
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
+from trade_checks._cases import chosen
+from trade_checks.drill import SCENES, Played, Report, as_data, page, play, standing, targets_of
 from trade_drivers import load, without
 from trade_gateway._usage import UsageError
-from trade_gateway.drill import SCENES, Played, Report, as_data, page, play, standing, targets_of
 from trade_gateway.terminal import sections
-from trade_gateway.terminal._options import Json, chosen
+from trade_gateway.terminal._options import Json
 from trade_gateway.terminal._output import Output
 
 SECTION: Final = sections.HARDWARE

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from trade.errors import ConfigurationError
+from trade_checks.drill._caller import Order
+from trade_checks.drill._scenes import VALID_S, Scene
+from trade_checks.drill._targets import Target
 from trade_drivers.robotfile import Robot
-from trade_gateway.drill._caller import Order
-from trade_gateway.drill._scenes import VALID_S, Scene
-from trade_gateway.drill._targets import Target
 from trade_gateway.process._json_child import JsonChild, bare_environment
 
 
@@ -107,7 +107,7 @@ class Testbed:
     def begin(self) -> None:
         """Starts the processes. Raises ChildFailed."""
         self._actors["link"] = self._actor(
-            "link", ["trade_gateway.drill._tcp_relay", str(self._near), str(self._far)], {}
+            "link", ["trade_checks.drill._tcp_relay", str(self._near), str(self._far)], {}
         )
         to_near, to_far = self._actors["link"].read_message(UP_S)["ports"]
         self._write_gateway("gateway", self._near, dials=to_far)
@@ -118,7 +118,7 @@ class Testbed:
     def call(self, scene: Scene, targets: Sequence[Target]) -> JsonChild:
         """Starts a caller that has found and enabled its targets, and waits for its cue. Raises ChildFailed."""
         orders = [self._order(scene, target) for target in targets]
-        words = ["trade_gateway.drill._caller", msgspec.json.encode(orders).decode()]
+        words = ["trade_checks.drill._caller", msgspec.json.encode(orders).decode()]
         caller = self._actors["caller"] = self._actor("caller", words, self._settings("caller", self._far))
         caller.read_message(UP_S)
         return caller
