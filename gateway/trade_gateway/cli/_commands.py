@@ -72,6 +72,8 @@ _OWN: Final = {
     "policy": (RIGHTS, "rights._policy:app"),
 }
 """By name, in the order of the help: the section, and the function or group of commands that implements it."""
+_APART: Final = {"conformance": "trade-checks", "drill": "trade-checks"}
+"""Commands that a package of this project has, which need not be installed."""
 _LAST: Final = 1000
 
 
@@ -97,6 +99,8 @@ def find(name: str | None) -> list[Command]:
     others = _others(products)
     if name in others:
         return [_of_package(name, others[name])]
+    if name in _APART:
+        return [_broken(name, f"needs {_APART[name]}; pip install {_APART[name]}")]
     return _in_order(products, others)
 
 

@@ -97,3 +97,13 @@ def test_no_package_replaces_a_command_of_trade(install: Install, name: str) -> 
     install(f"in_place_of_{name}", name, GREETS, "greet")
     assert "Greet a robot." not in _help()
     assert "Greet a robot." not in CliRunner().invoke(build(name), [name, "--help"]).output
+
+
+def test_a_command_of_a_package_of_this_project_names_it_where_it_is_not_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    error = CliRunner().invoke(build("drill"), ["drill", "head.toml"]).exception
+    assert isinstance(error, ConfigurationError)
+    assert str(error) == "trade drill: needs trade-checks; pip install trade-checks"
+    assert "drill" not in _help()
