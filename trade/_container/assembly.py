@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from trade._audit.events import open_audit
+from trade._audit.setup import open_audit
 from trade._calls.caller import Caller
 from trade._calls.client import CallClient
 from trade._calls.handle import handle_codec
@@ -524,7 +524,6 @@ class Components:
 
     def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
-        self.client.check_open()
         return containers_of(self.registry)
 
     # --- ending

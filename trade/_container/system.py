@@ -77,7 +77,9 @@ class System:
 
     def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
-        return self._components().containers()
+        components = self._components()
+        components.client.check_open()
+        return components.containers()
 
     def load(self) -> LoadInfo:
         """The load of this container, its process and its host."""
