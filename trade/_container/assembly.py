@@ -56,7 +56,7 @@ from trade._services.dispatcher import Dispatcher
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
-from trade._services.withdrawn import Withdrawn
+from trade._services.withdrawn import WithdrawnProviders
 from trade._settings import Settings
 from trade._streams.api import StreamApi
 from trade._streams.source import Streams
@@ -255,8 +255,8 @@ class Components:
 
     def _build_migration(self, leaving: contextlib.ExitStack) -> None:
         address, access = self._address, self.access
-        self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-        self.registration = Registration(self.client, self.providers, self.withdrawn, self.deadman)
+        self.withdrawn_providers = WithdrawnProviders(self.providers, self.deadman.rest)
+        self.registration = Registration(self.client, self.providers, self.withdrawn_providers, self.deadman)
         state_dir = self.settings.state_dir
         kept = None if state_dir is None else state_dir / self.settings.system / "code"
         code = CodeStore(kept, self.settings.code, address.container)
@@ -265,14 +265,14 @@ class Components:
             address,
             self.registration.register,
             self.providers,
-            self.withdrawn,
+            self.withdrawn_providers,
             self.settings.instantiable,
             code,
         )
         leaving.callback(self.factory.close)
         quiescer = Quiescer(self.locks, address)
         self.migration_source = MigrationSource(
-            self.client, self.providers, self.factory, self.withdrawn, quiescer, access, self.codec
+            self.client, self.providers, self.factory, self.withdrawn_providers, quiescer, access, self.codec
         )
         self.migration_target = MigrationTarget(
             address, self.providers, self.factory, quiescer, access, self.codec, self.scheduler

@@ -99,7 +99,7 @@ class System:
         if home != parts.client.address:
             problem = f"it belongs to another container, or to an earlier epoch; call deregister of {home.container}"
             raise ConfigurationError(where=service.label, problem=problem)
-        return parts.withdrawn.take_off(service.key)
+        return parts.withdrawn_providers.take_off(service.key)
 
     def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
         """Offers an object again that was deregistered through this container.
@@ -115,11 +115,11 @@ class System:
             ConfigurationError: no such provider was deregistered, or a malformed group.
         """
         parts = self._components()
-        return tuple(map(parts.client.handle, parts.withdrawn.put_back(provider, groups)))
+        return tuple(map(parts.client.handle, parts.withdrawn_providers.put_back(provider, groups)))
 
     def withdrawn(self) -> list[WithdrawnInfo]:
         """The providers that `register` can offer again, by name."""
-        return self._components().withdrawn.infos()
+        return self._components().withdrawn_providers.infos()
 
     def instantiate(
         self,
@@ -149,7 +149,7 @@ class System:
         parts = self._components()
         factory, named = parts.factory, (groups,) if isinstance(groups, str) else tuple(groups)
         if state is not None:
-            keys = parts.migration_target.bring_back(class_path, args, named, state)
+            keys = parts.migration_target.recreate(class_path, args, named, state)
             return tuple(map(parts.client.handle, keys))
         return factory.offer(factory.make(factory.find(class_path), args), named, args)
 

@@ -243,7 +243,7 @@ class BorderDirection:
         calls = () if call.behalf is None else call.behalf.calls
         behalf = Behalf(tuple(names[1:]), calls, ())
         there = structs.replace(call, session=names[0], behalf=behalf, ongoing=None, permit=None)
-        locks = self._remote.federation.remote_locks.shown(call)
+        locks = self._remote.federation.remote_locks.of_call(call)
         with ExitStack() as after:
             after.callback(running.reset, running.set(there))
             after.callback(holding.reset, holding.set(locks))
