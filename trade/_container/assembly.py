@@ -426,7 +426,7 @@ class Components:
         Calls to it, and locks of its resources, wait for the transport's sign: its last answers may be under way.
         """
         self.dispatcher.hang_up(address)  # before its locks end: see `Caller` on answers that grant
-        if self.locks.gone((str(address),)) is None:  # the other sign was earlier
+        if self.locks.session_error((str(address),)) is None:  # the other sign was earlier
             self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
         self.dispatcher.forget(address)
 

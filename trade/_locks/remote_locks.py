@@ -123,7 +123,9 @@ class RemoteLocks:
         """Keeps the locks of a grant. Raises LockLost if one of them, or the grant, no longer holds."""
         number = remote_lock.number
         self._by_grant[number] = remote_lock
-        reason = self._table.over(number) or next((_lapsed(lock) for lock in remote_lock.locks if not lock.held), "")
+        reason = self._table.why_ended(number) or next(
+            (_lapsed(lock) for lock in remote_lock.locks if not lock.held), ""
+        )
         if reason:
             self._by_grant.pop(number, None)
             remote_lock.number = 0

@@ -97,7 +97,7 @@ class LockServices:
     def renew(self, grants: list[int]) -> dict[int, str]:
         """Renews the leases of these grants; returns why each of the others no longer holds."""
         held = self._table.renew(grants, served_call().caller)
-        return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
+        return {number: self._table.why_ended(number) or "it is another's" for number in grants if number not in held}
 
     @service(effect="stop")
     def release(self, grant: int, lost: str = "") -> bool:

@@ -84,7 +84,7 @@ SOME_HAVE: Final = {
     "try_rules": "administer",  # its conditions are called with the rights of the container
     "save_rules": "administer",
 }
-"""Likewise, for functions of containers that supervise others, or run rules."""
+"""The same for functions that only some containers have: those that supervise others, or run rules."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
 _OPEN_TO_ALL: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor", "rule_file")
 """The providers of these functions: offering them needs no right, as each of their callers is checked."""

@@ -400,6 +400,6 @@ def _groups(handles: Sequence[Handle]) -> list[str]:
 
 
 def _stopped(report: EstopReport, reachability: Reachability | None = None) -> messages.Stopped:
-    apart = reachability.apart if reachability is not None else {}
+    apart = reachability.unreached if reachability is not None else {}
     complete = report.complete and not apart
     return messages.Stopped(report.id, complete, report.confirmed, report.missing, report.failed, apart)

@@ -295,8 +295,8 @@ def test_why_grants_ended_is_known_of_the_last_few_and_never_of_more(table: Tabl
     for _ in range(300):
         numbers.append(table.take("a").number)
         table.table.release(numbers[-1], "tester")
-    assert table.table.over(numbers[-1]) == "it was given back"
-    assert table.table.over(numbers[0]) == "it ended long ago"
+    assert table.table.why_ended(numbers[-1]) == "it was given back"
+    assert table.table.why_ended(numbers[0]) == "it ended long ago"
 
 
 def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(table: Table) -> None:
