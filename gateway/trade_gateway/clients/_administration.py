@@ -199,9 +199,9 @@ class Administration:
             except TradeError as error:
                 if not isinstance(error, AccessDenied):  # which the protocol audits
                     message = str(error)
-                    self._container.note_asked(what, about, who=who, outcome=type(error).__name__, why=message)
+                    self._container.note_request(what, about, client=who, outcome=type(error).__name__, error=message)
                 raise
-            self._container.note_asked(what, about, who=who, why=why)
+            self._container.note_request(what, about, client=who, error=why)
             return done
 
         return await self._counted(who, noted)

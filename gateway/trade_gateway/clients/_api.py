@@ -72,7 +72,7 @@ class ClientApi:
         return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
 
     async def counted(self, who: str, do: Callable[..., T], *args: Any) -> T:
-        """Likewise, counted against the limits of pending operations. Raises TooMany."""
+        """Runs a function as `in_thread` does, counted against the limits of pending operations. Raises TooMany."""
         ended = self._quota.take(who)
         try:
             return await self.in_thread(do, *args)
@@ -322,14 +322,14 @@ class ClientApi:
             await self.counted(who, self._require_answers)
             return messages.Stopped("", True, (), (), {})
         report = await self.counted(who, self._container.estop_clear, ids)
-        self._container.note_asked("e-stop clearing", ", ".join(ids), kind="stop", who=who)
+        self._container.note_request("e-stop clearing", ", ".join(ids), kind="stop", client=who)
         return _stopped(report)
 
     def note_refused(self, error: BaseException) -> None:
         """Audits the policy's refusal of a client; a refusal of this container is recorded already."""
         if isinstance(error, AccessDenied) and error.who != self._container.address.identity:
             why, outcome = str(error), type(error).__name__
-            self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
+            self._container.note_request(error.what, kind="refused", client=error.who, outcome=outcome, error=why)
 
     def _require_answers(self) -> None:
         reachability = self._container.reachability(limit_s=_ANSWERED_S)

@@ -135,7 +135,7 @@ class _WithGateways(Tables):
             super().check_here(name, entry, environment)
             return
         file = self.beside(entry.gateway)
-        with self.about(name, entry):
+        with self.errors_in(name, entry):
             settings = read_gateway_file(file).settings
         for key, actual, wanted in (
             ("name", settings.container, name),

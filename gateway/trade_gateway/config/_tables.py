@@ -83,14 +83,14 @@ class Tables:
         environment = {} if entry.gateway else self._environment_of(entry)
         health = self.program_path(entry.health.command[0]) if entry.health else ""
         part = ContainerSpec(name, entry, self._words(name, entry), environment, self.beside(entry.folder), health)
-        with self.about(name, entry):
+        with self.errors_in(name, entry):
             Settings.read(system=self.defaults.system, container=name, environment={})
         if entry.is_local:
             self.check_here(name, entry, environment)
         return part
 
     @contextmanager
-    def about(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
+    def errors_in(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
         """Reports errors inside as errors of a container's table."""
         try:
             yield
@@ -129,7 +129,7 @@ class Tables:
             if words and shutil.which(found := self.program_path(words[0]), path=path) is None:
                 problem = f"there is no program {found}" if "/" in found else f"there is no {found} in PATH"
                 self.refuse(name, key, f"{problem} that this user may run")
-        with self.about(name, entry, "announces"):
+        with self.errors_in(name, entry, "announces"):
             Settings.read(system=self.defaults.system, container=entry.announces or name, environment={})
 
     def program_path(self, named: str) -> str:
@@ -143,7 +143,7 @@ class Tables:
             self._check_http(name, entry.http)
         if entry.program is not None:
             self._check_program_here(name, entry, environment)
-        with self.about(name, entry):
+        with self.errors_in(name, entry):
             if entry.http and entry.http.twin:
                 load(self.beside(entry.http.twin))
             if entry.ros:

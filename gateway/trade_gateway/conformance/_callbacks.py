@@ -32,7 +32,7 @@ class Run(NamedTuple):
     locked: bool
 
 
-class Lathe:
+class RecordingProvider:
     """The provider that the container under test calls; it records the calls."""
 
     def __init__(self) -> None:
@@ -47,8 +47,8 @@ class Lathe:
         call = current_call()
         if call is not None:
             calls = () if call.behalf is None else call.behalf.calls
-            what = (call.session, call.sessions, calls, call.chain, call.remaining_s)
-            self.runs.append(Run(depth_mm, call.caller, *what, locked=self.resources[0].live != 0))
+            recorded = (call.session, call.sessions, calls, call.chain, call.remaining_s)
+            self.runs.append(Run(depth_mm, call.caller, *recorded, locked=self.resources[0].live != 0))
         self.go_on.wait(5.0)
         return f"{depth_mm:g} mm"
 
@@ -63,8 +63,8 @@ class Lathe:
 
 
 @contextmanager
-def _lathe(stage: Stage) -> Generator[Lathe, None, None]:
-    lathe = Lathe()
+def _lathe(stage: Stage) -> Generator[RecordingProvider, None, None]:
+    lathe = RecordingProvider()
     stage.container.register(lathe, "judge.lathe")
     try:
         yield lathe

@@ -82,7 +82,7 @@ class Peer:
         require(found, "it does not answer the registry query")
         return _offer(found[0])
 
-    def says(self, name: str) -> bool:
+    def has_function(self, name: str) -> bool:
         """Whether its own provider has that function."""
         own = self.offer().entries.get(SYSTEM)
         return own is not None and any(service.name == name for service in own.services)

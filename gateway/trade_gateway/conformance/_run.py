@@ -130,7 +130,7 @@ def _judge(stage: Stage, one: Check) -> tuple[Result, str]:
     if not (one.still or stage.motion):
         return Result.LEFT_OUT, "it is of motion; --motion turns the arm"
     try:
-        if one.needs and not stage.peer.says(one.needs):
+        if one.needs and not stage.peer.has_function(one.needs):
             return Result.LEFT_OUT, f"its own provider has no {one.needs}"
         one.does(stage)
     except NotHeld as why:

@@ -134,7 +134,7 @@ class Tools:
         """Audits the use of a tool that began at this ``time.monotonic_ns()``."""
         took_ns = time.monotonic_ns() - began
         what, who = f"agent's tool {tool}", self._client.identity
-        self._container.note_asked(what, about, who=who, outcome=outcome, why=why, took_ns=took_ns)
+        self._container.note_request(what, about, client=who, outcome=outcome, error=why, took_ns=took_ns)
 
     # --- queries
 

@@ -100,7 +100,7 @@ class Goal(Protocol):
         """Sends feedback to the client."""
         ...
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         """Registers a callback for a cancel by its client or a replacement; it runs at once if that has happened."""
         ...
 

@@ -132,7 +132,8 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         problem = "did not answer" if hears else "can be cleared only by a `trade` of its own version"
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {problem}[/]")
     if report.without_services:
-        out.say(f"{len(report.without_services)} containers did not answer; they may offer no services, so nothing to stop")
+        count = len(report.without_services)
+        out.say(f"{count} containers did not answer; they may offer no services, so nothing to stop")
     known = _known(report, own)
     if not known:
         out.say(f"[bold red]no container was found[/] in system {escape(system)} that has something to stop")

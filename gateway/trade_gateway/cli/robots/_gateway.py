@@ -141,9 +141,9 @@ class Gateway:
         changed = named.since(self._named)
         reopen = reopen or named.digests != self._named.digests
         try:
-            self._go_by(plan, reopen=reopen)
+            self._set_plan(plan, reopen=reopen)
         except TradeError as refused:
-            self._go_by(self._plan, reopen=False)
+            self._set_plan(self._plan, reopen=False)
             complain(f"{file} was changed and cannot be used; continuing as before: {refused}")
             return False
         self._plan, self._named = plan, named
@@ -154,7 +154,7 @@ class Gateway:
             out.data({"reloaded": str(file), "changed": changed})
         return True
 
-    def _go_by(self, plan: Plan, *, reopen: bool) -> None:
+    def _set_plan(self, plan: Plan, *, reopen: bool) -> None:
         if reopen or plan.settings != self._running:
             self._running = None
             self._leave_networks()

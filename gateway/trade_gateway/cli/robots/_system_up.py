@@ -45,7 +45,7 @@ class Report(Struct, frozen=True, kw_only=True):
 Reporter = Callable[[Report], None]
 
 
-class _Began(NamedTuple):
+class _StartedPart(NamedTuple):
     part: ContainerSpec
     started: Started
 
@@ -55,17 +55,17 @@ class SystemStarter:
 
     Args:
         plan: the checked file.
-        member: this command's container in the system of the file.
+        container: this command's container in the system of the file.
         ssh_config: a configuration instead of the user's.
         wait_s: how long a started container may take to become visible, and an object to be created.
         report: called with the result of each container.
     """
 
     def __init__(
-        self, plan: SystemPlan, member: Container, *, ssh_config: Path | None, wait_s: float, report: Reporter
+        self, plan: SystemPlan, container: Container, *, ssh_config: Path | None, wait_s: float, report: Reporter
     ) -> None:
         self._plan = plan
-        self._member = member
+        self._container = container
         self._ssh_config = ssh_config
         self._wait_s = wait_s
         self._report = report
@@ -82,30 +82,32 @@ class SystemStarter:
             CannotStart, ConfigurationError: with the reason; before any start if a host is unreachable.
             TradeError: an object could not be created.
         """
-        absent = [part for part in self._plan.parts if not self._is_supervised(part) and self._seen(part) is None]
+        absent = [part for part in self._plan.parts if not self._is_supervised(part) and self._visible(part) is None]
         check_hosts(self._plan, absent, self._ssh_config)
-        began: list[_Began] = []
+        started_parts: list[_StartedPart] = []
         try:
             for part in self._plan.parts:
                 if self._is_supervised(part):
-                    self._await_child(part, began, interrupted)
+                    self._await_child(part, started_parts, interrupted)
                 else:
-                    self._bring(part, began)
+                    self._start_part(part, started_parts)
                 if interrupted.is_set():
                     raise KeyboardInterrupt
         except BaseException:
             if not keep:
-                self._undo(began)
+                self._undo(started_parts)
             raise
 
-    def _bring(self, part: ContainerSpec, began: list[_Began]) -> None:
-        at, info = time.monotonic(), self._seen(part)
+    def _start_part(self, part: ContainerSpec, started_parts: list[_StartedPart]) -> None:
+        at, info = time.monotonic(), self._visible(part)
         was_up = info is not None
         if info is None:
-            began.append(_Began(part, self._start(part)))
-            info = self._await(began[-1])
-        made = [make(self._own(part, "instantiate"), one, wait_s=self._wait_s) for one in lacking(self._member, part)]
-        state = "was up" if was_up and not made else "started"
+            started_parts.append(_StartedPart(part, self._start(part)))
+            info = self._await(started_parts[-1])
+        created = [
+            make(self._own(part, "instantiate"), one, wait_s=self._wait_s) for one in lacking(self._container, part)
+        ]
+        state = "was up" if was_up and not created else "started"
         took_s = time.monotonic() - at
         self._report(Report(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
 
@@ -114,14 +116,14 @@ class SystemStarter:
 
     def _supervisor(self, name: str) -> Handle:
         plan = self._plan
-        return self._member.find(where(name=name, group=GROUP, container=plan.supervisor), wait_s=self._wait_s)
+        return self._container.find(where(name=name, group=GROUP, container=plan.supervisor), wait_s=self._wait_s)
 
     def _child(self, part: ContainerSpec) -> ChildInfo | None:
         found: list[ChildInfo] = self._supervisor("children")()
         return next((child for child in found if child.name == part.name), None)
 
     def _await_child(
-        self, part: ContainerSpec, began: Sequence[_Began], interrupted: threading.Event | SignalEvent
+        self, part: ContainerSpec, started_parts: Sequence[_StartedPart], interrupted: threading.Event | SignalEvent
     ) -> None:
         """Waits until the supervisor has a container up, and reports each change of its state.
 
@@ -129,7 +131,7 @@ class SystemStarter:
             CannotStart: the supervisor gave it up, or it was not up in time.
         """
         at, known, where_, pause = time.monotonic(), "", self._plan.at(part.name), threading.Event()
-        is_new = any(one.part.name == self._plan.supervisor for one in began)
+        is_new = any(one.part.name == self._plan.supervisor for one in started_parts)
         was_up = not is_new and (first := self._child(part)) is not None and first.state == "up"
         while not interrupted.is_set():
             child = self._child(part)
@@ -165,11 +167,11 @@ class SystemStarter:
             ssh_config=self._ssh_config,
         )
 
-    def _await(self, began: _Began) -> ContainerInfo:
-        part, started = began
+    def _await(self, started_parts: _StartedPart) -> ContainerInfo:
+        part, started = started_parts
         with contextlib.suppress(NoSuchService, TooManyServices):  # the epoch identifies it
-            self._member.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
-        info = next((one for one in self._member.containers() if one.epoch == started.epoch), None)
+            self._container.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
+        info = next((one for one in self._container.containers() if one.epoch == started.epoch), None)
         if info is None:
             output = f"it is up there as process {started.pid}, but was not visible here within {self._wait_s:g} s"
             remedy = f"set its endpoints ({self._plan.at(part.name, 'connect')}), and give it the certificate"
@@ -179,24 +181,24 @@ class SystemStarter:
         return info
 
     def _own(self, part: ContainerSpec, name: str) -> Handle:
-        return self._member.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
+        return self._container.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
 
-    def _seen(self, part: ContainerSpec) -> ContainerInfo | None:
+    def _visible(self, part: ContainerSpec) -> ContainerInfo | None:
         """Returns the container of that name. Raises ConfigurationError if there are two."""
         return self._seen_name(part.name)
 
     def _seen_name(self, name: str) -> ContainerInfo | None:
-        found = [info for info in self._member.containers() if info.name == name]
+        found = [info for info in self._container.containers() if info.name == name]
         if len(found) > 1:
             problem = f"there are {len(found)} of that name: {', '.join(f'{one.pid} on {one.host}' for one in found)}"
             raise ConfigurationError(where=self._plan.at(name), problem=problem)
         return found[0] if found else None
 
-    def _undo(self, began: Sequence[_Began]) -> None:
+    def _undo(self, started_parts: Sequence[_StartedPart]) -> None:
         """Ends the containers that were started, in reverse order; one that cannot be ended is reported and kept."""
-        for part, started in reversed(began):
+        for part, started in reversed(started_parts):
             try:
-                if any(info.epoch == started.epoch for info in self._member.containers()):
+                if any(info.epoch == started.epoch for info in self._container.containers()):
                     self._end(part, only_at_rest=True)
                 else:
                     self._end_unseen(part, started)
@@ -226,7 +228,7 @@ class SystemStarter:
         for part in reversed(self._plan.parts):
             if self._is_supervised(part):
                 self._end_child(part, only_at_rest=only_at_rest)
-            elif self._seen(part) is None:
+            elif self._visible(part) is None:
                 self._report(Report(container=part.name, host=part.entry.host, state="was down"))
             else:
                 self._end(part, only_at_rest=only_at_rest)
@@ -239,7 +241,7 @@ class SystemStarter:
             self._report(Report(container=part.name, host=LOCAL, state="was down"))
             return
         at, pause = time.monotonic(), threading.Event()
-        if part.entry.kind == "robot" and self._seen(part) is not None:
+        if part.entry.kind == "robot" and self._visible(part) is not None:
             self._own(part, "terminate_container").with_(deadline_s=_LEFT_S)("trade system down", only_at_rest)
         self._supervisor("stop_child")(part.name)
         while (child := self._child(part)) is not None and child.pid:
@@ -250,11 +252,11 @@ class SystemStarter:
         self._report(Report(container=part.name, host=LOCAL, state="ended", took_s=took_s))
 
     def _end(self, part: ContainerSpec, *, only_at_rest: bool) -> None:
-        at, info = time.monotonic(), self._seen(part)
+        at, info = time.monotonic(), self._visible(part)
         terminate = self._own(part, "terminate_container").with_(deadline_s=_LEFT_S)
         problems = terminate("trade system down", only_at_rest)
         until, pause = at + _LEFT_S, threading.Event()
-        while info is not None and any(one.epoch == info.epoch for one in self._member.containers()):
+        while info is not None and any(one.epoch == info.epoch for one in self._container.containers()):
             if time.monotonic() > until:
                 problem = f"did not end within {_LEFT_S:g} s; see `trade logs`"
                 raise ConfigurationError(where=self._plan.at(part.name), problem=problem)
@@ -269,11 +271,11 @@ class SystemStarter:
             if self._is_supervised(part):
                 yield self._child_status(part)
                 continue
-            info, host = self._seen(part), part.entry.host
+            info, host = self._visible(part), part.entry.host
             if info is None:
                 yield Report(container=part.name, host=host, state="down")
                 continue
-            lacks = ", ".join(one.class_ for one in lacking(self._member, part))
+            lacks = ", ".join(one.class_ for one in lacking(self._container, part))
             state = f"lacks {lacks}" if lacks else "up"
             yield Report(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
 

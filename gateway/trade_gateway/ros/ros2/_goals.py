@@ -55,13 +55,13 @@ class Pursued(Goal):
         """See `Goal`. Raises ConfigurationError: the message does not fit the type."""
         self._action.feedback.send({"goal_id": uuid(self.id), "feedback": message})
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         """See `Goal`."""
         with self._lock:
             if not self._canceled:
-                self._tell.append(tell)
+                self._tell.append(callback)
                 return
-        tell()
+        callback()
 
     @property
     def canceled(self) -> bool:

@@ -16,7 +16,7 @@ from trade_gateway.ros_messages._types import Message
 _SET_BOOL: Final = "std_srvs/srv/SetBool"
 
 
-class _Taken(NamedTuple):
+class _ClientLock(NamedTuple):
     """The lock of a node."""
 
     client: Client
@@ -93,7 +93,7 @@ class LocksToRos:
         self._graph = graph
         self._nodes = nodes
         self._container = container
-        self._taken: dict[str, _Taken] = {}
+        self._taken: dict[str, _ClientLock] = {}
         """By node."""
 
     @property
@@ -133,12 +133,12 @@ class LocksToRos:
             purpose = f"of {who}, a node of ROS"
             lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
         handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
-        taken = self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
+        taken = self._taken[who] = _ClientLock(client, lock, client.keep(lock, handles))
         client.when_closed(lambda: self._forget(who, taken))
         client.session.check()
         return ", ".join(lock.resources)
 
-    def _forget(self, who: str, taken: _Taken) -> None:
+    def _forget(self, who: str, taken: _ClientLock) -> None:
         if self._taken.get(who) is taken:
             del self._taken[who]
 
