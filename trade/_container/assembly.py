@@ -437,10 +437,10 @@ class Components:
         self.dispatcher.session_ended(session)
         self.session_end.emit(session)
 
-    def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
+    def ask_for_release(self, holder: Holder, token: Token, identity: str, reason: str) -> None:
         """Passes a release request to the holder of a lock; called by the lock services."""
         owner = Address(*holder.session.split("/")[:3])
-        self.client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
+        self.client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, identity, reason)
 
     def trace(self, on: bool) -> bool:
         """Switches the tracing of calls on or off. Returns whether it was on."""
@@ -479,8 +479,8 @@ class Components:
     def _taken(self) -> list[int]:
         return [pool.taken for pool in list(self.dispatcher.pools)]
 
-    def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
-        return self.access.denied(who, "instrument", record.key.domain, record.label)
+    def _denied_hook(self, identity: str, record: Record) -> AccessDenied | None:
+        return self.access.denied(identity, "instrument", record.key.domain, record.label)
 
     def recheck_access(self) -> None:
         """Applies a changed policy: locks that it no longer allows are lost."""

@@ -253,7 +253,9 @@ class System:
         """
         self._components().factory.terminate(service)
 
-    def terminate_container(self, reason: str = "", *, only_at_rest: bool = False, who: str = "itself") -> list[str]:
+    def terminate_container(
+        self, reason: str = "", *, only_at_rest: bool = False, identity: str = "itself"
+    ) -> list[str]:
         """Ends this container: its motion stops, and its services are withdrawn. Does not wait for its end.
 
         The process continues, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
@@ -261,7 +263,7 @@ class System:
         Args:
             reason: why, for people; it is logged.
             only_at_rest: not while one of its resources is locked or moves.
-            who: the requesting client; it is logged.
+            identity: the requesting client; it is logged.
 
         Returns:
             The stops that failed, with their reasons; the container ends nevertheless.
@@ -269,7 +271,7 @@ class System:
         Raises:
             InUse: a resource is locked or moves, with ``only_at_rest``.
         """
-        return self._components().shutdown.begin(reason, who, only_at_rest=only_at_rest)
+        return self._components().shutdown.begin(reason, identity, only_at_rest=only_at_rest)
 
     def load_policy(self, path: str) -> None:
         """Loads another access policy, or the same file again; calls under way continue.

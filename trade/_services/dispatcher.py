@@ -337,10 +337,10 @@ class Dispatcher:
             return None
         return IncomingCall(call, caller, replier, place[len(self._here) :])
 
-    def drop(self, where: str, who: str, bad: Exception) -> None:
+    def drop(self, where: str, identity: str, bad: Exception) -> None:
         """Records that something came in that is no call."""
         self.malformed += 1
-        self._audit.refused(where, str(bad), who=who)
+        self._audit.refused(where, str(bad), who=identity)
         if self.malformed == 1:
             _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", where, bad)
 

@@ -80,13 +80,13 @@ class Source:
         services: Callable[[ServiceKey], LocalService | None],
         transport: Transport,
         new_id: Callable[[], int],
-        tell: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None,
+        callback: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None,
     ) -> None:
         self._key = key
         self._services = services
         self._transport = transport
         self._new_id = new_id
-        self._tell = tell
+        self._tell = callback
         """Called with each listener that comes (True) or goes."""
         self._shown = ExitStack()
         self._lock = threading.Lock()

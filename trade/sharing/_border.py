@@ -200,10 +200,10 @@ class BorderDirection:
         self._guests.leave(place)
         self._origins.pop(offered.place, None)
 
-    def _complain(self, place: Exposed, why: str) -> None:
-        if self._refused.get(place) != why:
-            self._refused[place] = why
-            _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, why)
+    def _complain(self, place: Exposed, reason: str) -> None:
+        if self._refused.get(place) != reason:
+            self._refused[place] = reason
+            _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, reason)
 
     # --- handles
 

@@ -225,68 +225,68 @@ class Stage:
 
     # --- the arm
 
-    def angle(self, who: Voice) -> float:
+    def angle(self, client: Voice) -> float:
         """The angle of its arm in rad."""
-        return float(who.result(self.peer.arm, "angle", expires_ns=NEVER))
+        return float(client.result(self.peer.arm, "angle", expires_ns=NEVER))
 
-    def turns(self, who: Voice) -> int:
+    def turns(self, client: Voice) -> int:
         """The number of turns that have begun since its boot."""
-        return int(who.result(self.peer.arm, "turns", expires_ns=NEVER))
+        return int(client.result(self.peer.arm, "turns", expires_ns=NEVER))
 
-    def begin_turn(self, who: Voice, **how: Any) -> int:
+    def begin_turn(self, client: Voice, **how: Any) -> int:
         """Starts a long turn; returns the call's id once the arm moves. Raises NotHeld if it does not."""
-        away_rad = self.far_rad(who)
-        call_id = who.call(self.peer.arm, "turn", away_rad, expires_ns=who.expiry_ns(60.0), **how)
+        away_rad = self.far_rad(client)
+        call_id = client.call(self.peer.arm, "turn", away_rad, expires_ns=client.expiry_ns(60.0), **how)
 
         def moves() -> bool:
-            for reply in who.answers(call_id):
+            for reply in client.answers(call_id):
                 raise NotHeld(f"a turn did not begin, but was answered with status {reply.status}")
-            return self.moves(who)
+            return self.moves(client)
 
         eventually(moves, "angle() does not show the requested turn")
         return call_id
 
-    def far_rad(self, who: Voice) -> float:
+    def far_rad(self, client: Voice) -> float:
         """An angle that takes half a minute to reach."""
-        return -30.0 if self.angle(who) > 0 else 30.0
+        return -30.0 if self.angle(client) > 0 else 30.0
 
-    def moves(self, who: Voice) -> bool:
+    def moves(self, client: Voice) -> bool:
         """Whether the arm moves now."""
-        before = self.angle(who)
+        before = self.angle(client)
         threading.Event().wait(_LOOK_S)
-        return self.angle(who) != before
+        return self.angle(client) != before
 
     @contextlib.contextmanager
-    def stopping(self, who: Voice, after: str) -> Generator[None, None, None]:
+    def stopping(self, client: Voice, after: str) -> Generator[None, None, None]:
         """Raises NotHeld unless the arm comes to rest in time after the stop begins, and stays there.
 
         The stop must not wait for its answer, which may arrive after the arm has to rest.
         """
         since = time.monotonic()
         yield
-        self.require_rest(who, after, since)
+        self.require_rest(client, after, since)
 
-    def require_rest(self, who: Voice, after: str, since: float) -> None:
+    def require_rest(self, client: Voice, after: str, since: float) -> None:
         """Raises NotHeld unless the arm rests in time after that moment of time.monotonic(), and stays there."""
-        limit_s, before = STOPPED_S + SLACK_S, self.angle(who)
+        limit_s, before = STOPPED_S + SLACK_S, self.angle(client)
         while True:
             took_s = time.monotonic() - since
             require(took_s < limit_s, f"the arm is not at rest within {limit_s:g} s after {after}")
             threading.Event().wait(_LOOK_S)
-            where = self.angle(who)
+            where = self.angle(client)
             if where == before:
                 break
             before = where
         threading.Event().wait(_STILL_S)
-        require(self.angle(who) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
+        require(self.angle(client) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
 
-    def acquire(self, who: Voice, resources: Sequence[str], **terms: Any) -> Any:
+    def acquire(self, client: Voice, resources: Sequence[str], **terms: Any) -> Any:
         """Requests a lock; returns the answer."""
-        return who.ask(SYSTEM, "acquire", list(resources), terms)
+        return client.ask(SYSTEM, "acquire", list(resources), terms)
 
-    def granted(self, who: Voice, resources: Sequence[str], **terms: Any) -> Token:
+    def granted(self, client: Voice, resources: Sequence[str], **terms: Any) -> Token:
         """Takes a lock; raises NotHeld if it is not granted."""
-        found = who.result(SYSTEM, "acquire", list(resources), terms)
+        found = client.result(SYSTEM, "acquire", list(resources), terms)
         try:
             granted = msgspec.convert(found, Granted)
         except msgspec.ValidationError as bad:

@@ -19,27 +19,27 @@ _CONFIRMED_WITHIN_S = 3.0
 _WATCHED_S = 0.5
 
 
-def _open(who: Voice, reason: str = "a check") -> EstopOrder:
+def _open(client: Voice, reason: str = "a check") -> EstopOrder:
     name = secrets.token_hex(4)
-    return EstopOrder(PROTOCOL, name, Estop(name, who.session, reason, time.time()))
+    return EstopOrder(PROTOCOL, name, Estop(name, client.session, reason, time.time()))
 
 
 def _cleared(*orders: EstopOrder) -> EstopOrder:
     return EstopOrder(PROTOCOL, secrets.token_hex(4), None, tuple(order.request for order in orders))
 
 
-def _order(stage: Stage, who: Voice, order: EstopOrder) -> EstopConfirmed:
+def _order(stage: Stage, client: Voice, order: EstopOrder) -> EstopConfirmed:
     """Sends an order until it is confirmed; raises NotHeld if it is not."""
-    return _confirmed(stage, who, order.request, encode_message(order))
+    return _confirmed(stage, client, order.request, encode_message(order))
 
 
-def _confirmed(stage: Stage, who: Voice, request: str, payload: bytes) -> EstopConfirmed:
+def _confirmed(stage: Stage, client: Voice, request: str, payload: bytes) -> EstopConfirmed:
     address = stage.peer.address
     with stage.listening(estop_confirmed_key(address)) as heard:
         found: list[EstopConfirmed] = []
 
         def confirmed() -> bool:
-            who.put(estop_key(who.identity), payload, urgent=True)
+            client.put(estop_key(client.identity), payload, urgent=True)
             found[:] = [one for one in map(_confirmation, list(heard)) if one and one.request == request]
             return bool(found)
 
@@ -60,11 +60,11 @@ def _shown(stage: Stage) -> tuple[str, ...]:
     return tuple(estop.id for (domain, _), info in entries.items() if domain == SYSTEM[0] for estop in info.estops)
 
 
-def _require_stopped(stage: Stage, who: Voice, when: str) -> None:
-    began = stage.turns(who)
-    refused = error_of(who.ask(stage.peer.arm, "turn", 0.1))
+def _require_stopped(stage: Stage, client: Voice, when: str) -> None:
+    began = stage.turns(client)
+    refused = error_of(client.ask(stage.peer.arm, "turn", 0.1))
     require(isinstance(refused, errors.Stopped) and refused.estop, f"a turn {when} ended with {refused!r}")
-    require(stage.turns(who) == began, f"a turn began {when}")
+    require(stage.turns(client) == began, f"a turn began {when}")
 
 
 @check("estop", "S09")
@@ -178,10 +178,10 @@ def estop_learnt(stage: Stage) -> None:
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
-def _ordered(stage: Stage, who: Voice) -> EstopOrder:
+def _ordered(stage: Stage, client: Voice) -> EstopOrder:
     """Opens an e-stop in the container under test and the suite's own."""
-    order = _open(who)
-    _order(stage, who, order)
+    order = _open(client)
+    _order(stage, client, order)
 
     def everywhere() -> bool:
         return any(one.id == order.request for one in stage.container._parts.estop.open_here())

@@ -18,17 +18,17 @@ _LEASE_S = 1.0
 _MANY = 100
 
 
-def _renew(who: Voice, lock: Token) -> dict[int, str]:
-    return dict(who.result(SYSTEM, "renew", [lock.number], stop=True))
+def _renew(client: Voice, lock: Token) -> dict[int, str]:
+    return dict(client.result(SYSTEM, "renew", [lock.number], stop=True))
 
 
-def _release(who: Voice, lock: Token, lost: str = "") -> bool:
-    return bool(who.result(SYSTEM, "release", lock.number, lost, stop=True))
+def _release(client: Voice, lock: Token, lost: str = "") -> bool:
+    return bool(client.result(SYSTEM, "release", lock.number, lost, stop=True))
 
 
-def _locks_of(who: Voice) -> list[LockInfo]:
+def _locks_of(client: Voice) -> list[LockInfo]:
     try:
-        return msgspec.convert(who.result(SYSTEM, "locks"), list[LockInfo])
+        return msgspec.convert(client.result(SYSTEM, "locks"), list[LockInfo])
     except msgspec.ValidationError as bad:
         raise NotHeld(f"the answer of locks cannot be read: {bad}") from None
 
@@ -177,8 +177,8 @@ def stop_beside_waiting(stage: Stage) -> None:
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
-def _waiting(who: Voice) -> int:
-    return sum(len(info.waiting) for info in _locks_of(who))
+def _waiting(client: Voice) -> int:
+    return sum(len(info.waiting) for info in _locks_of(client))
 
 
 @check("owner-ends", "S12")

@@ -107,9 +107,9 @@ class Holder:
         self.turn, self.why, self._every_s = lease.turn, "", lease.lease_s / _ASKS
         self.term = TimerLease(until - lease.lease_s / _LEAVES, until)
 
-    def unanswered(self, why: str) -> None:
+    def unanswered(self, reason: str) -> None:
         """Handles a request that was lost or could not be sent."""
-        self.why = why
+        self.why = reason
 
 
 class Arbiter:

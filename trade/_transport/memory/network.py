@@ -238,7 +238,7 @@ class Network:
 
         arrived() if at_once else link.ways[source].send(kind, arrived)
 
-    def tap(self, hear: Tap) -> Callable[[], None]:
+    def tap(self, callback: Tap) -> Callable[[], None]:
         """Show a function every message between two transports, before it is sent and after it has arrived.
 
         The function runs under the network's lock, on the thread that sends or moves the time: it may kill, partition
@@ -247,8 +247,8 @@ class Network:
         Returns:
             A function that removes the tap.
         """
-        self._taps.append(hear)
-        return lambda: self._taps.remove(hear)
+        self._taps.append(callback)
+        return lambda: self._taps.remove(callback)
 
     def lose(self, which: Callable[[InFlightMessage], bool]) -> Callable[[], None]:
         """Drop selected messages in flight; both ends stay linked.

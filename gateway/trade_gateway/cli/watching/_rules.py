@@ -56,7 +56,7 @@ def run(
         leaving() as asked_to_leave,
         hangups() as hangup,
         Container(settings, on_terminate=asked_to_leave.set) as container,
-        Rules(container, file, audit=audit, dry_run=dry_run, tell=firings.put) as rules,
+        Rules(container, file, audit=audit, dry_run=dry_run, callback=firings.put) as rules,
     ):
         container.register_functions(RuleFile(container, file), "rule_file")
         refuse_twice(container, "trade rules run")
