@@ -14,7 +14,7 @@ from tests.system.terminals import Shell, end_all_but
 
 pytestmark = pytest.mark.realtime
 
-PACKAGES = ("trade", "drivers", "hil-sim")
+PACKAGES = ("trade", "drivers", "hil-sim", "robotfile")
 
 
 def page(folder: str) -> Path:

@@ -55,7 +55,8 @@ def test_each_wheel_has_its_licence_its_types_and_nothing_that_is_made_while_it_
 def test_the_four_packages_have_one_version_and_pin_each_other_to_it() -> None:
     texts = [(ROOT / member / "pyproject.toml").read_text(encoding="utf-8") for member in MEMBERS]
     [version] = {found for text in texts for found in re.findall(r'^version = "(.*)"$', text, re.MULTILINE)}
-    pins = [pin for text in texts for pin in re.findall(r'"trade-(?:core|drivers|gateway|hil-sim)([=<>~].*?)"', text)]
+    ours = re.compile(r'"trade-(?:core|drivers|gateway|hil-sim|robotfile)([=<>~].*?)"')
+    pins = [pin for text in texts for pin in ours.findall(text)]
     assert pins
     assert set(pins) == {f"=={version}"}
     assert f"\n## {version} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from trade import Resource
 from trade.errors import DeviceError, DeviceFault, DeviceSilent, TradeError
 from trade_drivers.bus._attempts import ATTEMPTS
 from trade_drivers.bus._jobs import Device, Work
-from trade_drivers.robotfile import Bus
+from trade_robotfile import Bus
 
 PROBE_NS: Final = 500_000_000
 """The first pause before a device that did not answer is tried again."""

@@ -14,7 +14,7 @@ from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._fault_detector import FaultDetector
 from trade_drivers.bus._jobs import Device, PortFull, PortLost, PortOpening, WireError
 from trade_drivers.faults import Tell
-from trade_drivers.robotfile import Bus
+from trade_robotfile import Bus
 
 _log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1

@@ -13,7 +13,7 @@ from trade.errors import DeviceFault, LimitExceeded
 from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints._zero import Zero
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 if TYPE_CHECKING:
     from trade_drivers.joints._motion import Motion

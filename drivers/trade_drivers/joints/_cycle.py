@@ -11,7 +11,7 @@ from trade_drivers.bus._jobs import Device, Gate, Steps, Work
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Leave
 from trade_drivers.joints._motion import Motion
-from trade_drivers.robotfile import Bus
+from trade_robotfile import Bus
 
 
 class Exchange(BusCycle[AxisT]):

@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from trade_drivers.robotfile import Drill
 from trade_gateway.drill._report import Played, Stop
 from trade_gateway.drill._scenes import Scene, limit_s
 from trade_gateway.drill._targets import Target
 from trade_gateway.drill._testbed import Testbed
 from trade_gateway.process._json_child import ChildFailed, JsonChild
+from trade_robotfile import Drill
 
 _TRIES: Final = 3
 _BEGUN_S: Final = 20.0

@@ -4,8 +4,8 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from trade_drivers.robotfile import Drill
 from trade_gateway.drill._targets import Target
+from trade_robotfile import Drill
 
 ALLOWANCE_S: Final = 0.5
 """Extra time for a joint to rest beyond the rules' limits, for a busy computer, in seconds."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from trade_drivers import Driver, load_driver
-from trade_drivers.robotfile import Arm, Bus, CanBus, Joint, Robot
+from trade_robotfile import Arm, Bus, CanBus, Joint, Robot
 
 LASTS_S = 20.0
 """How long a motion of a drill would last if nothing ended it, in seconds."""

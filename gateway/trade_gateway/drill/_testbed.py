@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from trade.errors import ConfigurationError
-from trade_drivers.robotfile import Robot
 from trade_gateway.drill._caller import Order
 from trade_gateway.drill._scenes import VALID_S, Scene
 from trade_gateway.drill._targets import Target
 from trade_gateway.process._json_child import JsonChild, bare_environment
+from trade_robotfile import Robot
 
 
 class _Event(msgspec.Struct, frozen=True):

@@ -10,8 +10,8 @@ from pymodbus.framer import FramerRTU
 
 from tests.endurance.fuzz._target import Target
 from trade.errors import DeviceError
+from trade_drivers import parse
 from trade_drivers.bus.can._netlink import parse_link
-from trade_drivers.robotfile import parse
 from trade_drivers.vendors.cia402 import _sdo as sdo
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.damiao._axis import DamiaoAxis

@@ -12,7 +12,7 @@ from trade._estop.store import _read as read_open_estop
 from trade._security.policy_file import read_policy
 from trade.errors import ConfigurationError
 from trade.rules._file import read_rules
-from trade_drivers.robotfile import parse as parse_robot
+from trade_drivers import parse as parse_robot
 from trade_gateway.cli.operation._archive import read_archive
 from trade_gateway.cli.operation._file_closure import named_files
 from trade_gateway.cli.watching._audit import _noted as read_notes

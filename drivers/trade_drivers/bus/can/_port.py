@@ -22,7 +22,7 @@ from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.bus.can._socketcand import ServerBus
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of each split frame

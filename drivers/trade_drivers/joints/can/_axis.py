@@ -5,7 +5,7 @@ from math import isfinite, tau
 from typing import Final
 
 from trade_drivers.joints import Axis, Resolution, Sample, Unfit
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 STILL_RAD_S: Final = 0.01
 """The maximum speed at rest."""

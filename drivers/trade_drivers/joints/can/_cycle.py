@@ -12,7 +12,7 @@ from trade_drivers.joints.can._axis import MotorAxis
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25

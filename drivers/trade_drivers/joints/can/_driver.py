@@ -14,7 +14,7 @@ from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
 from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
-from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
+from trade_robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort, Talk

@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Axis, Goal, Resolution, Sample
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
 

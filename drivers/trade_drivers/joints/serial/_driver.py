@@ -13,7 +13,7 @@ from trade_drivers.joints.serial._axis import ServoAxis
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.plugins._driver import AttachedBus, Driver
-from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
+from trade_robotfile import Bus, Gripper, Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire

@@ -13,7 +13,7 @@ from trade_drivers.joints.serial._axis import ServoAxis
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_drivers.robotfile import SerialBus
+    from trade_robotfile import SerialBus
 
 _Result = TypeVar("_Result")
 

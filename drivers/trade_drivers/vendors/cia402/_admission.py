@@ -11,8 +11,8 @@ from trade_drivers.vendors.cia402._inspect import set_up
 from trade_drivers.vendors.cia402._net import NoAnswer, Refused
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.cia402._cycle import DriveExchange
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _UNHEARD_NS: Final = 2_000_000_000

@@ -9,12 +9,12 @@ from trade.errors import DeviceError
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Sample
 from trade_drivers.joints.can import MotorAxis, resolution_of
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._machine import State, state_of
 from trade_drivers.vendors.cia402._net import emergency_text
 from trade_drivers.vendors.cia402._stream import Following, Turning
+from trade_robotfile import Joint
 
 _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"

@@ -20,7 +20,7 @@ from trade_drivers.vendors.cia402._stream import Following, Turning
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3

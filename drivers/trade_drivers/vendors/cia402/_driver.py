@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any, Final
 from trade.errors import ConfigurationError
 from trade_drivers.joints import BusMotor
 from trade_drivers.joints.can import CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
 from trade_drivers.vendors.cia402._commission import Cia402Commissioner
 from trade_drivers.vendors.cia402._table import orders
+from trade_robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort

@@ -17,7 +17,7 @@ from trade_drivers.vendors.cia402._table import Entry, Pdo
 from trade_drivers.vendors.cia402._units import check_units, read_optional
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _QUICK_STOP: Final = 3
 """Value of 6007h: quick stop after a lost heartbeat."""

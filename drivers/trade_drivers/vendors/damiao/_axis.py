@@ -8,9 +8,9 @@ from typing import Final
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Ramp, Resolution
 from trade_drivers.joints.can import MotorAxis
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Status
+from trade_robotfile import Joint
 
 COUNTS_PER_RAD: Final = (1 << 16) / tau
 """Counts per radian of the motor's shaft in this driver; frames contain radians."""

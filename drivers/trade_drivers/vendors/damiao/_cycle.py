@@ -18,7 +18,7 @@ from trade_drivers.vendors.damiao._inspect import look_over
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _LAG: Final = 5
 """Cycles by which a motor may lag behind its set-point."""

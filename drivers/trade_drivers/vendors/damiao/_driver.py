@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING
 
 from trade_drivers.joints.can import CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._commission import DamiaoCommissioner
 from trade_drivers.vendors.damiao._frames import MODELS, orders
+from trade_robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort

@@ -14,8 +14,8 @@ from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Register
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+    from trade_robotfile import CanBus
 
 _WITHIN: Final = 0.98
 """The share of a motor's position range that a joint may use, as positions at its two ends look alike."""

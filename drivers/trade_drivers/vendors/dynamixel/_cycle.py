@@ -11,8 +11,8 @@ from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis
 from trade_drivers.vendors.dynamixel._inspect import check_settings
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.dynamixel._wire import Wire
+    from trade_robotfile import SerialBus
 
 _SIZES: Final = tuple(
     register.end - CYCLIC[0]

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Final
 
 from trade_drivers._validation import not_installed
 from trade_drivers.joints.serial import ServoDriver
-from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import DynamixelAxis
 from trade_drivers.vendors.dynamixel._commission import DynamixelCommissioner
 from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
 from trade_drivers.vendors.dynamixel._inspect import check_bus, look_over
+from trade_robotfile import Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._wire import Wire

@@ -10,8 +10,8 @@ from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.dynamixel._wire import Wire
+    from trade_robotfile import SerialBus
 
 _KEPT: Final = Kept((7, 8), table.name_of, table.firmware)
 _OTHER_THAN_REVERSED: Final = 0xFE

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 
 from trade_drivers._validation import not_installed
 from trade_drivers.joints.serial import ServoDriver
-from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import FeetechAxis
 from trade_drivers.vendors.feetech._commission import FeetechCommissioner
 from trade_drivers.vendors.feetech._cycle import FeetechExchange
 from trade_drivers.vendors.feetech._inspect import check_bus, look_over
+from trade_robotfile import Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.feetech._wire import Wire

@@ -13,7 +13,7 @@ from trade_drivers.vendors.feetech._jobs import GOAL_BLOCK
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_drivers.robotfile import Robot, SerialBus
+    from trade_robotfile import Robot, SerialBus
 
 _KEPT: Final = Kept((5, 6), table.name_of, table.firmware)
 _MOST_SPEED_COUNTS: Final = ((1 << 15) - 1) // table.STEPS_PER_SPEED

@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints.can import MotorAxis, resolution_of
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
+from trade_robotfile import Joint
 
 COUNTS_PER_TURN: Final = 1 << 16
 """Counts per turn of the motor in this driver, finer than any encoder; frames contain turns."""

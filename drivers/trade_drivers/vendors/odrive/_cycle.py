@@ -16,7 +16,7 @@ from trade_drivers.vendors.odrive._inspect import look_over
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 _HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)

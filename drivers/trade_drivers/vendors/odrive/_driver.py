@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING
 
 from trade_drivers.joints.can import CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
 from trade_drivers.vendors.odrive._axis import MODELS, OdriveAxis
 from trade_drivers.vendors.odrive._commission import OdriveCommissioner
 from trade_drivers.vendors.odrive._frames import orders
+from trade_robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort

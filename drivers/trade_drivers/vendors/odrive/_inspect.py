@@ -13,8 +13,8 @@ from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.odrive._frames import Command, Control, Input, frame_id
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
     from trade_drivers.vendors.odrive._cycle import OdriveExchange
+    from trade_robotfile import CanBus
 
 _FIRMWARE: Final = (0, 6)
 _LONGEST_S: Final = 0.5

@@ -12,8 +12,8 @@ from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
 from trade_drivers.vendors.robotiq._jobs import Motion
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import SerialBus
     from trade_drivers.vendors.robotiq._wire import Wire
+    from trade_robotfile import SerialBus
 
 _log = logging.getLogger("trade")
 _TAKEN_NS: Final = 15_000_000

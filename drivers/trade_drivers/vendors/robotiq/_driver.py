@@ -3,20 +3,20 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
 
+import trade_robotfile
 from trade.errors import ConfigurationError, DeviceAbsent
-from trade_drivers import robotfile
 from trade_drivers._validation import not_installed
 from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.bus._thread import BusThread, opening, start_thread
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
-from trade_drivers.robotfile import Bus, Robot, SerialBus
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
 from trade_drivers.vendors.robotiq._cycle import Exchange
 from trade_drivers.vendors.robotiq._gripper import RobotiqGripper
 from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
+from trade_robotfile import Bus, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
@@ -68,7 +68,7 @@ class RobotiqDriver(Driver):
     """
 
     modules = ("pymodbus", "serial")
-    devices = (robotfile.Gripper,)
+    devices = (trade_robotfile.Gripper,)
     without_watchdog = "no watchdog: without its driver it completes its last stroke"
     commissioner = RobotiqCommissioner
 

@@ -7,9 +7,9 @@ from trade import Resource
 from trade.errors import DeviceFault
 from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._motion import GripperState
-from trade_drivers.robotfile import Gripper
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._table import Contact, Status
+from trade_robotfile import Gripper
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._jobs import Motion

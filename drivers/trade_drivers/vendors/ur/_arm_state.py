@@ -7,8 +7,8 @@ from trade import Resource
 from trade.errors import DeviceFault
 from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._arm import ArmState, Safety
-from trade_drivers.robotfile import Arm
 from trade_drivers.vendors.ur._messages import Sample
+from trade_robotfile import Arm
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import Motion

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Final
 from trade.errors import MotionStopped, TradeError
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, PortLost, Steps
-from trade_drivers.robotfile import UrBus
 from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._child import Child
 from trade_drivers.vendors.ur._dashboard import tell
 from trade_drivers.vendors.ur._link import Link
 from trade_drivers.vendors.ur._messages import Disconnected, Done, Halt, Heartbeat, Order, Scale, Servo, TakeControl
+from trade_robotfile import UrBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import ArmCommand, Motion

@@ -7,20 +7,20 @@ from typing import Final, NoReturn
 
 from msgspec import structs
 
+import trade_robotfile
 from trade.errors import ConfigurationError, DeviceAbsent
-from trade_drivers import robotfile
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
-from trade_drivers.robotfile import Bus, Robot, UrBus
 from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._cycle import Exchange
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded
 from trade_drivers.vendors.ur._link import Link
 from trade_drivers.vendors.ur._ur_arm import UrArm
+from trade_robotfile import Bus, Robot, UrBus
 
 _CYCLES_HZ: Final = {
     "UR3": 125.0,
@@ -84,7 +84,7 @@ class UrDriver(Driver):
     modules = ("rtde_control", "rtde_receive", "rtde_io")
     own_clock = "its library ur-rtde is in C++, waits by itself, and runs in processes of its own"
 
-    devices = (robotfile.Arm,)
+    devices = (trade_robotfile.Arm,)
 
     def check(self, robot: Robot, bus: Bus) -> None:
         self._limb_of(robot, bus, bus.name)

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from trade.errors import ConfigurationError
-from trade_drivers.robotfile import Robot
+from trade_robotfile._convert import RobotFileError
+from trade_robotfile._records import Robot
 
 
 def without(robot: Robot, names: Iterable[str]) -> tuple[Robot, list[str]]:
@@ -21,13 +21,13 @@ def without(robot: Robot, names: Iterable[str]) -> tuple[Robot, list[str]]:
         The rest, and the names of all removed devices and groups.
 
     Raises:
-        ConfigurationError: there is no such part, a remaining joint is coupled to a removed one, or nothing remains.
+        RobotFileError: there is no such part, a remaining joint is coupled to a removed one, or nothing remains.
     """
     out = set(names)
     known = {each.name for each in (*robot.buses, *robot.cameras, *robot.sensors)}
     if unknown := sorted(out - known):
         problem = f"there is no bus, camera or sensor {unknown[0]!r} to leave out; there is {', '.join(sorted(known))}"
-        raise ConfigurationError(where=robot.where, problem=problem)
+        raise RobotFileError(problem, robot.where)
     gone = {device.name for device in (*robot.joints, *robot.grippers, *robot.arms) if device.bus in out}
     _check_coupled(robot, gone)
     groups = [group for group in robot.groups if gone.isdisjoint(group.joints)]
@@ -43,7 +43,7 @@ def without(robot: Robot, names: Iterable[str]) -> tuple[Robot, list[str]]:
         coupled=[coupled for coupled in robot.coupled if gone.isdisjoint(coupled.joints)],
     )
     if not (rest.joints or rest.grippers or rest.arms or rest.cameras or rest.sensors):
-        raise ConfigurationError(where=robot.where, problem="nothing would be left of the robot")
+        raise RobotFileError("nothing would be left of the robot", robot.where)
     senses = (each.name for each in (*robot.cameras, *robot.sensors) if each.name in out)
     return rest, [*_in_order(robot, gone), *senses, *(group.name for group in robot.groups if group not in groups)]
 
@@ -59,4 +59,4 @@ def _check_coupled(robot: Robot, gone: set[str]) -> None:
         if stays and goes:
             bus = next(joint.bus for joint in robot.joints if joint.name == stays[0])
             problem = f"{stays[0]} is coupled to {goes[0]}, which is left out; leave out bus {bus!r} as well"
-            raise ConfigurationError(where=robot.where, problem=problem)
+            raise RobotFileError(problem, robot.where)

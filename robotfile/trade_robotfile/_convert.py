@@ -8,8 +8,6 @@ from typing import Final, TypeVar
 import msgspec
 from msgspec import Struct
 
-from trade.errors import ConfigurationError
-
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
@@ -22,19 +20,39 @@ _EXAMPLES: Final = {
     "channel": '"can0"',
 }
 
+
+class RobotFileError(ValueError):
+    """A robot file is wrong; the message says where, and what would be right."""
+
+    def __init__(self, problem: str, where: str) -> None:
+        """Make the error.
+
+        Args:
+            problem: what is wrong, and what would be right.
+            where: the file, and the key if it is about one.
+        """
+        super().__init__(problem, where)
+        self.problem: Final = problem
+        self.where: Final = where
+
+    def __str__(self) -> str:
+        """File, key and problem."""
+        return f"{self.where}: {self.problem}"
+
+
 _Record = TypeVar("_Record", bound=Struct)
 
 
-def wrong(where: str, key: str, problem: str) -> ConfigurationError:
+def wrong(where: str, key: str, problem: str) -> RobotFileError:
     """Returns the error that names file and key."""
-    return ConfigurationError(where=f"{where}: {key}", problem=problem)
+    return RobotFileError(problem, f"{where}: {key}")
 
 
 def record_of(key: str, name: str | None, table: Mapping[str, object], record: type[_Record], where: str) -> _Record:
     """Returns the table ``key`` as a record, with this name if it has one.
 
     Raises:
-        ConfigurationError: the table is invalid; names key, value and the valid values.
+        RobotFileError: the table is invalid; names key, value and the valid values.
     """
     try:
         made = msgspec.convert(dict(table) if name is None else {**table, "name": name}, record)
@@ -44,9 +62,7 @@ def record_of(key: str, name: str | None, table: Mapping[str, object], record: t
     return made
 
 
-def explain(
-    bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str
-) -> ConfigurationError:
+def explain(bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str) -> RobotFileError:
     """Returns the error for an invalid table."""
     text = str(bad)
     keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
