@@ -1,4 +1,4 @@
-"""Methods and functions that are declared elsewhere: ``lock = delegated("locking", LockApi.lock)`` is shown as such.
+"""Methods and functions that are declared elsewhere: ``lock = delegated(lambda parts: parts.lock_api, LockApi.lock)``.
 
 The reference is made of sources that are read, not run. This gives each such name the signature and the docstring of
 what it stands for.

@@ -2,6 +2,7 @@
 
 from trade._protocol.schema_types import publish as _publish
 from trade_drivers._attach import AttachedRobot, attach
+from trade_drivers._robot_file import load, parse, without
 from trade_drivers.bus._can_monitor import CanBusState, CanMonitor
 from trade_drivers.bus._jobs import WireError
 from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found, scan
@@ -14,9 +15,7 @@ from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint, pl
 from trade_drivers.motion._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers.plugins._driver import AnyDriver, AttachedBus, Driver, SenseDriver, drivers, load_driver
 from trade_drivers.plugins._validate import check, refusals
-from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
-from trade_drivers.robotfile._load import load
-from trade_drivers.robotfile._subset import without
+from trade_robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus
 
 __all__ = [
     "UNITS",

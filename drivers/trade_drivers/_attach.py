@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import trade
+import trade_robotfile
 from trade import Container, Measure
 from trade._default_system import take_over
 from trade._protocol.messages import HEALTHY
 from trade.errors import ConfigurationError, TradeError
-from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
+from trade_drivers._robot_file import robot_file_errors
 from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.faults import FaultLog, FaultPoller, FaultStore
@@ -25,7 +26,7 @@ from trade_drivers.interfaces._sensing import Camera, Sensor
 from trade_drivers.joints._multi_bus_group import AcrossGroup
 from trade_drivers.plugins._driver import AttachedBus, Driver, SenseDriver, load_driver
 from trade_drivers.plugins._validate import check
-from trade_drivers.robotfile import Group, Robot
+from trade_robotfile import Group, Robot
 
 _log = logging.getLogger("trade")
 _FAULTS: Final = "faults"
@@ -230,14 +231,15 @@ def _attach_senses(robot: Robot, ports: Mapping[str, str], undo: ExitStack) -> d
 
 def _sense(
     robot: Robot,
-    device: robotfile.Camera | robotfile.Sensor,
+    device: trade_robotfile.Camera | trade_robotfile.Sensor,
     wanted: type[_Sense],
     ports: Mapping[str, str],
     undo: ExitStack,
 ) -> _Sense:
     where = f"{robot.where}: {device.key}.driver"
     driver = load_driver(device.driver, where, SenseDriver)
-    sense = driver.attach(f"{robot.name}.{device.name}", device, ports.get(device.name))
+    with robot_file_errors():
+        sense = driver.attach(f"{robot.name}.{device.name}", device, ports.get(device.name))
     undo.callback(sense.close)
     if not isinstance(sense, wanted):
         raise ConfigurationError(where=where, problem=f"driver {device.driver!r} has no {wanted.__name__.lower()}s")

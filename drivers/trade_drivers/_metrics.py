@@ -7,7 +7,7 @@ from trade.errors import DeviceError
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.interfaces._motion import Motor, MotorState
 from trade_drivers.plugins._driver import AttachedBus
-from trade_drivers.robotfile import Robot
+from trade_robotfile import Robot
 
 
 def measures_of(robot: Robot, buses: Mapping[str, AttachedBus], providers: Mapping[str, object]) -> Iterator[Measure]:

@@ -22,7 +22,8 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.robot._bus_thread import ready
 from trade_hil_sim.robot._factory_devices import fresh_bus
-from trade_hil_sim.robot._robot import buses_of, read_robot
+from trade_hil_sim.robot._robot import buses_of
+from trade_robotfile import load
 
 EPILOG = f"""\
 When all ports can be opened, one line of JSON appears on standard output:
@@ -123,7 +124,7 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
     paced = not options.unpaced
     buses = [fresh_bus(words, directory, log=log, paced=paced) for words in options.fresh]
     if options.robot is not None:
-        buses += buses_of(read_robot(options.robot), directory, names=options.bus, log=log, paced=paced)
+        buses += buses_of(load(options.robot), directory, names=options.bus, log=log, paced=paced)
     for bus in buses:
         stack.callback(bus.close)
         bus.open()

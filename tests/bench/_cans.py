@@ -17,15 +17,15 @@ from statistics import median
 
 from tests.bench._report import keep_point, print_target
 from trade.errors import DeviceError, TradeError
-from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint
+from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint, parse
 from trade_drivers.bus.can import frame_bits
 from trade_drivers.joints import BusThread
 from trade_drivers.joints.can._driver import AttachedMotors
-from trade_drivers.robotfile import CanBus, parse
 from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._motor import Drive
+from trade_drivers.vendors.cia402._homing import Drive
 from trade_hil_sim import SimProcess
+from trade_robotfile import CanBus
 
 _COUNT = 6
 _BITRATE = 1_000_000

@@ -17,7 +17,7 @@ import serial
 
 from tests.bench._report import keep_point, print_target
 from tests.bench._servo import Answers, Cycle, _cycles_per_s, _load, _measure, _range
-from trade_drivers.robotfile import parse
+from trade_drivers import parse
 from trade_drivers.vendors.feetech import FeetechDriver
 from trade_hil_sim import SimProcess
 from trade_hil_sim.feetech import encode

@@ -14,8 +14,8 @@ from tests.bench._children import _requests
 from tests.bench._rosie import _WIDE, _through
 from trade import Container, Settings, handle_of
 from trade.errors import TradeError
-from trade_drivers import Arm, AttachedRobot, Gripper, JointGroup, Motor, attach
-from trade_drivers.robotfile import Robot, parse
+from trade_drivers import Arm, AttachedRobot, Gripper, JointGroup, Motor, attach, parse
+from trade_robotfile import Robot
 
 GROUP = "others"
 ANYWHERE = "/dev/ttyNOWHERE"

@@ -16,8 +16,7 @@ import psutil
 
 from tests.bench._report import keep_point, print_skipped, print_target
 from trade.errors import TradeError
-from trade_drivers import Arm, AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach
-from trade_drivers.robotfile import parse
+from trade_drivers import Arm, AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach, parse
 from trade_hil_sim import SimProcess
 
 _ROSIE = Path(__file__).parents[2] / "examples" / "rosie.toml"

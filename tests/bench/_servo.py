@@ -18,7 +18,7 @@ from statistics import median
 import serial
 
 from tests.bench._report import keep_point, print_target
-from trade_drivers.robotfile import parse
+from trade_drivers import parse
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_hil_sim import SimProcess
 from trade_hil_sim.dynamixel import encode

@@ -17,9 +17,8 @@ from tests.bench._jitter_driver import busy_with
 from tests.bench._record import Histogram, Point, Run, Spread
 from tests.bench._report import begin_part, this_run
 from tests.bench.test_page import a_run
-from trade_drivers import AttachedRobot, attach, load_driver
+from trade_drivers import AttachedRobot, attach, load_driver, parse
 from trade_drivers.plugins._driver import Driver
-from trade_drivers.robotfile import parse
 from trade_hil_sim import SimProcess
 
 ROOT = Path(__file__).parents[2]

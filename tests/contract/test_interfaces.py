@@ -19,10 +19,10 @@ from tests.unit.drivers.motor_rig import DAMIAO, ODRIVE
 from trade import where
 from trade.errors import DeviceError
 from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
-from trade_drivers.robotfile import Bus
 from trade_drivers.testing import JointGroupContract, MotorContract
 from trade_hil_sim import ByteLog, SimProcess, events
 from trade_hil_sim.robot._robot import buses_of
+from trade_robotfile import Bus
 
 pytestmark = pytest.mark.realtime
 

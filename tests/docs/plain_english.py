@@ -17,10 +17,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 SEARCHED = (
-    "trade", "pytest_trade", "drivers", "gateway", "hil-sim", "examples", "docs",
+    "trade", "pytest_trade", "checks", "drivers", "gateway", "hil-sim", "robotfile", "examples", "docs",
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "tests",
 )  # fmt: skip
-PRODUCT = ("trade", "pytest_trade", "drivers", "gateway", "hil-sim")
+PRODUCT = ("trade", "pytest_trade", "checks", "drivers", "gateway", "hil-sim", "robotfile")
 AVOIDED = {
     r"told|tells|telling": "notify, report, inform, say",
     r"nobody|no one": "no client, no container, none",

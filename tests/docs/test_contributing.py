@@ -17,6 +17,8 @@ HOUSES: Final = {
     "pytest_trade": ".",
     "trade_drivers": "drivers",
     "trade_gateway": "gateway",
+    "trade_checks": "checks",
+    "trade_robotfile": "robotfile",
     "trade_hil_sim": "hil-sim",
     "pytest_trade_hil_sim": "hil-sim",
 }

@@ -14,8 +14,8 @@ from trade._security.policy_file import read_policy
 from trade.rules import read_rules
 from trade_drivers import Robot, attach, load, parse
 from trade_gateway.config._gateway_file import Plan, read_gateway_file
-from trade_gateway.config._system import read_system_file
 from trade_gateway.language import read_lexicon
+from trade_gateway.supervisor._system_file import read_system_file
 from trade_hil_sim import SimProcess
 
 ROSIE = '[robot]\nname = "rosie"\n'

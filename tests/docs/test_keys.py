@@ -9,7 +9,7 @@ import pytest
 from msgspec import NODEFAULT, Struct, inspect
 
 from tests.docs.blocks import DOCS
-from trade_drivers.robotfile import Arm, Bus, CanBus, Coupled, Gripper, Group, Joint, SerialBus, UrBus
+from trade_robotfile import Arm, Bus, CanBus, Coupled, Gripper, Group, Joint, SerialBus, UrBus
 
 RECORDS: Final[dict[str, type[Struct]]] = {
     "`[bus.NAME]`": Bus,

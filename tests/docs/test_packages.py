@@ -14,7 +14,7 @@ from tests.system.terminals import Shell, end_all_but
 
 pytestmark = pytest.mark.realtime
 
-PACKAGES = ("trade", "drivers", "hil-sim")
+PACKAGES = ("trade", "drivers", "hil-sim", "robotfile")
 
 
 def page(folder: str) -> Path:
@@ -58,7 +58,7 @@ def test_the_commands_of_the_gateways_page(system: str, folder: Path) -> None:
             assert code == 0, f"{command}: {said}"
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "gateway"])
+@pytest.mark.parametrize("package", [*PACKAGES, "gateway", "checks"])
 def test_a_page_has_how_it_is_installed_and_links_that_lead_somewhere(package: str) -> None:
     text = page(package).read_text(encoding="utf-8")
     project = ROOT if package == "trade" else ROOT / package

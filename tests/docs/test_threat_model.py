@@ -44,7 +44,8 @@ def test_no_threat_that_was_asked_about_is_left_out() -> None:
 
 
 def _modules() -> list[Path]:
-    return [path for room in ("trade", "drivers", "gateway", "hil-sim") for path in (ROOT / room).rglob("*.py")]
+    rooms = ("trade", "checks", "drivers", "gateway", "hil-sim", "robotfile")
+    return [path for room in rooms for path in (ROOT / room).rglob("*.py")]
 
 
 def test_nothing_is_unpickled_or_evaluated() -> None:

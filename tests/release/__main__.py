@@ -1,7 +1,7 @@
 """What has to hold before wheels are given away: they are left in dist/, with hashes and what licences they need.
 
 Wheels and source archives are built twice, from two copies, and must be the same bytes. Then, on each Python 3.10 to
-3.13 of this machine: an environment of its own, the core installed alone, all four packages with what their ranges
+3.13 of this machine: an environment of its own, the core installed alone, all five packages with what their ranges
 bring today, and tests of this folder run against what is installed. --whole runs the whole suite there instead of a
 part; --only 3.12 tries one Python. The end is 1 if anything failed.
 """

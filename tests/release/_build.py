@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[2]
-MEMBERS: Final = (".", "drivers", "gateway", "hil-sim")
+MEMBERS: Final = (".", "checks", "drivers", "gateway", "hil-sim", "robotfile")
 """Where the project files of the packages are."""
-_NEEDED: Final = ("pyproject.toml", "uv.lock", "LICENSE", "trade", "pytest_trade", "drivers", "gateway", "hil-sim")
+_NEEDED: Final = ("pyproject.toml", "uv.lock", "LICENSE", "trade", "pytest_trade", *MEMBERS[1:])
 _LEFT_OUT: Final = shutil.ignore_patterns("__pycache__", "*.pyc", "build", "dist")
 
 

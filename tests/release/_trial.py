@@ -72,9 +72,9 @@ class Trial:
             raise Failed(f"trade was imported from {where}, not from its wheel")
 
     def all(self) -> str:
-        """Install all four with their extras, as one does who trusts their ranges; what the command says of itself."""
+        """Install all five with their extras, as one does who trusts their ranges; what the command says of itself."""
         wheels = [f"{self._wheel(name)}[{extras}]" for name, extras in _EXTRAS.items()]
-        self._install(*wheels, self._wheel("trade_hil_sim"))
+        self._install(*wheels, self._wheel("trade_hil_sim"), self._wheel("trade_checks"))
         self._run(self._uv, "pip", "check", "--quiet", "--python", self._python)
         return self._run(self._python.parent / "trade", "--version").strip()
 

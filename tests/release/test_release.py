@@ -52,10 +52,11 @@ def test_each_wheel_has_its_licence_its_types_and_nothing_that_is_made_while_it_
         assert not [name for name in names if re.search(r"__pycache__|\.pyc$|\.so$|(^|/)tests/", name)]
 
 
-def test_the_four_packages_have_one_version_and_pin_each_other_to_it() -> None:
+def test_the_five_packages_have_one_version_and_pin_each_other_to_it() -> None:
     texts = [(ROOT / member / "pyproject.toml").read_text(encoding="utf-8") for member in MEMBERS]
     [version] = {found for text in texts for found in re.findall(r'^version = "(.*)"$', text, re.MULTILINE)}
-    pins = [pin for text in texts for pin in re.findall(r'"trade-(?:core|drivers|gateway|hil-sim)([=<>~].*?)"', text)]
+    pin = re.compile(r'"trade-(?:checks|core|drivers|gateway|hil-sim|robotfile)([=<>~].*?)"')
+    pins = [found for text in texts for found in pin.findall(text)]
     assert pins
     assert set(pins) == {f"=={version}"}
     assert f"\n## {version} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

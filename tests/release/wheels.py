@@ -21,7 +21,7 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 LOCK: Final = Path(__file__).parents[2] / "uv.lock"
-OURS: Final = ("trade-core", "trade-drivers", "trade-gateway", "trade-hil-sim")
+OURS: Final = ("trade-checks", "trade-core", "trade-drivers", "trade-gateway", "trade-hil-sim", "trade-robotfile")
 PYTHONS: Final = ((3, 10), (3, 11), (3, 12), (3, 13))
 ALLOWED: Final = {"ur-rtde"}
 """Arms of Universal Robots need a computer with x86_64, or a build from source; the rest of a robot does without."""

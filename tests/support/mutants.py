@@ -59,7 +59,7 @@ def _stop_loses(patch: Patch) -> None:
 
 def _watchdog_off(patch: Patch) -> None:
     """The watchdogs of servos are not armed."""
-    from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
+    from trade_drivers.vendors.dynamixel._exchange import DynamixelExchange
 
     begin = DynamixelExchange.__init__
 

@@ -12,11 +12,11 @@ from tests.support.waiting import wait_until
 from tests.system.conftest import Rosie
 from trade import CallModel, Container, where
 from trade.errors import ConfigurationError, MotionStopped, Stopped
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import _write
 from trade_gateway.cli.watching._profile import read, write
 from trade_gateway.http import add_token
 from trade_gateway.pki._authority import Authority
+from trade_gateway.terminal._output import Output
 from trade_hil_sim import events, read_log
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]

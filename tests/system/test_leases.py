@@ -37,7 +37,7 @@ class Pair:
 
     def handed_back(self) -> bool:
         with suppress(ConfigurationError):
-            self.base.supervisor.stand_in("a").hand_back()
+            self.base.supervisor.standby_of("a").hand_back()
             return True
         return False
 
@@ -67,7 +67,7 @@ def test_P71_containers_of_a_lost_gateway_move_to_the_standby_with_state_and_ret
     assert (lost.pid, lost.why.startswith("no lease: ")) == (0, True)
     assert call("count") == 3
     with pytest.raises(ConfigurationError, match="rover has not requested it for 2 s"):
-        pair.base.supervisor.stand_in("a").hand_back()
+        pair.base.supervisor.standby_of("a").hand_back()
     pair.link()
     wait_until(pair.handed_back, "rover asks again")
     pair.rover.become("a", "up")
@@ -98,7 +98,7 @@ def test_S20_what_drives_something_of_its_host_is_leased_only_if_its_class_is_re
 def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
     pair.base.set_children(STANDBY + COUNTER)
     pair.base.become("a", "elsewhere")
-    there = pair.base.supervisor.stand_in("a")
+    there = pair.base.supervisor.standby_of("a")
     wait_until(lambda: there.lease(None, "rover", "").turn, "what it had before is known to have ended")
     first = there.lease(None, "rover", "").turn
     turn = there.lease(None, "rover", "").turn
@@ -119,7 +119,7 @@ def test_late_saves_and_other_gateways_change_nothing(pair: Pair) -> None:
         with pytest.raises(AccessDenied, match="only rover"):
             there.keep_for(caller, gateway, turn, 9, one)
     with pytest.raises(ConfigurationError, match="no standby for a container 'b'"):
-        pair.base.supervisor.stand_in("b")
+        pair.base.supervisor.standby_of("b")
 
 
 def test_a_container_moves_with_its_state_from_a_busy_host_to_the_least_loaded_one(
@@ -133,7 +133,7 @@ def test_a_container_moves_with_its_state_from_a_busy_host_to_the_least_loaded_o
         first = pair.rover.become("a", "up")
         cart.set_children(LEASED + COUNTER)
         call("count")
-        there = pair.base.supervisor.stand_in("a")
+        there = pair.base.supervisor.standby_of("a")
         wait_until(lambda: there._loads._loads.keys() == {"", "rover", "cart"}, "base knows the loads of all hosts")
         pair.base.set_children(standby + COUNTER)  # from now on, the test says what the loads are
         wait_until(lambda: "cart" in there._arbiter.asked_at, "cart asks for it")

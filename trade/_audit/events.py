@@ -5,7 +5,6 @@ Without a record, it costs a call nothing. With one, a call puts one event into 
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from msgspec import Struct
@@ -15,7 +14,6 @@ from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.sessions import foreign
 from trade._counters import CallCounters
 from trade._protocol.keys import DOMAIN, Address
-from trade._settings import Settings
 from trade.errors import (
     AccessDenied,
     Busy,
@@ -206,18 +204,6 @@ _SILENT: Final = frozenset(
     ("renew", "release", "release_requested", "notification_failed", "hook_suspended", "listen", "unlisten")
 )
 """Routine messages between containers."""
-
-
-def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
-    """The audit of a container; the stack closes its writer, if it has one."""
-    calls = CallCounters() if settings.metrics else None
-    if settings.audit is None:
-        return Audit(calls=calls)
-    from trade._audit.writer import start_writing  # noqa: PLC0415 - without a record no database is needed
-
-    writer = start_writing(settings, settings.audit, own)
-    leaving.callback(writer.close)
-    return Audit(writer.tell, own, reads=settings.audit_reads, calls=calls, record=writer)
 
 
 def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:

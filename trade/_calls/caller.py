@@ -1,7 +1,7 @@
 """The caller's side of a call: borrow a reply channel, put the request, wait until it is answered, lost or too late.
 
 A blocking caller waits on its reply channel itself, so no other thread is involved. A wait without an answer ends with
-the container's own put on the reply key, from the deadline thread or from the thread that notices the callee's loss.
+the container's own put on the reply key, at the deadline or from the thread that notices the callee's loss.
 """
 
 import itertools
@@ -33,13 +33,14 @@ from trade._protocol.messages import (
     encode_message,
 )
 from trade._telemetry.spans import Spans
-from trade._threads.alarm import NEVER, Alarm
 from trade._threads.condition import InterruptibleCondition
+from trade._threads.scheduler import NEVER, Scheduler
 from trade._transport.base import ChannelClosed, Message, Publisher, Transport
 from trade._transport.local_connection import ConnectionEnded
 
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0
+_END_S: Final = 2.0
 _GRANTING: Final = frozenset(("acquire", "renew"))
 """The services of locks whose answer counts only while its connection lasts: a callee that loses this container breaks
 its connections off before it ends its locks. A process that was frozen would else take an old answer for a lock, which
@@ -53,10 +54,11 @@ class Caller:
     Args:
         transport: carries its calls.
         own: the container.
+        timers: ends calls at their deadlines; its clock is theirs.
         local: carries its calls to containers of this host; none: the transport carries them, too.
     """
 
-    def __init__(self, transport: Transport, own: Address, local: LocalPath | None = None) -> None:
+    def __init__(self, transport: Transport, own: Address, timers: Scheduler, local: LocalPath | None = None) -> None:
         self._transport = transport
         self._local = local
         self.own: Final = own
@@ -76,13 +78,12 @@ class Caller:
         self._closed = False
         self.leaving = False
         """Whether its container closes: the callees see that, and end its calls."""
-        self.clock: Final = transport.clock
+        self.clock: Final = timers.clock
         """The clock of its deadlines."""
-        self._deadlines = Alarm("trade-deadlines", self._end_overdue, transport.clock)
+        self._deadlines = timers.due(self._end_overdue)
         self.malformed = 0
         self.spans: Spans | None = None
         """Records its calls while this container is traced."""
-        self._deadlines.start()
 
     @property
     def closed(self) -> bool:
@@ -139,7 +140,7 @@ class Caller:
 
     def _reads_replies(self) -> bool:
         """Whether this is a thread that the replies of started calls need, in the callback of one."""
-        return threading.current_thread() in (self._deadlines.thread, *self._threads)
+        return self._deadlines.runs_here or threading.current_thread() in self._threads
 
     def _ask_behind(self, call: Call, route: Route, deadline_ns: int) -> Reply:
         """The same on the way that started calls took, so that it arrives after them."""
@@ -203,8 +204,7 @@ class Caller:
 
     def _wait_with(self, slot: Slot, waiting: tuple[int, Peer, int]) -> None:
         slot.waiting = waiting
-        if waiting[2] < self._deadlines.next_ns:
-            self._deadlines.ring()
+        self._deadlines.by(waiting[2])
 
     def _ask(self, call: Call, route: Route, deadline_ns: int) -> Reply:
         """The same on the transport."""
@@ -264,8 +264,7 @@ class Caller:
         grants, sent = _grants(call, route), (publisher, data)
         pending = Pending(peer, deadline_ns, on_reply, on_progress, sent, starter, grants=grants)
         self._pending[call.id] = pending
-        if deadline_ns < self._deadlines.next_ns:
-            self._deadlines.ring()
+        self._deadlines.by(deadline_ns)
         if peer.lost or self._closed:
             self._finish(ended(call.id, Status.UNSENT))
             return
@@ -526,17 +525,17 @@ class Caller:
         """Ends every wait and every thread. Idempotent."""
         self._closed = True
         self._end(lambda _peer, _deadline: True, Status.CLOSED)
-        self._wait_until_free(time.monotonic() + 2)
+        self._wait_until_free(time.monotonic() + _END_S)
         for box in list(self._every):
             box.channel.close()
         if self._local is not None:
             self._local.close()
         for peer in list(self._peers.values()):
             peer.close()
-        self._deadlines.close()
+        self._deadlines.cancel(_END_S)
         for thread in list(self._threads):
             if thread is not threading.current_thread():
-                thread.join(2)
+                thread.join(_END_S)
         self.publishers.close()
 
     def _wait_until_free(self, deadline: float) -> None:

@@ -107,7 +107,7 @@ class CallClient:
         """The registry entry of a service, or the last known one; raises ServiceGone if it has none."""
         record = self.registry.get(handle.key) or handle.last_record
         if record is None:
-            raise self._targets.gone(handle)
+            raise self._targets.gone_error(handle)
         return record
 
     def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
@@ -116,10 +116,10 @@ class CallClient:
         verb = verb_of(key.domain, key.name, handle.record.info.effect)
         return verb, policy.roles_with(verb, key.domain) if policy is not None and verb else ()
 
-    def require_call(self, who: str, handle: Handle) -> None:
+    def require_call(self, identity: str, handle: Handle) -> None:
         """Raises AccessDenied if a client for whom this container acts may not call that service."""
         key, record = handle.key, handle.record
-        self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+        self.access.require_call(identity, key.domain, key.name, record.info.effect, record.label)
 
     # --- calls of handles
 
@@ -296,10 +296,10 @@ class CallClient:
         wait_s = patience_s(wait_s)
         if self.registry.wait_for(ready, wait_s):
             return
-        apart = self._unanswered(wait_s) if len(self.registry.containers()) == 1 else ()
+        unreached = self._unanswered(wait_s) if len(self.registry.containers()) == 1 else ()
         hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
         others = self.beyond() if wait_s > 0 else ()
-        raise no_such_service(constraint, self.registry.select(where()), wait_s, apart, hidden, others)
+        raise no_such_service(constraint, self.registry.select(where()), wait_s, unreached, hidden, others)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Endpoints without a container; the reasons, at half a second each, only if the caller does not wait."""
@@ -408,9 +408,9 @@ class CallClient:
 
     def ask_all(self, name: str, *args: Any) -> list[Any]:
         """The results of `asked`."""
-        return [outcome.result for outcome in self.asked(name, *args)]
+        return [outcome.result for outcome in self.call_everywhere(name, *args)]
 
-    def asked(self, name: str, *args: Any, container: str = "*") -> list[batch.Outcome]:
+    def call_everywhere(self, name: str, *args: Any, container: str = "*") -> list[batch.Outcome]:
         """The successful calls of one of the middleware's own services in all containers; see `answers`."""
         present = self.everywhere(name, container=container)
         return answers(name, self.call_all(present.handles, *args), present.silent)

@@ -10,7 +10,7 @@ from msgspec import Struct
 from trade._calls.arguments import ArgumentEncoder
 from trade._protocol.keys import Address, call_key
 from trade._protocol.messages import EMPTY, PROTOCOL, Call, Reply, encode_message
-from trade._threads.alarm import NEVER
+from trade._threads.scheduler import NEVER
 from trade._transport.base import Channel, Publisher, Transport
 
 if TYPE_CHECKING:

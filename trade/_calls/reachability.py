@@ -27,7 +27,7 @@ _HIDDEN: Final = (
 )
 
 
-class Reachability(Struct, frozen=True):
+class Reachability(Struct, frozen=True, rename={"unreached": "apart"}):
     """The containers that one has found so far."""
 
     others: tuple[str, ...]
@@ -35,7 +35,7 @@ class Reachability(Struct, frozen=True):
     none do not count."""
     silent: tuple[str, ...] = ()
     """Those of them that have not listed their services yet."""
-    apart: dict[str, str] = {}
+    unreached: dict[str, str] = {}
     """The endpoints of ``Settings.connect``, or of the hub, where no container was found; with reasons, if known."""
     source: str = "TRADE_CONNECT"
     """Where these endpoints are from."""
@@ -43,12 +43,12 @@ class Reachability(Struct, frozen=True):
     @property
     def unanswered(self) -> tuple[str, ...]:
         """These endpoints and reasons, as text for errors."""
-        return tuple(f"{endpoint} ({self.source}): {why}" for endpoint, why in self.apart.items())
+        return tuple(f"{endpoint} ({self.source}): {why}" for endpoint, why in self.unreached.items())
 
     @property
     def complete(self) -> bool:
         """Whether it found a container at each endpoint, and all have listed their services."""
-        return bool(self.others) and not self.silent and not self.apart
+        return bool(self.others) and not self.silent and not self.unreached
 
     def as_error(self, system: str, so: str = "") -> NoContainerFound:
         """The error of a request that has no reliable answer, because containers are missing.
@@ -57,8 +57,8 @@ class Reachability(Struct, frozen=True):
             system: the system of the request.
             so: what is unknown therefore.
         """
-        others, apart = bool(self.others), self.unanswered
-        return NoContainerFound(system=system, so=so, others=others, silent=self.silent, apart=apart)
+        others, unreached = bool(self.others), self.unanswered
+        return NoContainerFound(system=system, so=so, others=others, silent=self.silent, apart=unreached)
 
 
 def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Reachability:
@@ -66,7 +66,7 @@ def look_around(registry: Registry, reach: Dialer | None, own: Address, system: 
     until = time.monotonic() + limit_s
     while not (found := _reachability(registry, reach, own)).complete and time.monotonic() < until:
         time.sleep(_LOOK_S)
-    return found if reach is None else structs.replace(found, apart=_apart(reach, own, system, found))
+    return found if reach is None else structs.replace(found, unreached=_unreached(reach, own, system, found))
 
 
 def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Reachability:
@@ -75,20 +75,20 @@ def _reachability(registry: Registry, reach: Dialer | None, own: Address) -> Rea
     return Reachability(
         others=tuple(state.address.who for state in states),
         silent=tuple(state.address.who for state in states if not state.heard.complete),
-        apart=dict.fromkeys(unlinked, ""),
+        unreached=dict.fromkeys(unlinked, ""),
         source="" if reach is None else reach.source,
     )
 
 
-def _apart(reach: Dialer, own: Address, system: str, found: Reachability) -> dict[str, str]:
+def _unreached(reach: Dialer, own: Address, system: str, found: Reachability) -> dict[str, str]:
     """The endpoints without a link, and why; a link from there to here counts, too."""
-    reach.try_all(list(found.apart))
-    reasons = {endpoint: reach.why_apart(endpoint, certain=not found.others) for endpoint in found.apart}
-    apart = {endpoint: why for endpoint, why in reasons.items() if why}
+    reach.try_all(list(found.unreached))
+    reasons = {endpoint: reach.why_apart(endpoint, certain=not found.others) for endpoint in found.unreached}
+    unreached = {endpoint: why for endpoint, why in reasons.items() if why}
     if not found.others:
         hidden = _HIDDEN.format(identity=own.identity, system=system)
-        apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
-    return apart
+        unreached |= {endpoint: hidden for endpoint in reach.configured if endpoint not in unreached}
+    return unreached
 
 
 def beyond(

@@ -6,16 +6,15 @@ import logging
 from collections.abc import Callable, Generator
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, Protocol
 
 from trade._context.active_calls import ActiveCall, end_calls
+from trade._registry.registry import Record
 from trade._threads.condition import InterruptibleCondition
 from trade.errors import OutcomeUnknown
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar  # every type checker has it
-
-    from trade._calls.handle import Handle
 
     _Result = TypeVar("_Result", default=Any)
 else:
@@ -26,13 +25,26 @@ else:
 _logger = logging.getLogger("trade")
 
 
+class RunHandle(Protocol):
+    """A handle, as its runs use it. Implemented by `trade.Handle`."""
+
+    @property
+    def label(self) -> str: ...
+    @property
+    def record(self) -> Record: ...
+    def __call__(self) -> Any: ...
+    def start(self) -> "Run[Any]": ...
+    def cancel_service(self) -> "RunHandle": ...
+    def log_not_cancelled(self, error: BaseException) -> None: ...
+
+
 class Run(Generic[_Result]):
     """A call under way. Wait with ``result()`` or ``await``; it ends at its deadline at the latest.
 
     Type checkers know the type of its result if the call was made with `trade.start_call`.
     """
 
-    def __init__(self, handle: "Handle") -> None:
+    def __init__(self, handle: RunHandle) -> None:
         self._handle = handle
         self._outcome: tuple[Any, BaseException | None] | None = None
         """Its result or its error, once it has ended."""
@@ -76,9 +88,9 @@ class Run(Generic[_Result]):
             raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it continues")
         return self._outcome
 
-    def add_done_callback(self, tell: "Callable[[Run], object]") -> None:
+    def add_done_callback(self, callback: "Callable[[Run], object]") -> None:
         """Calls this when the run has ended, on the thread that notices it; at once if it has."""
-        self._done_callbacks.append(tell)
+        self._done_callbacks.append(callback)
         if self._outcome is not None:
             self._call_back()
 
@@ -110,17 +122,17 @@ class Run(Generic[_Result]):
         """Does what `cancel` does, without waiting for it; only the first call has an effect."""
         if not self._cancelling and self._outcome is None:
             self._soon(self.ask_to_end)
-            self._soon(self._call_off)
+            self._soon(self._call_cancel_service)
 
-    def _call_off(self) -> None:
+    def _call_cancel_service(self) -> None:
         """Calls the service that cancels it, if its provider names one."""
 
-        def look(stopping: Run) -> None:
-            if (error := stopping.exception()) is not None:
+        def log_failure(cancel_run: Run) -> None:
+            if (error := cancel_run.exception()) is not None:
                 self._handle.log_not_cancelled(error)
 
         if self._handle.record.info.cancel is not None:
-            self._handle.cancel_service().start().add_done_callback(look)
+            self._handle.cancel_service().start().add_done_callback(log_failure)
 
     def _soon(self, do: Callable[[], None]) -> None:
         try:
@@ -156,11 +168,11 @@ class Run(Generic[_Result]):
         if self._on_progress is not None:
             self._on_progress(value)
 
-    def on_progress(self, tell: Callable[[Any], object]) -> None:
+    def on_progress(self, callback: Callable[[Any], object]) -> None:
         """Calls this with each progress value, on the thread that receives it; with the latest one at once."""
-        self._on_progress = tell
+        self._on_progress = callback
         if self._progress is not None:
-            tell(self._progress)
+            callback(self._progress)
 
     def fail(self, error: BaseException) -> None:
         """Ends the run with an error, because the call could not begin; called by the container."""
@@ -185,32 +197,32 @@ class Run(Generic[_Result]):
 
         The service that cancels it is also called at its deadline, when it is unknown whether it ended.
         """
-        around = copy_context()  # its session and its locks
+        context = copy_context()  # its session and its locks
 
         def end() -> None:
-            end_calls([partial(around.run, self.end_soon)])
+            end_calls([partial(context.run, self.end_soon)])
 
-        def call_off() -> None:
-            self._soon(self._call_off)
+        def cancel_service() -> None:
+            self._soon(self._call_cancel_service)
 
-        def look(_: object) -> None:
+        def cancel_if_unknown(_: object) -> None:
             forget()
             if isinstance(self.exception(0), OutcomeUnknown):
-                end_calls([partial(around.run, call_off)])
+                end_calls([partial(context.run, cancel_service)])
 
         forget = outer.on_cancel(end)
-        self.add_done_callback(look)
+        self.add_done_callback(cancel_if_unknown)
         return forget
 
     async def settled(self) -> None:
         """Waits from asyncio until it has ended, with a result or an error; cancelling this wait does not cancel it."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
-        def tell(_: object) -> None:
+        def set_ended(_: object) -> None:
             with contextlib.suppress(RuntimeError):  # that loop has ended
                 loop.call_soon_threadsafe(ended.set)
 
-        self.add_done_callback(tell)
+        self.add_done_callback(set_ended)
         await ended.wait()
 
     def __await__(self) -> Generator[Any, None, _Result]:

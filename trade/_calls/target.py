@@ -274,7 +274,7 @@ class RemoteTarget:
         error = None if reply.status == Status.OK else self._failure(reply, request)
         spans = self._caller.spans
         if spans is not None and self._traceable:
-            spans.asked(reply.id, self._label, request, error)
+            spans.record_outgoing(reply.id, self._label, request, error)
         if error is not None:
             request.refused(self._peer.address, error)
             raise error

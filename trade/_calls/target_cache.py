@@ -61,7 +61,7 @@ class Targets:
             self._require(record)
         target = None if record is None else self._make(record)
         if target is None:
-            raise self.gone(handle)
+            raise self.gone_error(handle)
         self.known[key] = target
         changed = self._registry.get(key) is not record or self._access.policy is not policy
         if self._closed or changed:  # it was removed or replaced meanwhile
@@ -69,17 +69,17 @@ class Targets:
         return target
 
     def _require(self, record: Record) -> None:
-        key, who = record.key, self._own.identity
+        key, identity = record.key, self._own.identity
         try:
-            self._access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+            self._access.require_call(identity, key.domain, key.name, record.info.effect, record.label)
         except AccessDenied as denied:
-            self._audit.refused(record.label, denied, who=who, session=self._caller.session)
+            self._audit.refused(record.label, denied, who=identity, session=self._caller.session)
             raise
 
     def _make(self, record: Record) -> Target | None:
         if not record.local:
             try:
-                return RemoteTarget(record, self._caller, self._codec, self._our_own(record))
+                return RemoteTarget(record, self._caller, self._codec, self._own_description(record))
             except ChannelClosed:  # closed meanwhile
                 raise container_closed(self._own) from None
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
@@ -87,7 +87,7 @@ class Targets:
             return None
         return LocalTarget(service, record, self._codec, self._caller, self._thread_pool)
 
-    def _our_own(self, record: Record) -> ServiceInfo | None:
+    def _own_description(self, record: Record) -> ServiceInfo | None:
         """This container's own description of a middleware function that another container has, too.
 
         It takes precedence over the other container's description, which may come from another language.
@@ -98,7 +98,7 @@ class Targets:
         service = self._providers.services_at(f"{DOMAIN}/{key.provider}").get(key.name)
         return None if service is None else service.info
 
-    def gone(self, handle: Handle) -> ServiceGone:
+    def gone_error(self, handle: Handle) -> ServiceGone:
         """The error of a handle without a target."""
         return as_never_ran(self._gone(handle), handle.key)
 

@@ -8,13 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from trade._audit.events import open_audit
+from trade._audit.setup import open_audit
 from trade._calls.caller import Caller
 from trade._calls.client import CallClient
 from trade._calls.handle import handle_codec
 from trade._calls.local_path import MARK, LocalPath
 from trade._calls.sessions import Sessions
 from trade._calls.target_cache import Targets
+from trade._container.certificate_end import ExpiryWatch
 from trade._container.policy_reload import begin_watching
 from trade._container.registration import Registration
 from trade._container.shutdown import Shutdown
@@ -56,7 +57,7 @@ from trade._services.dispatcher import Dispatcher
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_server import LocalServer
 from trade._services.providers import Providers
-from trade._services.withdrawn import Withdrawn
+from trade._services.withdrawn import WithdrawnProviders
 from trade._settings import Settings
 from trade._streams.api import StreamApi
 from trade._streams.source import Streams
@@ -132,13 +133,17 @@ class Components:
         """Whether the transport was given: then it carries everything."""
         self.events = EventLog(self._address.container)
         self._certificate = None if self._given else self.settings.certificate()
-        self.transport = transport or join(
-            self.settings,
-            self._certificate,
-            leaving,
-            lambda until: self.events.note("certificate_ends", self._address.identity, until),
-        )
+        self.transport = transport or join(self.settings, self._certificate, leaving)
         leaving.callback(self.transport.close)
+        self._timers = Scheduler("trade-timers", self.transport.clock)
+        """Has a fixed number of tasks, fewer than it may have threads. So none waits for another one that blocks."""
+        leaving.callback(self._timers.close)
+        self._real_timers = Scheduler("trade-timers") if self._given else self._timers
+        """The same on the computer's clock, where a test may move the other one."""
+        leaving.callback(self._real_timers.close)
+        if self._certificate is not None:
+            ends = partial(self.events.note, "certificate_ends", self._address.identity)
+            ExpiryWatch(self._certificate, self._real_timers, ends)
         self.dialer: Dialer | None = None
         """Its links; None on a transport without links."""
         own_pair = not self._given and self.settings.tls is None and self.settings.credentials is None
@@ -146,7 +151,9 @@ class Components:
         """The secret of this user on this host, if the container's links use it."""
         self._links = self.transport.links if isinstance(self.transport, ZenohTransport) else None
         if isinstance(self.transport, ZenohTransport):
-            self.dialer = Dialer(self.transport.links, self.settings.check_may_dial, self.settings.connect)
+            self.dialer = Dialer(
+                self.transport.links, self.settings.check_may_dial, self._timers, self.settings.connect
+            )
             leaving.callback(self.dialer.close)
 
     def _build_calls(self, leaving: contextlib.ExitStack) -> None:
@@ -155,7 +162,7 @@ class Components:
         self.client = CallClient(address, self.settings.system, self.registry, self.dialer, self.access)
         self.codec = handle_codec(lambda handle: handle.key, self.client.handle)
         self.local_path = self._local_path()
-        self.caller = Caller(self.transport, address, self.local_path)
+        self.caller = Caller(self.transport, address, self._timers, self.local_path)
         leaving.callback(self.caller.close)
         self.scheduler = Scheduler("trade-clock")
         leaving.callback(self.scheduler.close)
@@ -181,8 +188,8 @@ class Components:
             leaving.callback(handed_down.pop, address)
         self.event_loop = AsyncLoop()
         leaving.callback(self.event_loop.close)
-        self.lock_api = LockApi(self.client, self.transport.clock)
-        self.locks = LockTable(address.epoch, self._address.container, self.transport.clock, self.audit)
+        self.lock_api = LockApi(self.client, self._timers)
+        self.locks = LockTable(address.epoch, self._address.container, self._timers, self.audit)
         leaving.callback(self.locks.close)
         self.remote_locks = RemoteLocks(self.locks, address.epoch)
 
@@ -255,8 +262,8 @@ class Components:
 
     def _build_migration(self, leaving: contextlib.ExitStack) -> None:
         address, access = self._address, self.access
-        self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-        self.registration = Registration(self.client, self.providers, self.withdrawn, self.deadman)
+        self.withdrawn_providers = WithdrawnProviders(self.providers, self.deadman.rest)
+        self.registration = Registration(self.client, self.providers, self.withdrawn_providers, self.deadman)
         state_dir = self.settings.state_dir
         kept = None if state_dir is None else state_dir / self.settings.system / "code"
         code = CodeStore(kept, self.settings.code, address.container)
@@ -265,14 +272,14 @@ class Components:
             address,
             self.registration.register,
             self.providers,
-            self.withdrawn,
+            self.withdrawn_providers,
             self.settings.instantiable,
             code,
         )
         leaving.callback(self.factory.close)
         quiescer = Quiescer(self.locks, address)
         self.migration_source = MigrationSource(
-            self.client, self.providers, self.factory, self.withdrawn, quiescer, access, self.codec
+            self.client, self.providers, self.factory, self.withdrawn_providers, quiescer, access, self.codec
         )
         self.migration_target = MigrationTarget(
             address, self.providers, self.factory, quiescer, access, self.codec, self.scheduler
@@ -282,7 +289,13 @@ class Components:
 
     def _build_dispatch(self, leaving: contextlib.ExitStack) -> None:
         self.dispatcher = Dispatcher(
-            self.transport, self._address, self.providers, self.event_loop, self.access, self.audit
+            self.transport,
+            self._address,
+            self.providers,
+            self.event_loop,
+            self.access,
+            self.audit,
+            self._real_timers,
         )
         leaving.callback(self.dispatcher.close)
         self.local_server: LocalServer | None = None
@@ -378,6 +391,7 @@ class Components:
                 self.locks.session_back,
                 self._beat,
                 self.estop.learn,
+                self._real_timers,
             )
             self._leaving.callback(self.watch.close)
             if self.access.path is not None:
@@ -426,7 +440,7 @@ class Components:
         Calls to it, and locks of its resources, wait for the transport's sign: its last answers may be under way.
         """
         self.dispatcher.hang_up(address)  # before its locks end: see `Caller` on answers that grant
-        if self.locks.gone((str(address),)) is None:  # the other sign was earlier
+        if self.locks.session_error((str(address),)) is None:  # the other sign was earlier
             self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
         self.dispatcher.forget(address)
 
@@ -437,10 +451,10 @@ class Components:
         self.dispatcher.session_ended(session)
         self.session_end.emit(session)
 
-    def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
+    def ask_for_release(self, holder: Holder, token: Token, identity: str, reason: str) -> None:
         """Passes a release request to the holder of a lock; called by the lock services."""
         owner = Address(*holder.session.split("/")[:3])
-        self.client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
+        self.client.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, identity, reason)
 
     def trace(self, on: bool) -> bool:
         """Switches the tracing of calls on or off. Returns whether it was on."""
@@ -479,8 +493,8 @@ class Components:
     def _taken(self) -> list[int]:
         return [pool.taken for pool in list(self.dispatcher.pools)]
 
-    def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
-        return self.access.denied(who, "instrument", record.key.domain, record.label)
+    def _denied_hook(self, identity: str, record: Record) -> AccessDenied | None:
+        return self.access.denied(identity, "instrument", record.key.domain, record.label)
 
     def recheck_access(self) -> None:
         """Applies a changed policy: locks that it no longer allows are lost."""
@@ -524,7 +538,6 @@ class Components:
 
     def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
-        self.client.check_open()
         return containers_of(self.registry)
 
     # --- ending

@@ -206,56 +206,56 @@ class Container:
 
     load_policy = delegated(lambda parts: parts, Components.load_policy)
 
-    def note_change(self, what: str, about: str = "") -> None:
+    def note_change(self, change: str, subject: str = "") -> None:
         """Adds a change of configuration to the audit record, if one is kept (`Settings.audit`).
 
         Args:
-            what: the change, in a few words.
-            about: the file or the device.
+            change: the change, in a few words.
+            subject: the file or the device.
         """
-        self._parts.audit.changed(what, about, running.get())
+        self._parts.audit.changed(change, subject, running.get())
 
-    def note_asked(
+    def note_request(
         self,
-        what: str,
-        about: str = "",
+        request: str,
+        service: str = "",
         *,
         kind: Literal["call", "stop", "refused"] = "call",
-        who: str = "",
+        client: str = "",
         outcome: str = "ok",
-        why: str = "",
+        error: str = "",
         took_ns: int = 0,
     ) -> None:
         """Adds a request to a program that acts for others, such as an agent's tool, to the audit record, if kept.
 
         Args:
-            what: the request, in a few words.
-            about: the service, without arguments, which may be secret.
+            request: the request, in a few words.
+            service: the service, without arguments, which may be secret.
             kind: the kind of the row.
-            who: the identity that the program acts for; empty: this container.
+            client: the identity that the program acts for; empty: this container.
             outcome: ``ok``, or the type of the error.
-            why: the message of the error.
+            error: the message of the error.
             took_ns: the duration in nanoseconds.
         """
         own = self.address
         self._parts.audit.note(
             kind,
-            what,
-            about=about,
-            who=who or own.identity,
+            request,
+            about=service,
+            who=client or own.identity,
             session=str(own),
             outcome=outcome,
-            why=why,
+            why=error,
             took_ns=took_ns,
         )
 
-    def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
+    def measured_by(self, read: Callable[[], Iterable[Measure]]) -> None:
         """Adds metrics to this container's own (`Settings.metrics`).
 
         Args:
-            tell: called at each reading; returns numbers that are known already, without waiting.
+            read: called at each reading; returns numbers that are known already, without waiting.
         """
-        self._parts.measured.append(tell)
+        self._parts.measured.append(read)
 
     @property
     def metrics_port(self) -> int:

@@ -15,7 +15,7 @@ from trade._registry.constraints import checked_meta
 from trade._services.decorator import provider_of
 from trade._services.providers import Providers
 from trade._services.registration import checked_groups, checked_health
-from trade._services.withdrawn import Withdrawn
+from trade._services.withdrawn import WithdrawnProviders
 from trade._transport.base import ChannelClosed
 
 _logger = logging.getLogger("trade")
@@ -24,10 +24,12 @@ _logger = logging.getLogger("trade")
 class Registration:
     """Offers objects to the whole system."""
 
-    def __init__(self, client: CallClient, providers: Providers, withdrawn: Withdrawn, deadman: Deadman) -> None:
+    def __init__(
+        self, client: CallClient, providers: Providers, withdrawn_providers: WithdrawnProviders, deadman: Deadman
+    ) -> None:
         self._client = client
         self._providers = providers
-        self._withdrawn = withdrawn
+        self._withdrawn_providers = withdrawn_providers
         self._deadman = deadman
 
     def register(
@@ -59,7 +61,7 @@ class Registration:
             keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self._client.address) from None
-        self._withdrawn.forget(provider)
+        self._withdrawn_providers.forget(provider)
         return tuple(self._client.handle(key) for key in keys)
 
     def register_functions(self, functions: object, name: str) -> tuple[Handle, ...]:
@@ -80,7 +82,7 @@ class Registration:
             ConfigurationError: it is not registered here.
         """
         provider = provider_of(provider)
-        if not self._withdrawn.forget(provider):
+        if not self._withdrawn_providers.forget(provider):
             for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
                 _logger.error("a provider was withdrawn but could not be stopped: %s", problem)
             self._providers.remove(provider)

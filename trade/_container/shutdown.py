@@ -32,7 +32,7 @@ class Shutdown:
         self._close = close
         self._first = threading.Lock()
 
-    def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]:
+    def begin(self, reason: str, identity: str, *, only_at_rest: bool = False) -> list[str]:
         """Stops all motion, and closes the container afterwards; returns what could not be stopped, and why.
 
         Raises:
@@ -42,7 +42,7 @@ class Shutdown:
             raise InUse(container=self._name, uses=uses)
         problems = self._rest(self._resources(), f"container {self._name} is terminated: {reason}")
         if self._first.acquire(blocking=False):
-            _logger.warning("container %s is terminated by %s: %s", self._name, who, reason or "no reason given")
+            _logger.warning("container %s is terminated by %s: %s", self._name, identity, reason or "no reason given")
             threading.Thread(target=self._end, name="trade-terminate", daemon=True).start()
         return problems
 

@@ -77,7 +77,9 @@ class System:
 
     def containers(self) -> Table[ContainerInfo]:
         """The containers of the system, this one included."""
-        return self._components().containers()
+        components = self._components()
+        components.client.check_open()
+        return components.containers()
 
     def load(self) -> LoadInfo:
         """The load of this container, its process and its host."""
@@ -97,7 +99,7 @@ class System:
         if home != parts.client.address:
             problem = f"it belongs to another container, or to an earlier epoch; call deregister of {home.container}"
             raise ConfigurationError(where=service.label, problem=problem)
-        return parts.withdrawn.take_off(service.key)
+        return parts.withdrawn_providers.take_off(service.key)
 
     def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
         """Offers an object again that was deregistered through this container.
@@ -113,11 +115,11 @@ class System:
             ConfigurationError: no such provider was deregistered, or a malformed group.
         """
         parts = self._components()
-        return tuple(map(parts.client.handle, parts.withdrawn.put_back(provider, groups)))
+        return tuple(map(parts.client.handle, parts.withdrawn_providers.put_back(provider, groups)))
 
     def withdrawn(self) -> list[WithdrawnInfo]:
         """The providers that `register` can offer again, by name."""
-        return self._components().withdrawn.infos()
+        return self._components().withdrawn_providers.infos()
 
     def instantiate(
         self,
@@ -147,7 +149,7 @@ class System:
         parts = self._components()
         factory, named = parts.factory, (groups,) if isinstance(groups, str) else tuple(groups)
         if state is not None:
-            keys = parts.migration_target.bring_back(class_path, args, named, state)
+            keys = parts.migration_target.recreate(class_path, args, named, state)
             return tuple(map(parts.client.handle, keys))
         return factory.offer(factory.make(factory.find(class_path), args), named, args)
 
@@ -251,7 +253,9 @@ class System:
         """
         self._components().factory.terminate(service)
 
-    def terminate_container(self, reason: str = "", *, only_at_rest: bool = False, who: str = "itself") -> list[str]:
+    def terminate_container(
+        self, reason: str = "", *, only_at_rest: bool = False, identity: str = "itself"
+    ) -> list[str]:
         """Ends this container: its motion stops, and its services are withdrawn. Does not wait for its end.
 
         The process continues, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
@@ -259,7 +263,7 @@ class System:
         Args:
             reason: why, for people; it is logged.
             only_at_rest: not while one of its resources is locked or moves.
-            who: the requesting client; it is logged.
+            identity: the requesting client; it is logged.
 
         Returns:
             The stops that failed, with their reasons; the container ends nevertheless.
@@ -267,7 +271,7 @@ class System:
         Raises:
             InUse: a resource is locked or moves, with ``only_at_rest``.
         """
-        return self._components().shutdown.begin(reason, who, only_at_rest=only_at_rest)
+        return self._components().shutdown.begin(reason, identity, only_at_rest=only_at_rest)
 
     def load_policy(self, path: str) -> None:
         """Loads another access policy, or the same file again; calls under way continue.

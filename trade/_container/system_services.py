@@ -113,5 +113,5 @@ class SystemServices:
     def terminate_container(self, reason: str = "", only_at_rest: bool = False) -> list[str]:
         """End this container: stop what moves and withdraw its services; returns what could not be stopped, and why."""
         call = current_call()
-        who = "itself" if call is None else call.caller
-        return self._system.terminate_container(reason, only_at_rest=only_at_rest, who=who)
+        identity = "itself" if call is None else call.caller
+        return self._system.terminate_container(reason, only_at_rest=only_at_rest, identity=identity)

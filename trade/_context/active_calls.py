@@ -12,6 +12,7 @@ from msgspec import Raw
 from trade._context.sessions import within
 from trade._protocol.messages import Call, LargeBytes, Status, encode_message
 from trade._protocol.remote_errors import pack_error
+from trade._threads.scheduler import Scheduler
 from trade.errors import Cancelled, OutcomeUnknown
 
 _logger = logging.getLogger("trade")
@@ -21,6 +22,7 @@ GRACE_NS: Final = 5_000_000_000
 MOST_BYTES: Final = 64 << 20
 MOST_CALLS: Final = 65_536
 _MOST_CALLERS: Final = 1024
+_END_S: Final = 2.0
 
 Answer = tuple[int, Raw | LargeBytes]
 Key = tuple[str, int]
@@ -220,40 +222,39 @@ def failed(error: BaseException) -> Answer:
 
 
 class ProgressReporter:
-    """Sends the latest progress of each call, at most every 50 ms, on its own thread.
+    """Sends the latest progress of each call, at most every 50 ms, on a thread of the timers.
 
     The last progress goes out before the answer. `Dispatcher._send_progress` sends it.
     """
 
-    EVERY_S: Final = 0.05
+    EVERY_NS: Final = 50_000_000
 
-    def __init__(self, send: Callable[[ActiveCall, Raw], None]) -> None:
+    def __init__(self, send: Callable[[ActiveCall, Raw], None], timers: Scheduler) -> None:
         self._send = send
+        self._clock = timers.clock
         self._news = set[ActiveCall]()
         self._lock = threading.Lock()
-        self._some = threading.Event()
-        self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._next_ns = 0
+        """When it may send again."""
+        self._task = timers.due(self._send_news)
 
     def report(self, ongoing: ActiveCall, body: Raw) -> None:
         """Sends this soon, unless newer progress replaces it."""
         with self._lock:
             ongoing.unsent = body
             self._news.add(ongoing)
-            self._some.set()
-            if self._thread is None and not self._ended.is_set():
-                self._thread = threading.Thread(target=self._main, name="trade-progress", daemon=True)
-                self._thread.start()
+        self._task.by(self._next_ns)
 
-    def _main(self) -> None:
-        while not self._ended.is_set():
-            self._some.wait()
-            with self._lock:
-                self._some.clear()
-                news, self._news = self._news, set[ActiveCall]()
-            for ongoing in news:
-                self.send(ongoing)
-            self._ended.wait(self.EVERY_S)
+    def _send_news(self) -> int | None:
+        with self._lock:
+            now_ns = self._clock.now_ns()
+            if now_ns < self._next_ns:
+                return self._next_ns
+            self._next_ns = now_ns + self.EVERY_NS
+            news, self._news = self._news, set[ActiveCall]()
+        for ongoing in news:
+            self.send(ongoing)
+        return None
 
     def send(self, ongoing: ActiveCall) -> None:
         """Sends the latest progress of a call, unless it was sent or the call has ended."""
@@ -265,8 +266,5 @@ class ProgressReporter:
             ongoing.unsent = None
 
     def close(self) -> None:
-        """Ends the thread. Idempotent."""
-        self._ended.set()
-        self._some.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(2)
+        """Sends no more. Idempotent."""
+        self._task.cancel(_END_S)

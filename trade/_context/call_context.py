@@ -91,10 +91,10 @@ class CallContext(Struct, frozen=True, gc=False):
         time.sleep(allowed_s or 0.0)  # it cannot be cancelled
         return False
 
-    def on_cancel(self, tell: Callable[[], object]) -> None:
+    def on_cancel(self, callback: Callable[[], object]) -> None:
         """Calls this, on another thread, when its caller cancels the call; at once if that has happened."""
         if self.ongoing is not None:
-            self.ongoing.on_cancel(tell)
+            self.ongoing.on_cancel(callback)
 
     def raise_if_cancelled(self) -> None:
         """Raises Cancelled, the way to end a cancelled call, if its caller has cancelled it."""

@@ -33,7 +33,7 @@ class EndedSessions:
         """Records that an unreachable session is back."""
         self._reasons.pop(session, None)
 
-    def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
+    def session_error(self, sessions: Iterable[str]) -> SessionEnded | None:
         """The error of the first of these that has ended, or whose container has; None if all exist."""
         if self._reasons:
             for session in sessions:

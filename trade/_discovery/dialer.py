@@ -1,6 +1,6 @@
 """Links a running container to others, and makes it discoverable; the main session stays as it is.
 
-One thread, alive only while it has work: it looks for containers while discovery is on, and dials a configured endpoint
+One task, due only while it has work: it looks for containers while discovery is on, and dials a configured endpoint
 again whenever its link is gone.
 """
 
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade._threads.scheduler import NEVER, Scheduler
 from trade._transport.addresses import Attempt, Attempts
 from trade._transport.endpoints import Endpoint, accepts
 from trade._transport.interfaces import is_near
@@ -19,9 +20,10 @@ from trade.errors import CannotConnect, ConfigurationError, LinkStays
 
 _logger = logging.getLogger("trade")
 
-_ROUND_S: Final = 1.0
+_ROUND_NS: Final = 1_000_000_000
 _SCOUT_S: Final = 0.5
 _JOIN_S: Final = 2.0
+_END_S: Final = 5.0
 _AGAIN_S: Final = 5.0
 """A peer that refused a link is not dialled again for this long."""
 _REFUSED_S: Final = 3.0
@@ -35,6 +37,7 @@ class Dialer:
         self,
         links: Links,
         may_dial: Callable[[str], None],
+        timers: Scheduler,
         configured: Sequence[str] = (),
         attempts: Attempts | None = None,
     ) -> None:
@@ -53,11 +56,10 @@ class Dialer:
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
         self._attempts = attempts or Attempts(is_near)
-        self._thread: threading.Thread | None = None
-        self._wake = threading.Event()
+        self._clock = timers.clock
+        self._rounds = timers.due(self._round)
         self._closed = False
-        with self._lock:
-            self._ensure_thread()
+        self._rounds.by(0)
 
     @property
     def broadcasts(self) -> bool:
@@ -85,8 +87,7 @@ class Dialer:
             self._check_dials(on)
             self._discovering = on
             self._refused.clear()
-            self._ensure_thread()
-        self._wake.set()
+        self._rounds.by(0)
 
     def connect(self, endpoint: str) -> None:
         self._check_open()
@@ -99,7 +100,7 @@ class Dialer:
         with self._lock:
             self._check_open()
             self._kept[endpoint] = there
-            self._ensure_thread()
+        self._rounds.by(self._clock.now_ns() + _ROUND_NS)
 
     def disconnect(self, endpoint: str) -> None:
         """Stop dialling an endpoint; raises LinkStays while the link exists, as only closing an end removes it."""
@@ -172,30 +173,21 @@ class Dialer:
         known += [_BRIDGES] if self._links.bridges else []
         return "; ".join(known)
 
-    # --- the thread
-
-    def _ensure_thread(self) -> None:
-        if self._thread is None and self._has_work():
-            self._thread = threading.Thread(target=self._run, name="trade-reach", daemon=True)
-            self._thread.start()
+    # --- the task
 
     def _has_work(self) -> bool:
         return not self._closed and (self._discovering or bool(self._kept) or bool(self._unsure))
 
-    def _run(self) -> None:
-        while True:
-            with self._lock:
-                if not self._has_work():
-                    self._thread = None
-                    return
-            for step in (self._discover, self._redial, self._report_refusals):
-                try:
-                    step()
-                except Exception:
-                    if not self._closed:
-                        _logger.exception("looking for other containers failed; trying again")
-            self._wake.wait(_ROUND_S)
-            self._wake.clear()
+    def _round(self) -> float:
+        if not self._has_work():
+            return NEVER
+        for step in (self._discover, self._redial, self._report_refusals):
+            try:
+                step()
+            except Exception:
+                if not self._closed:
+                    _logger.exception("looking for other containers failed; trying again")
+        return self._clock.now_ns() + _ROUND_NS
 
     def _discover(self) -> None:
         if not self._discovering:
@@ -240,14 +232,11 @@ class Dialer:
             raise ConfigurationError(problem="the container is closed")
 
     def close(self) -> None:
-        """End the thread and the beacon. Idempotent."""
+        """Dial no more, and end the beacon. Idempotent."""
         with self._lock:
             self._closed = True
             self._dim()
-            thread = self._thread
-        self._wake.set()
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(5)
+        self._rounds.cancel(_END_S)
 
 
 _NO_LINK: Final = "no link was made in time"

@@ -3,12 +3,12 @@
 import contextlib
 import logging
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 from trade._discovery.host_folder import HostFolder
 from trade._discovery.hub_file import HubFile
-from trade._security.certificates import Certificate, ExpiryWatch
+from trade._security.certificates import Certificate
 from trade._security.network_crossings import crossings
 from trade._security.policy_file import read_policy
 from trade._security.zenoh_acl import acl
@@ -24,19 +24,13 @@ _logger = logging.getLogger("trade")
 _PORTS_TRIED: Final = 4
 
 
-def join(
-    settings: Settings,
-    certificate: Certificate | None,
-    leaving: contextlib.ExitStack,
-    warned: Callable[[str], None] = lambda _: None,
-) -> ZenohTransport:
+def join(settings: Settings, certificate: Certificate | None, leaving: contextlib.ExitStack) -> ZenohTransport:
     """Opens the transport, and adds to the stack what has to close with the container.
 
     Args:
         settings: of the container.
         certificate: of the container.
         leaving: the stack.
-        warned: called with each warning that the certificate ends.
     """
     networks = _networks(settings)
     transport = _attached(settings, certificate) or _join(settings, certificate, networks, leaving)
@@ -48,8 +42,6 @@ def join(
     most = MOST_STRANGERS if certificate is None else MOST_WITH_TLS
     guard = PortGuard((own.port for own in transport.links.listen), transport.links.count, most)
     leaving.callback(guard.close)
-    if certificate is not None:
-        leaving.callback(ExpiryWatch(certificate, warned).close)
     return transport
 
 

@@ -77,12 +77,12 @@ class LinkTable:
         links: Links | None,
         registry: Registry,
         answers: Callable[[Address], int],
-        tell: Tell,
+        callback: Tell,
     ) -> None:
         self._links = links
         self._registry = registry
         self._answers = answers
-        self._tell = tell
+        self._tell = callback
         self._looking = threading.Lock()
         self._seen: dict[Link, _Seen] = {}
 

@@ -21,6 +21,7 @@ from trade._protocol.messages import (
     decode_tally,
 )
 from trade._registry.registry import ContainerState, Registry
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import Answer, Channel, ChannelClosed, Message, Transport
 
 _logger = logging.getLogger("trade")
@@ -43,6 +44,7 @@ class RegistryListener:
         returned: Callable[[str], None],
         beat: Callable[[], None],
         learn: Callable[[Iterable[Estop], Address], None],
+        timers: Scheduler,
     ) -> None:
         self._registry = registry
         self._learn = learn
@@ -53,9 +55,9 @@ class RegistryListener:
         self.malformed = 0
         self._beat = beat
         self._stays_from = time.monotonic() + _STAYS_S
-        self._asker = Resynchronizer(transport, registry, self._answer, self._regularly)
+        self._asker = Resynchronizer(transport, registry, self._answer, self._regularly, timers)
         self._transport = transport
-        self._absences = GracePeriods(self._gone, transport.bridge_lost)
+        self._absences = GracePeriods(self._gone, transport.bridge_lost, timers)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
         for key in transport.present(ALIVE, _SYNC_S):
             self._sign(Message(key, b""))

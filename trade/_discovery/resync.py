@@ -1,14 +1,15 @@
 """Queries containers for their current announcements when one may have been missed."""
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from trade._protocol.keys import REGISTRY, Address, registry_key
 from trade._registry.registry import ContainerState, Registry
+from trade._threads.scheduler import NEVER, Scheduler
 from trade._transport.base import Answer, ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
@@ -20,40 +21,57 @@ _SLOW_ANSWER_S: Final = 10.0
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0
 """Between two queries to a container that is alive and does not reply, or announces nonsense."""
+_END_S: Final = 2.0
 
 Take = Callable[[Answer, dict[Address, ContainerState]], None]
 
 
 class Resynchronizer:
-    """One thread that sends queries; several requests for one container make one query.
+    """A task that sends queries; several requests for one container make one query.
 
-    A second thread, started with the first such case, queries slow containers, so that no other waits for them. The
-    first thread also calls `beat`, every ``Transport.beat_s``, to announce the container's own revision.
+    A second task queries slow containers, so that no other waits for them. The first one also calls `beat`, every
+    ``Transport.beat_s``, to announce the container's own revision.
     """
 
-    def __init__(self, transport: Transport, registry: Registry, take: Take, beat: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        registry: Registry,
+        take: Take,
+        beat: Callable[[], None],
+        timers: Scheduler,
+    ) -> None:
         self._transport = transport
         self._registry = registry
         self._take = take
         self._beat = beat
+        self._clock = timers.clock
         self._changed = threading.Condition()
         self._due: dict[Address, float] = {}
-        """When to query each container, in monotonic seconds."""
+        """When to query each container, in seconds of the clock."""
         self._pauses: dict[Address, float] = {}
         """Seconds until the next query, of those whose last reply was missing or incomplete."""
         self._slow: set[Address] = set()
         """Containers whose last reply did not come in time."""
         self._asking = False
         self._closed = False
-        self._next_beat = time.monotonic() + transport.beat_s
-        self._threads: list[threading.Thread] = []
+        self._next_beat = self._clock.now() + transport.beat_s
+        self._tasks = {slow: timers.due(partial(self._run, slow)) for slow in (False, True)}
+        self._started = False
 
     def start(self) -> None:
-        self._spawn("trade-asking", slow=False)
+        self._started = True
+        self._remind()
 
-    def _spawn(self, name: str, *, slow: bool) -> None:
-        self._threads.append(threading.Thread(target=self._run, args=(slow,), name=name, daemon=True))
-        self._threads[-1].start()
+    def _remind(self) -> None:
+        """Runs each task when its next work is due, which may have changed."""
+        for slow, task in self._tasks.items() if self._started else ():
+            task.by(self._next_ns(slow))
+
+    def _next_ns(self, slow: bool) -> float:
+        with self._changed:
+            soonest = min(self._mine(slow).values(), default=NEVER)
+            return NEVER if self._closed else (soonest if slow else min(soonest, self._next_beat)) * 1e9
 
     def request(self, address: Address, *, appeared: bool = False) -> None:
         """Schedule a query to a container; does not wait.
@@ -66,8 +84,8 @@ class Resynchronizer:
             if appeared:
                 self._due.pop(address, None)
                 self._forget(address)
-            self._due.setdefault(address, time.monotonic() + self._pauses.get(address, 0.0))
-            self._changed.notify_all()
+            self._due.setdefault(address, self._clock.now() + self._pauses.get(address, 0.0))
+        self._remind()
 
     @property
     def busy(self) -> bool:
@@ -81,39 +99,33 @@ class Resynchronizer:
             self._changed.wait_for(lambda: not self.busy, timeout_s)
 
     def _run(self, slow: bool) -> None:
-        while not self._closed:
-            try:
-                if not slow:
-                    self._beat_if_due()
-                self._ask(self._wait(slow), slow)
-            except ChannelClosed:
-                with self._changed:
-                    self._closed = True
-                    self._changed.notify_all()
-            except Exception:
-                _logger.exception("the query for current announcements failed")
+        try:
+            if not slow:
+                self._beat_if_due()
+            self._ask(self._take_due(slow), slow)
+        except ChannelClosed:
+            self._closed = True
+        except Exception:
+            _logger.exception("the query for current announcements failed")
+        with self._changed:
+            if not slow:
+                self._asking = False
+            self._changed.notify_all()
+        self._remind()
 
     def _beat_if_due(self) -> None:
-        if time.monotonic() >= self._next_beat:
-            self._next_beat = time.monotonic() + self._transport.beat_s
+        if self._clock.now() >= self._next_beat:
+            self._next_beat = self._clock.now() + self._transport.beat_s
             self._beat()
 
-    def _wait(self, slow: bool) -> list[Address]:
-        """Waits for containers to query; empty when other work is due."""
+    def _take_due(self, slow: bool) -> list[Address]:
+        """The containers to query now."""
         with self._changed:
-            if not slow and self._asking:
-                self._asking = False
-                self._changed.notify_all()
-            soonest = min(self._mine(slow).values(), default=math.inf)
-            left = (soonest if slow else min(soonest, self._next_beat)) - time.monotonic()
-            if left > 0 and not self._closed:
-                self._changed.wait(min(left, threading.TIMEOUT_MAX))
-            now = time.monotonic()
+            now = self._clock.now()
             due = [address for address, when in self._mine(slow).items() if when <= now]
             for address in due:
                 del self._due[address]
-            if not slow:
-                self._asking = bool(due)
+            self._asking = self._asking if slow else bool(due)
             return due
 
     def _mine(self, slow: bool) -> dict[Address, float]:
@@ -150,7 +162,7 @@ class Resynchronizer:
                     self._forget(address)
                 elif alive[address].heard.answered > before[address]:  # more has been missed meanwhile
                     self._forget(address)
-                    self._due[address] = time.monotonic()
+                    self._due[address] = self._clock.now()
                 else:
                     self._put_off(address, in_vain)
             self._changed.notify_all()
@@ -164,17 +176,14 @@ class Resynchronizer:
         """Query a container that is alive but does not reply less and less often."""
         pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
         self._pauses[address] = pause_s
-        self._due[address] = time.monotonic() + pause_s
+        self._due[address] = self._clock.now() + pause_s
         if in_vain:
             self._slow.add(address)
-            if len(self._threads) == 1 and not self._closed:
-                self._spawn("trade-asking-slow", slow=True)
 
     def close(self) -> None:
-        """End the threads. Idempotent."""
+        """Ask no more. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(2)
+        for task in self._tasks.values():
+            task.cancel(_END_S)

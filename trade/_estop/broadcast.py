@@ -25,7 +25,7 @@ _AGAIN_S: Final = 0.1
 Expected = Callable[[], set[Address]]
 
 
-class EstopReport(Struct, frozen=True):
+class EstopReport(Struct, frozen=True, rename={"without_services": "apart"}):
     """Which containers carried out an e-stop, or its clearing."""
 
     id: str
@@ -40,7 +40,7 @@ class EstopReport(Struct, frozen=True):
     """Those of the above that use another protocol version, with that version. Their services cannot be read here, so
     each of them counts as having something to stop. They ignore a clearing that does not use their own version."""
 
-    apart: tuple[str, ...] = ()
+    without_services: tuple[str, ...] = ()
     """Containers that did not list their services and, by the policy, may offer none: they have nothing to stop."""
 
     @property
@@ -59,16 +59,16 @@ class EstopBroadcast:
         self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
         self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
         self._channel = transport.subscribe(ESTOPS)
-        self._take: Callable[[EstopOrder, str], None] | None = None
-        self._asked: list[dict[str, dict[Address, str]]] = []
+        self._on_order: Callable[[EstopOrder, str], None] | None = None
+        self._requests: list[dict[str, dict[Address, str]]] = []
         """For each `ask` under way, by request: the containers that have confirmed it, with their problems."""
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
         self.malformed = 0
 
-    def listen(self, take: Callable[[EstopOrder, str], None]) -> None:
+    def listen(self, on_order: Callable[[EstopOrder, str], None]) -> None:
         """Begins to receive: calls this with each order and its giver's identity. Earlier orders wait until then."""
-        self._take = take
+        self._on_order = on_order
         self._thread.start()
 
     def confirm(self, request: str, problem: str) -> None:
@@ -83,7 +83,7 @@ class EstopBroadcast:
         orders: Sequence[EstopOrder],
         expected: Expected,
         limit_s: float,
-        over: Callable[[], bool],
+        is_done: Callable[[], bool],
         *,
         beyond: bool = True,
     ) -> EstopReport:
@@ -99,29 +99,29 @@ class EstopBroadcast:
         until = time.monotonic() + limit_s
         data = [encode_message(order) for order in orders]
         awaited: set[Address] = set()
-        heard: dict[str, dict[Address, str]] = {order.request: {} for order in orders}
+        confirmations: dict[str, dict[Address, str]] = {order.request: {} for order in orders}
         with self._changed:
-            self._asked.append(heard)
-        if (take := self._take) is not None:
+            self._requests.append(confirmations)
+        if (on_order := self._on_order) is not None:
             for order in orders:
-                take(order, self._own.identity)
-        while (left_s := until - time.monotonic()) > 0 and not over():
+                on_order(order, self._own.identity)
+        while (left_s := until - time.monotonic()) > 0 and not is_done():
             for payload in data if beyond else ():
                 self._orders.put(payload)
             awaited.update(expected())
             with self._changed:
-                if self._changed.wait_for(partial(_confirmed, awaited, heard), min(_AGAIN_S, left_s)):
+                if self._changed.wait_for(partial(_confirmed, awaited, confirmations), min(_AGAIN_S, left_s)):
                     break
         with self._changed:
-            self._asked = [one for one in self._asked if one is not heard]
-        return _report(orders, awaited, list(heard.values()))
+            self._requests = [one for one in self._requests if one is not confirmations]
+        return _report(orders, awaited, list(confirmations.values()))
 
     # --- hearing
 
     def _read(self) -> None:
         while True:
             try:
-                self._heard(self._channel.receive())
+                self._handle(self._channel.receive())
             except ChannelClosed:
                 return
             except (Malformed, msgspec.DecodeError) as bad:
@@ -131,24 +131,24 @@ class EstopBroadcast:
             except Exception:
                 _logger.exception("an e-stop message could not be processed")
 
-    def _heard(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         _, *chunks = message.key.split("/")
         if not all(map(is_chunk, chunks)):
             raise Malformed(f"{message.key!r} is a pattern")
-        if len(chunks) == 1 and self._take is not None:
+        if len(chunks) == 1 and self._on_order is not None:
             order = decode_estop_order(message.payload or b"", chunks[0])
             denied = self._access.denied_order(chunks[0], clears=order.opened is None)
             if denied is not None:
                 self._audit.refused("trade.estop" if order.opened else "trade.estop_clear", denied, who=chunks[0])
                 raise Malformed(str(denied))
-            self._take(order, chunks[0])
+            self._on_order(order, chunks[0])
         elif len(chunks) == 3:
-            self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
+            self._handle_confirmation(Address(*chunks), decode_estop_confirmed(message.payload or b""))
 
-    def _hear_confirmed(self, address: Address, confirmed: EstopConfirmed) -> None:
+    def _handle_confirmation(self, address: Address, confirmed: EstopConfirmed) -> None:
         with self._changed:
-            for asked in self._asked:
-                if (heard := asked.get(confirmed.request)) is not None:
+            for confirmations in self._requests:
+                if (heard := confirmations.get(confirmed.request)) is not None:
                     heard[address] = confirmed.problem
             self._changed.notify_all()
 
@@ -161,36 +161,40 @@ class EstopBroadcast:
 
 def as_seen_here(report: EstopReport) -> EstopReport:
     """A report of another container, which may have another protocol version, with versions as this one names them."""
-    return structs.replace(report, versions={who: one for who, one in report.versions.items() if one != PROTOCOL})
+    return structs.replace(
+        report, versions={container: one for container, one in report.versions.items() if one != PROTOCOL}
+    )
 
 
 def all_of(estop_id: str, reports: Iterable[EstopReport]) -> EstopReport:
     """Merges the reports of several containers about one e-stop: one confirmation of a container is enough."""
     confirmed, missing = set[str](), set[str]()
-    failed, versions, apart = dict[str, str](), dict[str, int](), set[str]()
+    failed, versions, without_services = dict[str, str](), dict[str, int](), set[str]()
     for report in reports:
         confirmed.update(report.confirmed)
         missing.update(report.missing)
         failed.update(report.failed)
         versions.update(report.versions)
-        apart.update(report.apart)
+        without_services.update(report.without_services)
     confirmed -= failed.keys()
     missing -= confirmed | failed.keys()
-    apart -= confirmed | missing | failed.keys()
+    without_services -= confirmed | missing | failed.keys()
     return EstopReport(
-        estop_id, tuple(sorted(confirmed)), tuple(sorted(missing)), failed, versions, tuple(sorted(apart))
+        estop_id, tuple(sorted(confirmed)), tuple(sorted(missing)), failed, versions, tuple(sorted(without_services))
     )
 
 
-def _confirmed(awaited: set[Address], heard: Mapping[str, Mapping[Address, str]]) -> bool:
-    return bool(awaited) and all(awaited <= who.keys() for who in heard.values())
+def _confirmed(awaited: set[Address], confirmations: Mapping[str, Mapping[Address, str]]) -> bool:
+    return bool(awaited) and all(awaited <= confirmation.keys() for confirmation in confirmations.values())
 
 
-def _report(orders: Sequence[EstopOrder], awaited: set[Address], heard: Sequence[Mapping[Address, str]]) -> EstopReport:
+def _report(
+    orders: Sequence[EstopOrder], awaited: set[Address], confirmations: Sequence[Mapping[Address, str]]
+) -> EstopReport:
     """The report of orders that were given together, from the confirmations of each."""
-    done = awaited.intersection(*heard)
+    done = awaited.intersection(*confirmations)
     problems: dict[Address, str] = {}
-    for address, problem in chain.from_iterable(one.items() for one in heard):
+    for address, problem in chain.from_iterable(one.items() for one in confirmations):
         problems[address] = "; ".join(filter(None, (problems.get(address, ""), problem)))
     names = (order.cleared if order.opened is None else (order.opened.id,) for order in orders)
     return EstopReport(

@@ -68,20 +68,20 @@ class EstopController:
         self._registry = registry
         self._providers = providers
         self._access = access
-        self._line = EstopBroadcast(transport, own, access, audit)
+        self._broadcast = EstopBroadcast(transport, own, access, audit)
         self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources, audit)
         self._estops = EstopLatch(
             table,
             self.deadman,
             EstopStore(settings, own),
-            self._line.confirm,
+            self._broadcast.confirm,
             self._publish,
             lambda: bool(providers.stops()),
             audit,
         )
         self._provider: object = None
-        self._beside: Beside | None = None
-        self._through: Beside | None = None
+        self._stop_lines: Beside | None = None
+        self._other_containers: Beside | None = None
 
     def open_here(self) -> tuple[Estop, ...]:
         """The e-stops that are open in this container."""
@@ -100,15 +100,15 @@ class EstopController:
             through: begins it in other containers, which may see more.
         """
         self._provider = provider
-        self._beside = lines
-        self._through = through
-        self._registry.changes.subscribe(self._heard)
-        self._line.listen(self._estops.take)
+        self._stop_lines = lines
+        self._other_containers = through
+        self._registry.changes.subscribe(self._on_change)
+        self._broadcast.listen(self._estops.take)
 
     @property
     def malformed(self) -> int:
         """The number of messages that were dropped."""
-        return self._line.malformed
+        return self._broadcast.malformed
 
     # --- asking
 
@@ -137,21 +137,21 @@ class EstopController:
             if way is not None:
                 others.append(way(estop.id, estop.reason, max(0.1, until - time.monotonic())))
 
-        def over() -> bool:
+        def is_done() -> bool:
             nonlocal rounds
             rounds += 1
             if rounds == 2:  # the links alone did not do it at once
-                begin(self._beside)
+                begin(self._stop_lines)
             if rounds == _SOON_ROUNDS:
-                begin(self._through)
+                begin(self._other_containers)
             return self._estops.is_cleared(estop.id) or self._is_done(
                 all_of(estop.id, [one.report() for one in others])
             )
 
-        report = self._line.ask([order], self._awaited, limit_s, over)
+        report = self._broadcast.ask([order], self._awaited, limit_s, is_done)
         if not others:
-            begin(self._beside)  # for containers without a link
-        done = report.complete and any(who != self._own.who for who in report.confirmed)
+            begin(self._stop_lines)  # for containers without a link
+        done = report.complete and any(container != self._own.who for container in report.confirmed)
         found = [one.report() if done else one.wait() for one in others]
         return self._with_versions(all_of(estop.id, [report, *found]))
 
@@ -171,10 +171,14 @@ class EstopController:
         order = EstopOrder(PROTOCOL, estop_id, mine)
         expected = self._awaited if beyond else lambda: {self._own}
         cleared = partial(self._estops.is_cleared, estop_id)
-        report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
+        report = self._broadcast.ask([order], expected, limit_s, cleared, beyond=beyond)
         named = {*report.confirmed, *report.missing, *report.failed}
         known = {state.address.who: state.protocol for state in self._registry.containers() if state.protocol}
-        versions = {who: version for who, version in {**known, self._own.who: PROTOCOL}.items() if who in named}
+        versions = {
+            container: version
+            for container, version in {**known, self._own.who: PROTOCOL}.items()
+            if container in named
+        }
         return structs.replace(self._with_versions(report), versions=versions)
 
     def subscribe(self, callback: Callable[[Estop], str]) -> None:
@@ -198,7 +202,7 @@ class EstopController:
         reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
         mine = Estop(estop.id, str(self._own), reason, estop.at)
         order = EstopOrder(PROTOCOL, estop.id, mine)
-        report = self._line.ask([order], self._awaited, LIMIT_S, lambda: self._estops.is_cleared(estop.id))
+        report = self._broadcast.ask([order], self._awaited, LIMIT_S, lambda: self._estops.is_cleared(estop.id))
         if report.missing or report.failed:
             _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
         failed = [f"{name}: {problem}" for name, problem in report.failed.items()]
@@ -248,7 +252,7 @@ class EstopController:
         def expected() -> set[Address]:
             return {*self._with_stops(), *self._unread(), *before, *knowing()}
 
-        report = self._line.ask(orders, expected, limit_s, lambda: False)
+        report = self._broadcast.ask(orders, expected, limit_s, lambda: False)
         self._registry.wait_for(lambda: not self._still_reported(ids, report.confirmed), _ENTRY_LAG_S)
         unheeding = (state for state in self._others() if any(estop.id in ids for estop in state.open_estops()))
         names = {state.address.who for state in unheeding}
@@ -262,7 +266,7 @@ class EstopController:
         return structs.replace(
             report,
             versions={name: there[name] for name in sorted(there) if name in named},
-            apart=tuple(sorted({address.who for address in unable} - named)),
+            without_services=tuple(sorted({address.who for address in unable} - named)),
         )
 
     def _still_reported(self, ids: Sequence[str], by: Sequence[str]) -> bool:
@@ -321,7 +325,7 @@ class EstopController:
             if reporter != self._own:
                 self._estops.learn(estops, reporter)
 
-    def _heard(self, change: Change) -> None:
+    def _on_change(self, change: Change) -> None:
         """Handles a change of the registry."""
         for record in (*change.joined, *change.replaced):
             if record.estops and not record.local:
@@ -331,7 +335,7 @@ class EstopController:
 
     def close(self) -> None:
         """Takes no more orders. Idempotent."""
-        self._line.close()
+        self._broadcast.close()
         self._estops.close()
 
 

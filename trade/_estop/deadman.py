@@ -46,19 +46,19 @@ class Deadman:
     def rest(self, resources: Sequence[Resource], reason: str) -> list[str]:
         """Stops those of these that move, and waits for it; returns what could not be stopped, and why."""
         busy = [one for one in resources if one.busy and self._stop_of(one) is not None]
-        problems, over = list[str](), threading.Semaphore(0)
+        problems, stops = list[str](), threading.Semaphore(0)
 
-        def done(resource: Resource, problem: str) -> None:
+        def on_stopped(resource: Resource, problem: str) -> None:
             if problem:
                 problems.append(f"{resource.name}: {problem}")
-            over.release()
+            stops.release()
 
-        self.stop(busy, reason, done)
+        self.stop(busy, reason, on_stopped)
         for _ in busy:
-            over.acquire(timeout=2 * _STOP_S)
+            stops.acquire(timeout=2 * _STOP_S)
         return problems
 
-    def stop(self, resources: Sequence[Resource], reason: str, done: Callable[[Resource, str], None]) -> None:
+    def stop(self, resources: Sequence[Resource], reason: str, on_stopped: Callable[[Resource, str], None]) -> None:
         """Makes permits for these void, asks their calls to end, and stops them; does not wait.
 
         Args:
@@ -71,7 +71,7 @@ class Deadman:
             resource.stop("trade", (), reason)
             service = self._stop_of(resource)
             if service is None:  # nothing physical: its calls are asked to end
-                done(resource, "")
+                on_stopped(resource, "")
             else:
                 by_stop.setdefault(service, []).append(resource)
         _ask_to_end(resources)
@@ -79,9 +79,9 @@ class Deadman:
             names = [resource.name for resource in stopped]
             self._audit.note("stop", service.label, about=names, why=reason)
             _logger.warning("stopping %s: %s", ", ".join(names), reason)
-            self._begin(service, _each(stopped, done))
+            self._begin(service, _each(stopped, on_stopped))
 
-    def everything(self, done: Callable[[list[str]], None]) -> None:
+    def everything(self, on_stopped: Callable[[list[str]], None]) -> None:
         """Asks all calls to end and calls every stop service, a shared one once; does not wait.
 
         A resource that could not be stopped is unsafe from then on (S14).
@@ -96,9 +96,9 @@ class Deadman:
             service = self._stop_of(resource)
             if service is not None:
                 stops.setdefault(service, []).append(resource)
-        together = _StopGroup(stops, done)
+        stop_group = _StopGroup(stops, on_stopped)
         for service in stops:
-            self._begin(service, together.ended_by(service))
+            self._begin(service, stop_group.ended_by(service))
 
     def _begin(self, service: LocalService, ended: Callable[[str], None]) -> None:
         threading.Thread(target=self._stop, args=(service, ended), name="trade-deadman", daemon=True).start()
@@ -125,19 +125,21 @@ class Deadman:
 class _StopGroup:
     """Stops that began together, until the last one is over."""
 
-    def __init__(self, stops: Mapping[LocalService, Sequence[Resource]], done: Callable[[list[str]], None]) -> None:
+    def __init__(
+        self, stops: Mapping[LocalService, Sequence[Resource]], on_stopped: Callable[[list[str]], None]
+    ) -> None:
         self._stops = stops
-        self._done = done
+        self._on_stopped = on_stopped
         self._left = set(stops)
         self._problems: list[str] = []
         self._guard = threading.Lock()
         if not stops:
-            done([])
+            on_stopped([])
 
     def ended_by(self, service: LocalService) -> Callable[[str], None]:
-        return lambda problem: self._over(service, problem)
+        return lambda problem: self._service_stopped(service, problem)
 
-    def _over(self, service: LocalService, problem: str) -> None:
+    def _service_stopped(self, service: LocalService, problem: str) -> None:
         """Takes the first result of each service; later ones do not count."""
         with self._guard:
             if service not in self._left:
@@ -149,13 +151,13 @@ class _StopGroup:
         for resource in self._stops[service] if problem else ():
             resource.stop_ended(problem)
         if last:
-            self._done(self._problems)
+            self._on_stopped(self._problems)
 
 
-def _each(resources: Sequence[Resource], done: Callable[[Resource, str], None]) -> Callable[[str], None]:
+def _each(resources: Sequence[Resource], on_stopped: Callable[[Resource, str], None]) -> Callable[[str], None]:
     def ended(problem: str) -> None:
         for resource in resources:
-            done(resource, problem)
+            on_stopped(resource, problem)
 
     return ended
 

@@ -101,12 +101,12 @@ class EstopLatch:
             self._relays = [one for one in self._relays if one is not relay]
             relay.close()
 
-    def take(self, order: EstopOrder, who: str) -> None:
+    def take(self, order: EstopOrder, identity: str) -> None:
         """Carries out an identity's order, without waiting; a repeated order is confirmed again."""
         with self._guard:
             known = self._ledger.knows(order.request)
             if known and order.opened is not None:
-                self._ledger.hear(order.opened)
+                self._ledger.update_report(order.opened)
             answer = self._ledger.answer(order.request) if known else None
             if not known:
                 self._start(order.request, order.opened)
@@ -115,7 +115,7 @@ class EstopLatch:
         elif not known and order.opened is not None:
             self._begin(order.opened)
         elif not known:
-            self._clear(order.request, order.cleared, who)
+            self._clear(order.request, order.cleared, identity)
 
     def learn(self, estops: Iterable[Estop], reporter: Address) -> None:
         """Opens the open e-stops of another container, except those that were cleared here."""
@@ -139,9 +139,9 @@ class EstopLatch:
 
     def _begin(self, estop: Estop) -> None:
         reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
-        who = foreign(estop.by) or identity_of(estop)
+        identity = foreign(estop.by) or identity_of(estop)
         why = f"{estop.reason} (reported by {estop.told_by})".lstrip() if estop.told_by else estop.reason
-        self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=why)
+        self._audit.note("stop", "e-stop", about=estop.id, who=identity, session=estop.by, why=why)
         with self._guard:
             self._latch()
             fresh = self._round is None or not self._round.serves
@@ -170,8 +170,8 @@ class EstopLatch:
 
     # --- clearing
 
-    def _clear(self, request: str, ids: Sequence[str], who: str) -> None:
-        self._audit.note("stop", "e-stop cleared", about=list(ids), who=who)
+    def _clear(self, request: str, ids: Sequence[str], identity: str) -> None:
+        self._audit.note("stop", "e-stop cleared", about=list(ids), who=identity)
         with self._guard:
             self._ledger.clear(ids)
             if not self._ledger.open:
@@ -205,32 +205,32 @@ class EstopLatch:
         if replaced and (early_s := self._finished + SHARED_S - time.monotonic()) > 0:
             return early_s  # too many e-stops: each report of one costs every container
         for one in pending:
-            self._note(one)
+            self._persist(one)
         if problem := self._removed([name for name in replaced if not self.is_open(name)]):
             _logger.error("an e-stop that a newer one has replaced %s", problem)
         del self._ledger.replaced[: len(replaced)]
-        over = [(one, result) for one in pending if (result := one.result()) is not None]
-        if over:
-            self._done(over)
+        finished = [(one, result) for one in pending if (result := one.result()) is not None]
+        if finished:
+            self._finish(finished)
         return _LOOK_AGAIN_S if self._pending else None
 
-    def _note(self, one: Pending) -> None:
-        if one.noted:
+    def _persist(self, pending_request: Pending) -> None:
+        if pending_request.noted:
             return
-        one.noted = True
-        if one.opened is None:
-            one.problem = self._removed(one.cleared)
-        elif self._keeps() and self.is_open(one.opened.id):
-            one.problem = self._written(one.opened)
+        pending_request.noted = True
+        if pending_request.opened is None:
+            pending_request.problem = self._removed(pending_request.cleared)
+        elif self._keeps() and self.is_open(pending_request.opened.id):
+            pending_request.problem = self._written(pending_request.opened)
 
-    def _done(self, over: Sequence[tuple[Pending, str]]) -> None:
+    def _finish(self, finished: Sequence[tuple[Pending, str]]) -> None:
         with self._guard:
-            for one, problem in over:
+            for one, problem in finished:
                 self._ledger.answered(one.request, problem)
                 self._pending.pop(one.request, None)
         self._finished = time.monotonic()
         self._changed()  # first: a client with all confirmations may look at the entries at once
-        for one, problem in over:
+        for one, problem in finished:
             if problem:
                 _logger.error("e-stop %s: %s", one.request, problem)
             self._confirm(one.request, problem)

@@ -59,7 +59,7 @@ class Ledger:
                 self.replaced.append(its[-1].id)
         return _without_the_oldest(self._answers)
 
-    def hear(self, given: Estop) -> None:
+    def update_report(self, given: Estop) -> None:
         """Takes the giver's own order after another container's report of it."""
         there = self.open.get(given.id)
         if there is not None and there.told_by and there.by == given.by:

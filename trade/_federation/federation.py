@@ -95,7 +95,7 @@ class Federation:
         """Raises SessionEnded if the session has ended or its container is not present."""
         address = Address(*session.split("/")[:3])
         there = self._registry.wait_for(lambda: self._registry.is_alive(address), _PATIENCE_S)
-        if (ended := self._locks.gone((session,))) is not None:
+        if (ended := self._locks.session_error((session,))) is not None:
             raise ended
         if not there:
             raise SessionEnded(session=session, reason="its container is not in this system")

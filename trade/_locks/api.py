@@ -15,7 +15,7 @@ from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, as_constraint, group_at, under
 from trade._resources.grants import LockInfo, LockRequest
 from trade._table import Table
-from trade._transport.wait_clock import WaitClock
+from trade._threads.scheduler import Scheduler
 from trade.errors import (
     Busy,
     ConfigurationError,
@@ -59,9 +59,9 @@ class LockOverview(NamedTuple):
 class LockApi:
     """The lock methods of one container; ``container.lock_api``."""
 
-    def __init__(self, client: CallClient, clock: WaitClock) -> None:
+    def __init__(self, client: CallClient, timers: Scheduler) -> None:
         self._client = client
-        self.lease_client: Final = LeaseClient(client, clock)
+        self.lease_client: Final = LeaseClient(client, timers)
 
     def lock(
         self,

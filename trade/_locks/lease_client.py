@@ -17,7 +17,7 @@ from trade._locks.lock import Lock, in_own_thread
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._resources.grants import LockRequest
-from trade._transport.wait_clock import WaitClock
+from trade._threads.scheduler import Scheduler
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0
@@ -25,19 +25,18 @@ _ANSWER_S: Final = 2.0
 _AGAIN_S: Final = 0.1
 _BEATS: Final = 4
 """Renewals within one lease."""
+_END_S: Final = 2.0
 
 
 class LeaseClient:
-    """All locks of a container, and the thread that renews them."""
+    """All locks of a container, and the timer that renews them."""
 
-    def __init__(self, client: CallClient, clock: WaitClock) -> None:
+    def __init__(self, client: CallClient, timers: Scheduler) -> None:
         self._client = client
-        self.clock: Final = clock
+        self.clock: Final = timers.clock
         self._locks: list[Lock] = []
-        self._changed = threading.Condition()
-        self._thread: threading.Thread | None = None
-        self._due = math.inf
-        """When the next renewals are sent."""
+        self._guard = threading.Lock()
+        self._renewals = timers.due(self._renew_all)
         self._closed = False
 
     @property
@@ -114,7 +113,7 @@ class LeaseClient:
         Returns:
             Whether it was held until then, by those containers that answer.
         """
-        with self._changed:
+        with self._guard:
             if lock in self._locks:
                 self._locks.remove(lock)
         return self._give_back(lock, lost)
@@ -134,31 +133,16 @@ class LeaseClient:
     # --- keeping
 
     def _keep(self, lock: Lock) -> None:
-        with self._changed:
+        with self._guard:
             self._locks.append(lock)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="trade-locks", daemon=True)
-                self._thread.start()
-            if self.clock.now() + lock.lease_s / _BEATS < self._due:
-                self.clock.expect(self._changed)
-                self._changed.notify_all()
+        self._renewals.by(_renewal_ns(self.clock.now(), [lock]))
 
-    def _run(self) -> None:
-        renewed = self.clock.now()
-        while True:
-            with self._changed:
-                while not self._closed:
-                    self._due = renewed + min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
-                    left_s = self._due - self.clock.now()
-                    if left_s <= 0:
-                        break
-                    self.clock.wait(self._changed, None if left_s == math.inf else left_s)
-                if self._closed:
-                    self.clock.arrived()
-                    return
-                locks = list(self._locks)
-            renewed = self.clock.now()
-            self._renew(locks)
+    def _renew_all(self) -> float:
+        with self._guard:
+            locks = list(self._locks)
+        began = self.clock.now()
+        self._renew(locks)
+        return _renewal_ns(began, locks)
 
     def _renew(self, locks: Sequence[Lock]) -> None:
         """Sends one renewal to each container, for all its locks; does not wait for the answers."""
@@ -202,7 +186,7 @@ class LeaseClient:
 
     def lost(self, address: Address) -> None:
         """Loses, as a whole, the locks with a part in a container that has ended or cannot be reached (S14)."""
-        with self._changed:
+        with self._guard:
             hit = [lock for lock in self._locks if address in lock.granted]
         for lock in hit:
             lock.drop(address)
@@ -210,7 +194,7 @@ class LeaseClient:
 
     def asked(self, token: Token, who: str, reason: str) -> bool:
         """Takes a release request for a grant. Returns whether its owner handles requests."""
-        with self._changed:
+        with self._guard:
             found = next((lock for lock in self._locks if token in lock.granted.values()), None)
         if found is None or found.on_request is None:
             return False
@@ -218,14 +202,18 @@ class LeaseClient:
         return True
 
     def close(self) -> None:
-        """Releases all locks and ends the thread. Idempotent."""
-        with self._changed:
+        """Releases all locks, and renews none any more. Idempotent."""
+        self._renewals.cancel()
+        with self._guard:
             locks, self._closed = list(self._locks), True
-            self._changed.notify_all()
         for lock in locks:
             lock.release()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(2)
+        self._renewals.cancel(_END_S)
+
+
+def _renewal_ns(now: float, locks: Sequence[Lock]) -> float:
+    """When locks that were renewed now are renewed again, in nanoseconds of the clock."""
+    return (now + min((lock.lease_s for lock in locks), default=math.inf) / _BEATS) * 1e9
 
 
 def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Callable[[], Any]]]:

@@ -19,7 +19,7 @@ from trade.errors import LockLost
 
 Wanted = Mapping[Address, Sequence[str]]
 """Resources of one other system, by the container that grants their locks."""
-Wish = Callable[[int, str, str], None]
+OnReleaseRequest = Callable[[int, str, str], None]
 """Takes a release request for the locks behind a grant: the grant, the requesting client and the reason."""
 
 
@@ -36,13 +36,13 @@ class RemoteSystem(Protocol):
 class SharedResource(Resource):
     """A resource of another system, as it is known here."""
 
-    __slots__ = ("__weakref__", "home", "home_name", "lender")
+    __slots__ = ("__weakref__", "home", "home_name", "remote_system")
 
-    def __init__(self, name: str, home: Address, home_name: str, lender: RemoteSystem) -> None:
+    def __init__(self, name: str, home: Address, home_name: str, remote_system: RemoteSystem) -> None:
         super().__init__(name)
         self.home: Final = home
         self.home_name: Final = home_name
-        self.lender: Final = lender
+        self.remote_system: Final = remote_system
 
     def stop(
         self,
@@ -59,9 +59,9 @@ class SharedResource(Resource):
 class RemoteLock:
     """The locks in other systems behind one grant."""
 
-    def __init__(self, borrowed: "RemoteLocks", wish: Wish) -> None:
-        self._borrowed = borrowed
-        self._wish = wish
+    def __init__(self, remote_locks: "RemoteLocks", on_request: OnReleaseRequest) -> None:
+        self._remote_locks = remote_locks
+        self._on_request = on_request
         self.number = 0
         """The number of the grant; 0 while it has none."""
         self.locks: list[Lock] = []
@@ -72,15 +72,15 @@ class RemoteLock:
         """Binds them to that grant. Raises LockLost if one of the two no longer holds."""
         if granted.token is not None and self.locks:
             self.number = granted.token.number
-            self._borrowed.keep(self)
+            self._remote_locks.keep(self)
 
-    def lost(self, why: LockLost) -> None:
+    def on_lost(self, error: LockLost) -> None:
         """Handles the loss of a lock in another system."""
-        self._borrowed.lose(self.number, why.reason)
+        self._remote_locks.lose(self.number, error.reason)
 
-    def asked(self, who: str, reason: str) -> None:
+    def on_release_request(self, client: str, reason: str) -> None:
         """Handles a release request from another system."""
-        self._wish(self.number, who, reason)
+        self._on_request(self.number, client, reason)
 
     def release(self) -> None:
         """Releases them, in no client's context."""
@@ -94,38 +94,44 @@ class RemoteLocks:
     def __init__(self, table: LockTable, epoch: str) -> None:
         self._table = table
         self._epoch = epoch
-        self._loans: dict[int, RemoteLock] = {}
+        self._by_grant: dict[int, RemoteLock] = {}
         table.on_loss(self._lost)
 
     @contextlib.contextmanager
-    def behind(
-        self, call: CallContext, resources: Iterable[Resource], terms: LockRequest, wish: Wish
+    def acquire(
+        self, call: CallContext, resources: Iterable[Resource], terms: LockRequest, on_request: OnReleaseRequest
     ) -> Generator[RemoteLock, None, None]:
         """Locks the shared ones of these at their homes; releases them unless they are bound to a grant then.
 
         Raises:
             TradeError: the error of the home.
         """
-        loan, begun = RemoteLock(self, wish), time.monotonic()
+        remote_lock, begun = RemoteLock(self, on_request), time.monotonic()
         try:
-            for lender, wanted in _by_lender(resources).items():
-                left = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
-                loan.locks.append(lender.lock(call, wanted, left, loan.lost, loan.asked))
-                loan.waited_s = time.monotonic() - begun
-            yield loan
+            for remote_system, wanted in _by_system(resources).items():
+                remaining = structs.replace(terms, wait_s=max(0.0, terms.wait_s - remote_lock.waited_s))
+                remote_lock.locks.append(
+                    remote_system.lock(call, wanted, remaining, remote_lock.on_lost, remote_lock.on_release_request)
+                )
+                remote_lock.waited_s = time.monotonic() - begun
+            yield remote_lock
         finally:
-            if not loan.number:
-                loan.release()
+            if not remote_lock.number:
+                remote_lock.release()
 
-    def keep(self, loan: RemoteLock) -> None:
+    def keep(self, remote_lock: RemoteLock) -> None:
         """Keeps the locks of a grant. Raises LockLost if one of them, or the grant, no longer holds."""
-        number = loan.number
-        self._loans[number] = loan
-        reason = self._table.over(number) or next((_lapsed(lock) for lock in loan.locks if not lock.held), "")
+        number = remote_lock.number
+        self._by_grant[number] = remote_lock
+        reason = self._table.why_ended(number) or next(
+            (_lapsed(lock) for lock in remote_lock.locks if not lock.held), ""
+        )
         if reason:
-            self._loans.pop(number, None)
-            loan.number = 0
-            raise LockLost(resources=tuple(name for lock in loan.locks for name in lock.resources), reason=reason)
+            self._by_grant.pop(number, None)
+            remote_lock.number = 0
+            raise LockLost(
+                resources=tuple(name for lock in remote_lock.locks for name in lock.resources), reason=reason
+            )
 
     def lose(self, number: int, reason: str) -> None:
         """Revokes a grant, because a lock behind it is lost."""
@@ -134,17 +140,17 @@ class RemoteLocks:
 
     def _lost(self, number: int, reason: str) -> None:
         """Gives up the locks behind a revoked grant, so that their motion stops, too; called by the table."""
-        loan = self._loans.pop(number, None)
-        for lock in () if loan is None else loan.locks:
+        remote_lock = self._by_grant.pop(number, None)
+        for lock in () if remote_lock is None else remote_lock.locks:
             lock.lose(reason)
 
-    def give_back(self, number: int) -> None:
+    def release(self, number: int) -> None:
         """Releases the locks behind a released grant."""
-        loan = self._loans.pop(number, None)
-        if loan is not None:
-            loan.release()
+        remote_lock = self._by_grant.pop(number, None)
+        if remote_lock is not None:
+            remote_lock.release()
 
-    def shown(self, call: CallContext) -> tuple[Lock, ...]:
+    def of_call(self, call: CallContext) -> tuple[Lock, ...]:
         """The locks in other systems behind the tokens of a call."""
         return tuple(lock for token in call.tokens if self._may_show(call, token) for lock in self._behind(token))
 
@@ -152,23 +158,23 @@ class RemoteLocks:
         return token.epoch == self._epoch and self._table.may_use(token.number, call.caller)
 
     def _behind(self, token: Token) -> Sequence[Lock]:
-        loan = self._loans.get(token.number)
-        return () if loan is None else loan.locks
+        remote_lock = self._by_grant.get(token.number)
+        return () if remote_lock is None else remote_lock.locks
 
     def resume(self, call: CallContext, resources: Iterable[Resource]) -> list[str]:
         """Resumes the shared ones of these; returns those that were stopped, by their names here."""
         shared = [one for one in resources if isinstance(one, SharedResource)]
-        return [one.name for one in shared if one.lender.resume(call, one.home, [one.home_name])]
+        return [one.name for one in shared if one.remote_system.resume(call, one.home, [one.home_name])]
 
     def request_release(self, call: CallContext, resources: Iterable[Resource], reason: str) -> list[str]:
         """Asks the owners of the shared ones of these to release them; returns who was asked."""
-        asked = [
-            who
-            for lender, wanted in _by_lender(resources).items()
+        clients = [
+            client
+            for remote_system, wanted in _by_system(resources).items()
             for address, names in wanted.items()
-            for who in lender.request_release(call, address, names, reason)
+            for client in remote_system.request_release(call, address, names, reason)
         ]
-        return list(dict.fromkeys(asked))
+        return list(dict.fromkeys(clients))
 
 
 def _lapsed(lock: Lock) -> str:
@@ -179,9 +185,9 @@ def _lapsed(lock: Lock) -> str:
     return "it was given back"
 
 
-def _by_lender(resources: Iterable[Resource]) -> dict[RemoteSystem, dict[Address, list[str]]]:
+def _by_system(resources: Iterable[Resource]) -> dict[RemoteSystem, dict[Address, list[str]]]:
     found: dict[RemoteSystem, dict[Address, list[str]]] = {}
     for one in resources:
         if isinstance(one, SharedResource):
-            found.setdefault(one.lender, {}).setdefault(one.home, []).append(one.home_name)
+            found.setdefault(one.remote_system, {}).setdefault(one.home, []).append(one.home_name)
     return found

@@ -24,9 +24,9 @@ _MOST_WAITING: Final = 24
 
 GroupsOf = Callable[[str], set[str]]
 """The groups of the services that use a resource."""
-Ask = Callable[[Holder, Token, str, str], None]
+SendReleaseRequest = Callable[[Holder, Token, str, str], None]
 """Passes a release request to the holder of a grant: the holder, the grant, the requesting client and the reason."""
-Asked = Callable[[Token, str, str], bool]
+OnReleaseRequested = Callable[[Token, str, str], bool]
 """Takes such a request for a lock of this container; returns whether its owner handles requests."""
 
 
@@ -37,20 +37,20 @@ class LockServices:
         self,
         table: LockTable,
         own: Address,
-        ask: Ask,
-        asked: Asked,
+        send_request: SendReleaseRequest,
+        on_release_requested: OnReleaseRequested,
         access: Authorizer,
         groups: GroupsOf,
-        borrowed: RemoteLocks,
+        remote_locks: RemoteLocks,
     ) -> None:
         self._table = table
-        self._borrowed = borrowed
+        self._remote_locks = remote_locks
         self._access = access
         self._groups = groups
         self._own = own
-        self._ask = ask
-        self._asked = asked
-        self._places = threading.BoundedSemaphore(_MOST_WAITING)
+        self._send_request = send_request
+        self._on_release_requested = on_release_requested
+        self._slots = threading.BoundedSemaphore(_MOST_WAITING)
 
     @service
     def acquire(self, resources: list[str], terms: LockRequest) -> Granted:
@@ -67,35 +67,37 @@ class LockServices:
             since=time.time(),
             delegates=terms.delegates,
         )
-        if not self._places.acquire(blocking=False):
+        if not self._slots.acquire(blocking=False):
             raise Busy(service="trade.acquire", container=self._own.container)
         terms = structs.replace(terms, wait_s=call.patience_s(terms.wait_s))
         try:
-            with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # at their homes first
-                wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
+            with self._remote_locks.acquire(
+                call, named, terms, self._forward_request
+            ) as remote_lock:  # at their homes first
+                wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - remote_lock.waited_s))
                 granted = self._table.acquire(resources, holder, wait, call.tokens, (call.id, *calls))
                 try:
                     self._require(call, "lock", granted.resources)  # once more: it may have waited for long
-                    loan.bind(granted)
+                    remote_lock.bind(granted)
                 except TradeError:
                     if granted.token is not None:
                         self._table.release(granted.token.number, call.caller)
                     raise
         finally:
-            self._places.release()
-        return structs.replace(granted, waited_s=granted.waited_s + loan.waited_s)
+            self._slots.release()
+        return structs.replace(granted, waited_s=granted.waited_s + remote_lock.waited_s)
 
-    def _pass_wish(self, number: int, who: str, reason: str) -> None:
+    def _forward_request(self, number: int, client: str, reason: str) -> None:
         """Passes on a release request from another system."""
         holders = [info.holder for info in self._table.infos() if info.token.number == number]
         if holders:
-            self._ask(holders[0], Token(self._own.epoch, number), who, reason)
+            self._send_request(holders[0], Token(self._own.epoch, number), client, reason)
 
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:
         """Renews the leases of these grants; returns why each of the others no longer holds."""
         held = self._table.renew(grants, served_call().caller)
-        return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
+        return {number: self._table.why_ended(number) or "it is another's" for number in grants if number not in held}
 
     @service(effect="stop")
     def release(self, grant: int, lost: str = "") -> bool:
@@ -105,7 +107,7 @@ class LockServices:
             return self._table.lose(grant, lost)
         held = self._table.release(grant, identity)
         if held:
-            self._borrowed.give_back(grant)
+            self._remote_locks.release(grant)
         return held
 
     @service(effect="read")
@@ -130,20 +132,20 @@ class LockServices:
     def request_release(self, resources: list[str], reason: str) -> list[str]:
         """Asks the owners of these to release them; returns who was asked."""
         call = served_call()
-        who = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
+        client = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
         holders: dict[Token, Holder] = {}
         for resource in self._table.named(resources):
             if (holder := resource.holder) is not None:
                 holders[Token(self._own.epoch, resource.live)] = holder
         for token, holder in holders.items():
-            self._ask(holder, token, who, reason)
+            self._send_request(holder, token, client, reason)
         free = [resource for resource in self._table.named(resources) if resource.holder is None]
-        return [holder.owner for holder in holders.values()] + self._borrowed.request_release(call, free, reason)
+        return [holder.owner for holder in holders.values()] + self._remote_locks.request_release(call, free, reason)
 
     @service
     def release_requested(self, token: Token, who: str, reason: str) -> bool:
         """Takes a release request for a lock of this container; returns whether its owner handles requests."""
-        return self._asked(token, who, reason)
+        return self._on_release_requested(token, who, reason)
 
     @service
     def resume(self, resources: list[str]) -> list[str]:
@@ -159,7 +161,7 @@ class LockServices:
                     since=resource.holder.since,
                 )
         self._require(call, "administer", [resource.name for resource in found if resource.holder is None])
-        there = self._borrowed.resume(call, found)
+        there = self._remote_locks.resume(call, found)
         return [resource.name for resource in found if _resumed(resource) or resource.name in there]
 
     def _is_for(self, resource: Resource, holder: Holder, call: CallContext) -> bool:

@@ -12,7 +12,7 @@ from trade._calls.handle import Handle
 from trade._migration.delivered_code import CodeStore
 from trade._protocol.keys import Address
 from trade._services.providers import Providers
-from trade._services.withdrawn import Withdrawn
+from trade._services.withdrawn import WithdrawnProviders
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchClass, NotInstantiable
 
 _logger = logging.getLogger("trade")
@@ -22,7 +22,7 @@ _PATH: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 Arguments = Sequence[Any] | Mapping[str, Any]
 
 
-class _Made(NamedTuple):
+class _CreatedProvider(NamedTuple):
     provider: object
     args: Arguments
 
@@ -55,7 +55,7 @@ class ProviderFactory:
         own: Address,
         register: Callable[[object, Sequence[str]], tuple[Handle, ...]],
         providers: Providers,
-        withdrawn: Withdrawn,
+        withdrawn_providers: WithdrawnProviders,
         allowed: Sequence[str],
         code: CodeStore,
     ) -> None:
@@ -64,10 +64,10 @@ class ProviderFactory:
         self._own = own
         self._register = register
         self._providers = providers
-        self._withdrawn = withdrawn
+        self._withdrawn_providers = withdrawn_providers
         self._allowed = tuple(allowed)
         self._lock = threading.Lock()
-        self._made: dict[int, _Made] = {}
+        self._created: dict[int, _CreatedProvider] = {}
 
     def host(self) -> None:
         """Lets code of others in this process, such as drivers of other packages, use this container by default."""
@@ -102,77 +102,81 @@ class ProviderFactory:
             raise NoSuchClass(class_path=class_path, container=where, reason=f"it is defined as {path_of(found)}")
         return found
 
-    def make(self, kind: type, args: Arguments) -> object:
+    def make(self, provider_class: type, args: Arguments) -> object:
         """Create an object of a class that `find` returned. Raises CannotInstantiate."""
         try:
-            return kind(**args) if isinstance(args, Mapping) else kind(*args)
+            return provider_class(**args) if isinstance(args, Mapping) else provider_class(*args)
         except Exception as error:
             where = self._own.container
-            raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_error_text(error)) from error
+            raise CannotInstantiate(
+                class_path=path_of(provider_class), container=where, problem=_error_text(error)
+            ) from error
 
-    def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
+    def offer(self, provider: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
         """Register a created object; close it if that fails."""
         try:
-            handles = self._register(made, groups)
+            handles = self._register(provider, groups)
         except BaseException:
-            end(made)
+            end(provider)
             raise
-        self.keep(made, args)
+        self.keep(provider, args)
         return handles
 
-    def keep(self, made: object, args: Arguments) -> None:
+    def keep(self, provider: object, args: Arguments) -> None:
         """Keep an object that was created here, with its arguments."""
         with self._lock:
-            self._made[id(made)] = _Made(made, args)
+            self._created[id(provider)] = _CreatedProvider(provider, args)
 
     def arguments_of(self, provider: object) -> Arguments:
         """The arguments that a provider was created with; empty if it was not created here."""
         with self._lock:
-            made = self._made.get(id(provider))
-        return () if made is None else made.args
+            created = self._created.get(id(provider))
+        return () if created is None else created.args
 
     def release(self, provider: object) -> None:
         """Close a provider that has moved away, so that it is not offered again, whatever created it."""
-        self._withdrawn.forget(provider)
+        self._withdrawn_providers.forget(provider)
         with self._lock:
-            self._made.pop(id(provider), None)
+            self._created.pop(id(provider), None)
         end(provider)
 
     def terminate(self, service: Handle) -> None:
         """See `System.terminate`."""
         key, offered = service.key, None
         if key.address == self._own:
-            offered = self._providers.offer(f"{key.domain}/{key.provider}") or self._withdrawn.offer(key.provider)
-        made = None if offered is None else self._made.get(id(offered.provider))
-        if made is None:
+            offered = self._providers.offer(f"{key.domain}/{key.provider}") or self._withdrawn_providers.offer(
+                key.provider
+            )
+        created = None if offered is None else self._created.get(id(offered.provider))
+        if created is None:
             problem = "it was not made by instantiate of this container; deregister withdraws others"
             raise ConfigurationError(where=service.label, problem=problem)
-        if self._withdrawn.offer(key.provider) is None:
-            self._withdrawn.take_off(key)
-        self.release(made.provider)
+        if self._withdrawn_providers.offer(key.provider) is None:
+            self._withdrawn_providers.take_off(key)
+        self.release(created.provider)
 
     def close(self) -> None:
         """Close all objects created here. Idempotent."""
         with self._lock:
-            made, self._made = list(self._made.values()), {}
-        for one in reversed(made):
+            created, self._created = list(self._created.values()), {}
+        for one in reversed(created):
             end(one.provider)
         _hosts.pop(id(self), None)
 
 
-def path_of(kind: type) -> str:
+def path_of(provider_class: type) -> str:
     """``module:qualified name``."""
-    return f"{kind.__module__}:{kind.__qualname__}"
+    return f"{provider_class.__module__}:{provider_class.__qualname__}"
 
 
-def end(made: object) -> None:
+def end(provider: object) -> None:
     """Close an object that has `close`; log any error."""
-    close = getattr(made, "close", None)
+    close = getattr(provider, "close", None)
     if callable(close):
         try:
             close()
         except Exception:
-            _logger.exception("%s could not be closed", type(made).__qualname__)
+            _logger.exception("%s could not be closed", type(provider).__qualname__)
 
 
 def _error_text(error: Exception) -> str:

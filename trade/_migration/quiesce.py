@@ -36,8 +36,8 @@ class Frozen:
             LockedByOther: the lock that holds it was broken or its lease expired, or it moves.
             Stopped: a client stopped it meanwhile.
         """
-        if self._number and (why := self._table.over(self._number)):
-            raise self._lost(why)
+        if self._number and (reason := self._table.why_ended(self._number)):
+            raise self._lost(reason)
         require_rest(self._resources)
 
     def seal(self) -> None:
@@ -49,16 +49,16 @@ class Frozen:
         if self._number:
             self._free = self._table.retire(self._number, "its provider has moved")
             if self._free is None:
-                raise self._lost(self._table.over(self._number))
+                raise self._lost(self._table.why_ended(self._number))
 
     def unseal(self) -> None:
         """Release the resources: the provider continues."""
         if self._free is not None:
             self._free()
 
-    def _lost(self, why: str) -> LockedByOther:
+    def _lost(self, reason: str) -> LockedByOther:
         names = tuple(resource.name for resource in self._resources)
-        return LockedByOther(resources=names, owner=f"no owner any more: {why}", purpose="migrating")
+        return LockedByOther(resources=names, owner=f"no owner any more: {reason}", purpose="migrating")
 
 
 class Quiescer:
@@ -120,9 +120,9 @@ BUDGET_S: Final = 5.0
 """How long a provider may take to save or restore its state."""
 
 
-def is_stateful(kind: type) -> bool:
+def is_stateful(provider_class: type) -> bool:
     """Whether objects of a class can save and restore their state."""
-    return all(callable(getattr(kind, name, None)) for name in ("save_state", "restore_state"))
+    return all(callable(getattr(provider_class, name, None)) for name in ("save_state", "restore_state"))
 
 
 def save(provider: Any) -> Any:
@@ -135,20 +135,20 @@ def restore(provider: Any, state: Any) -> None:
     _within_budget(lambda: provider.restore_state(state), "restore_state")
 
 
-def _within_budget(ask: Callable[[], Any], what: str) -> Any:
+def _within_budget(ask: Callable[[], Any], method: str) -> Any:
     """Calls on its own thread: a call that hangs blocks nothing else."""
-    results, errors, over = list[Any](), list[BaseException](), threading.Event()
+    results, errors, ended = list[Any](), list[BaseException](), threading.Event()
 
     def run() -> None:
         try:
             results.append(ask())
         except BaseException as error:  # noqa: BLE001 - raised again in the calling thread
             errors.append(error)
-        over.set()
+        ended.set()
 
-    threading.Thread(target=run, name=f"trade-{what}", daemon=True).start()
-    if not over.wait(BUDGET_S):
-        raise TimeoutError(f"{what} has not ended after {BUDGET_S:g} s")
+    threading.Thread(target=run, name=f"trade-{method}", daemon=True).start()
+    if not ended.wait(BUDGET_S):
+        raise TimeoutError(f"{method} has not ended after {BUDGET_S:g} s")
     for error in errors:
         raise error
     return results[0]

@@ -22,7 +22,7 @@ from trade._registry.constraints import where
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._services.registration import Offer
-from trade._services.withdrawn import Withdrawn
+from trade._services.withdrawn import WithdrawnProviders
 from trade._telemetry.load import busyness
 from trade.errors import (
     CannotMigrate,
@@ -50,46 +50,46 @@ class MigrationSource:
         self,
         client: CallClient,
         providers: Providers,
-        making: ProviderFactory,
-        withdrawn: Withdrawn,
-        freezing: Quiescer,
+        factory: ProviderFactory,
+        withdrawn_providers: WithdrawnProviders,
+        quiescer: Quiescer,
         access: Authorizer,
         codec: Codec,
     ) -> None:
         self._client = client
         self._providers = providers
-        self._making = making
-        self._withdrawn = withdrawn
-        self._freezing = freezing
+        self._factory = factory
+        self._withdrawn_providers = withdrawn_providers
+        self._quiescer = quiescer
         self._access = access
         self._codec = codec
         self._lock = threading.Lock()
-        self._away: set[str] = set()
+        self._frozen_places: set[str] = set()
         """Places of the providers that are being held still."""
 
     # --- state
 
-    def save_state(self, service: Handle, who: str) -> Any:
+    def save_state(self, service: Handle, caller: str) -> Any:
         """See `Container.save_state`."""
-        offer = self._stateful(service, who)
-        with self._still(service, offer, f"saving the state of {service.label}"):
+        offer = self._stateful(service, caller)
+        with self._freeze(service, offer, f"saving the state of {service.label}"):
             return save(offer.provider)
 
-    def restore_state(self, service: Handle, state: Any, who: str) -> None:
+    def restore_state(self, service: Handle, state: Any, caller: str) -> None:
         """See `Container.restore_state`."""
-        offer = self._stateful(service, who)
-        with self._still(service, offer, f"restoring the state of {service.label}") as still:
+        offer = self._stateful(service, caller)
+        with self._freeze(service, offer, f"restoring the state of {service.label}") as frozen:
             restore(offer.provider, state)
-            still.check()
+            frozen.check()
 
-    def _stateful(self, service: Handle, who: str) -> Offer:
-        offer = self._offer(service, who)
+    def _stateful(self, service: Handle, caller: str) -> Offer:
+        offer = self._offer(service, caller)
         if not is_stateful(type(offer.provider)):
             problem = "it has no state to save and restore; its class needs save_state() and restore_state(state)"
             raise ConfigurationError(where=service.label, problem=problem)
         return offer
 
-    def _offer(self, service: Handle, who: str) -> Offer:
+    def _offer(self, service: Handle, caller: str) -> Offer:
         """The registration of a service's provider; raises ServiceGone, AccessDenied, ConfigurationError."""
         key = service.key
         if key.address != self._client.address:
@@ -101,49 +101,49 @@ class MigrationSource:
         offer = self._providers.offer(_place(key))
         if offer is None:
             raise ServiceGone(service=service.label)
-        self._require(who, key, offer)
+        self._require(caller, key, offer)
         return offer
 
-    def _require(self, who: str, key: ServiceKey, offer: Offer) -> None:
+    def _require(self, caller: str, key: ServiceKey, offer: Offer) -> None:
         for group in dict.fromkeys((key.domain, *offer.groups)):
-            self._access.require(who, "administer", group, f"{type(offer.provider).__qualname__} in {group}")
+            self._access.require(caller, "administer", group, f"{type(offer.provider).__qualname__} in {group}")
 
     @contextlib.contextmanager
-    def _still(self, service: Handle, offer: Offer, purpose: str) -> Generator[Frozen, None, None]:
+    def _freeze(self, service: Handle, offer: Offer, purpose: str) -> Generator[Frozen, None, None]:
         place = _place(service.key)
         with self._lock:
-            if place in self._away:
+            if place in self._frozen_places:
                 own = self._client.address
                 owner = own.who
                 raise LockedByOther(resources=(place,), owner=owner, purpose="moving it, or its state, already")
-            self._away.add(place)
+            self._frozen_places.add(place)
         try:
             services = self._providers.services_at(place)
-            with self._freezing.frozen(services, lambda: self._providers.alone_with(offer.provider), purpose) as still:
-                yield still
+            with self._quiescer.frozen(services, lambda: self._providers.alone_with(offer.provider), purpose) as frozen:
+                yield frozen
         finally:
             with self._lock:
-                self._away.discard(place)
+                self._frozen_places.discard(place)
 
     # --- migrating
 
-    def migrate(self, service: Handle, to: str, args: Arguments | None, who: str) -> list[Handle]:
+    def migrate(self, service: Handle, to: str, args: Arguments | None, caller: str) -> list[Handle]:
         """See `Container.migrate`."""
-        offer = self._offer(service, who)
+        offer = self._offer(service, caller)
         self._require_free(service, offer)
         there = self._target(to)
-        with self._still(service, offer, f"migrating to container {there.container}") as still:
+        with self._freeze(service, offer, f"migrating to container {there.container}") as frozen:
             snapshot = self._packed(service, offer, there, args)
             prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(snapshot)
             keys = _keys(there.key.address, prepared)
             try:
-                self._require(who, service.key, offer)  # again, as time has passed
+                self._require(caller, service.key, offer)  # again, as time has passed
                 _require_time(service, there)
-                still.check()
-                still.seal()
-                name = self._withdrawn.take_off(service.key, moved_to=_moved_to(keys[0]))
+                frozen.check()
+                frozen.seal()
+                name = self._withdrawn_providers.take_off(service.key, moved_to=_moved_to(keys[0]))
             except BaseException:
-                still.unseal()
+                frozen.unseal()
                 with contextlib.suppress(TradeError):  # else the ticket there expires
                     self._ask(there.key.address, "arrived", _ASK_S, prepared.ticket)
                 raise
@@ -183,7 +183,7 @@ class MigrationSource:
         except Exception as error:
             problem = f"save_state: {type(error).__name__}: {error}"
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem) from error
-        given = self._making.arguments_of(offer.provider) if args is None else args
+        given = self._factory.arguments_of(offer.provider) if args is None else args
         return ProviderSnapshot(
             class_path=path_of(kind),
             fingerprint=fingerprint(kind, offer.implements, self._codec),
@@ -212,9 +212,9 @@ class MigrationSource:
         except TradeError as error:
             problem = error.problem if isinstance(error, CannotMigrate) else str(error)
         if problem:
-            self._withdrawn.put_back(name, None)
+            self._withdrawn_providers.put_back(name, None)
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem, withdrawn=True)
-        self._making.release(offer.provider)
+        self._factory.release(offer.provider)
 
     def _is_offered(self, keys: list[ServiceKey], ticket: str) -> bool:
         """Whether the target offers it; if not, it never will. Raises TradeError if the target cannot be asked."""

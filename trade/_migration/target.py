@@ -55,27 +55,29 @@ class Prepared(Struct, frozen=True):
     services: tuple[str, ...]
 
 
-class _Ready(Struct, eq=False):
+class _PreparedProvider(Struct, eq=False):
     caller: str
     provider: object
     snapshot: ProviderSnapshot
     built: Built
-    ending: contextlib.ExitStack
+    provider_cleanup: contextlib.ExitStack
     """Closes the provider; emptied once it is offered."""
-    standing: contextlib.ExitStack
+    cleanup: contextlib.ExitStack
     """Undoes all that the preparation took, and closes the provider."""
-    due: ScheduledTask
+    expiry: ScheduledTask
 
 
-def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
+def fingerprint(provider_class: type, implements: Sequence[type], codec: Codec) -> str:
     """A text that is equal for two classes of one path with the same services and the same version of their state."""
-    marked = marked_methods(kind, implements)
+    marked = marked_methods(provider_class, implements)
     services = [
         structs.replace(Signature(name, name, mark, function, codec).info, doc="")
         for name, (mark, function) in sorted(marked.items())
     ]
-    version = str(getattr(kind, "state_version", ""))
-    return hashlib.sha256(encode_message((path_of(kind), version, is_stateful(kind), services))).hexdigest()
+    version = str(getattr(provider_class, "state_version", ""))
+    return hashlib.sha256(
+        encode_message((path_of(provider_class), version, is_stateful(provider_class), services))
+    ).hexdigest()
 
 
 class MigrationTarget:
@@ -85,23 +87,23 @@ class MigrationTarget:
         self,
         own: Address,
         providers: Providers,
-        making: ProviderFactory,
-        freezing: Quiescer,
+        factory: ProviderFactory,
+        quiescer: Quiescer,
         access: Authorizer,
         codec: Codec,
         scheduler: Scheduler,
     ) -> None:
         self._own = own
-        self._making = making
+        self._factory = factory
         self._providers = providers
-        self._freezing = freezing
+        self._quiescer = quiescer
         self._access = access
         self._codec = codec
         self._scheduler = scheduler
         self._lock = threading.Lock()
-        self._places = threading.BoundedSemaphore(MOST)
-        self._ready: dict[str, _Ready] = {}
-        self._arrived: dict[str, None] = {}
+        self._slots = threading.BoundedSemaphore(MOST)
+        self._prepared: dict[str, _PreparedProvider] = {}
+        self._used_tickets: dict[str, None] = {}
         """The last tickets that were used."""
 
     def prepare(self, snapshot: ProviderSnapshot, caller: str) -> Prepared:
@@ -115,18 +117,20 @@ class MigrationTarget:
             Busy: too many providers are being prepared.
         """
         self._require(snapshot, caller)
-        if not self._places.acquire(blocking=False):
+        if not self._slots.acquire(blocking=False):
             raise Busy(service="trade.prepare_arrival", container=self._own.container)
         ticket = secrets.token_hex(8)
         with contextlib.ExitStack() as undo:
-            undo.callback(self._places.release)
-            ending = undo.enter_context(contextlib.ExitStack())
-            made, built = self._make(snapshot, ending)
-            self._restore(snapshot, made, built, undo)
-            due = self._scheduler.due(lambda: self._over(ticket))
+            undo.callback(self._slots.release)
+            provider_cleanup = undo.enter_context(contextlib.ExitStack())
+            instance, built = self._create(snapshot, provider_cleanup)
+            self._restore(snapshot, instance, built, undo)
+            expiry = self._scheduler.due(lambda: self._expire(ticket))
             with self._lock:
-                self._ready[ticket] = _Ready(caller, made, snapshot, built, ending, undo.pop_all(), due)
-        due.at(time.monotonic_ns() + int(TICKET_S * 1e9))
+                self._prepared[ticket] = _PreparedProvider(
+                    caller, instance, snapshot, built, provider_cleanup, undo.pop_all(), expiry
+                )
+        expiry.at(time.monotonic_ns() + int(TICKET_S * 1e9))
         domain, _, provider = built.place.partition("/")
         return Prepared(ticket, domain, provider, tuple(built.services))
 
@@ -134,18 +138,18 @@ class MigrationTarget:
         for group in snapshot.groups or (domain_of(snapshot.groups),):
             self._access.require(caller, "register", group, f"{snapshot.class_path} in {group}")
 
-    def _make(self, snapshot: ProviderSnapshot, ending: contextlib.ExitStack) -> tuple[object, Built]:
-        kind = self._making.find(snapshot.class_path)
+    def _create(self, snapshot: ProviderSnapshot, provider_cleanup: contextlib.ExitStack) -> tuple[object, Built]:
+        provider_class = self._factory.find(snapshot.class_path)
         implements = [self._interface(path) for path in snapshot.implements]
-        if fingerprint(kind, implements, self._codec) != snapshot.fingerprint:
+        if fingerprint(provider_class, implements, self._codec) != snapshot.fingerprint:
             problem = "its class is another version there: other services, other arguments or another state_version"
             raise self._refusal(snapshot, problem)
-        made = self._making.make(kind, snapshot.args)
-        ending.callback(end, made)
-        groups = checked_groups(made, snapshot.groups)
-        built = self._providers.build(made, groups, implements, meta=snapshot.meta)
-        ending.callback(self._providers.discard, built)
-        return made, built
+        provider = self._factory.make(provider_class, snapshot.args)
+        provider_cleanup.callback(end, provider)
+        groups = checked_groups(provider, snapshot.groups)
+        built = self._providers.build(provider, groups, implements, meta=snapshot.meta)
+        provider_cleanup.callback(self._providers.discard, built)
+        return provider, built
 
     def _interface(self, path: str) -> type:
         found = imported(path)
@@ -154,22 +158,22 @@ class MigrationTarget:
             raise NoSuchClass(class_path=path, container=here, reason="nothing there has imported this interface")
         return found
 
-    def _restore(self, snapshot: ProviderSnapshot, made: object, built: Built, undo: contextlib.ExitStack) -> None:
+    def _restore(self, snapshot: ProviderSnapshot, provider: object, built: Built, undo: contextlib.ExitStack) -> None:
         """Restore under a lock, so that the permit refuses every command that the provider gives meanwhile (S18)."""
         used = {resource for service in built.services.values() for resource in service.resources}
         purpose = f"{snapshot.class_path} arriving"
-        still = undo.enter_context(
-            self._freezing.frozen(
+        frozen = undo.enter_context(
+            self._quiescer.frozen(
                 built.services, lambda: [one for one in used if not self._providers.groups_of(one.name)], purpose
             )
         )
         if snapshot.has_state:
             try:
-                restore(made, snapshot.state)
-                still.check()
+                restore(provider, snapshot.state)
+                frozen.check()
             except Exception as error:
                 with contextlib.suppress(LockedByOther):
-                    still.seal()  # it may still run, and must not move anything
+                    frozen.seal()  # it may still run, and must not move anything
                 raise self._refusal(snapshot, f"restore_state there: {type(error).__name__}: {error}") from error
 
     def arrive(self, ticket: str, caller: str) -> None:
@@ -180,28 +184,28 @@ class MigrationTarget:
             AccessDenied: the caller may no longer offer it.
         """
         with self._lock:
-            ready = self._ready.get(ticket)
+            ready = self._prepared.get(ticket)
             if ready is None or ready.caller != caller:
                 here = self._own.container
                 problem = "the prepared provider has expired there"
                 raise CannotMigrate(provider="it", to=here, problem=problem)
-            del self._ready[ticket]
-            self._arrived[ticket] = None  # before the offer: a container that asks now must not offer it elsewhere
-            for forgotten in list(self._arrived)[:-_REMEMBERED]:
-                del self._arrived[forgotten]
-        ready.due.cancel()
+            del self._prepared[ticket]
+            self._used_tickets[ticket] = None  # before the offer: a container that asks now must not offer it elsewhere
+            for forgotten in list(self._used_tickets)[:-_REMEMBERED]:
+                del self._used_tickets[forgotten]
+        ready.expiry.cancel()
         try:
             self._require(ready.snapshot, caller)
             self._providers.host(ready.built)
         except BaseException:
-            self._arrived.pop(ticket, None)
-            ready.standing.close()
+            self._used_tickets.pop(ticket, None)
+            ready.cleanup.close()
             raise
-        self._making.keep(ready.provider, ready.snapshot.args)
-        ready.ending.pop_all()
-        ready.standing.close()
+        self._factory.keep(ready.provider, ready.snapshot.args)
+        ready.provider_cleanup.pop_all()
+        ready.cleanup.close()
 
-    def bring_back(
+    def recreate(
         self, class_path: str, args: Sequence[Any] | Mapping[str, Any], groups: tuple[str, ...], state: Any
     ) -> list[ServiceKey]:
         """Create a provider, give it its state, then offer it.
@@ -211,7 +215,7 @@ class MigrationTarget:
             NotInstantiable, NoSuchClass, AccessDenied, LockedByOther, ConfigurationError, Busy: as for `prepare`.
         """
         named = dict(args) if isinstance(args, Mapping) else tuple(args)
-        version = fingerprint(self._making.find(class_path), (), self._codec)
+        version = fingerprint(self._factory.find(class_path), (), self._codec)
         snapshot = ProviderSnapshot(
             class_path=class_path, fingerprint=version, args=named, groups=groups, has_state=True, state=state
         )
@@ -226,27 +230,27 @@ class MigrationTarget:
     def arrived(self, ticket: str, caller: str) -> bool:
         """Whether a ticket was used; if not, it becomes invalid."""
         with self._lock:
-            ready = self._ready.get(ticket)
+            ready = self._prepared.get(ticket)
             if ready is not None and ready.caller == caller:
-                del self._ready[ticket]
+                del self._prepared[ticket]
             else:
                 ready = None
-            used = ticket in self._arrived
+            used = ticket in self._used_tickets
         if ready is not None:
-            ready.due.cancel()
-            ready.standing.close()
+            ready.expiry.cancel()
+            ready.cleanup.close()
         return used
 
-    def _over(self, ticket: str) -> None:
+    def _expire(self, ticket: str) -> None:
         with self._lock:
-            ready = self._ready.pop(ticket, None)
+            ready = self._prepared.pop(ticket, None)
         if ready is not None:
-            ready.standing.close()
+            ready.cleanup.close()
 
     def close(self) -> None:
         """Close prepared providers that were not fetched. Idempotent."""
-        for ticket in list(self._ready):
-            self._over(ticket)
+        for ticket in list(self._prepared):
+            self._expire(ticket)
 
     def _refusal(self, snapshot: ProviderSnapshot, problem: str) -> CannotMigrate:
         return CannotMigrate(provider=snapshot.class_path, to=self._own.container, problem=problem)

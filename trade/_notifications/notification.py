@@ -23,7 +23,7 @@ from trade.errors import ConfigurationError
 _logger = logging.getLogger("trade")
 
 _SINGLE: Final = ("at", "after", "once")
-_LOOK_NS: Final = 1_000_000_000
+_POLL_NS: Final = 1_000_000_000
 """How often the wall clock is checked: it may be set."""
 
 
@@ -127,19 +127,19 @@ class ActiveNotification(Notification):
         self._if = if_
         self._when = when
         self._client = client
-        self._tell_ended = ended
-        self._tell_failed = failed
+        self._on_ended = ended
+        self._on_failed = failed
         self.detached = False
         self._state = State.STANDING if when is None else State.WAITING
         self._due_ns: int | None = None
         """The next time of ``after`` and ``every``."""
         self._held = False
         """Whether the condition held at the last tick."""
-        self._concerned: deque[Handle | StateEvent] = deque()
+        self._reports: deque[Handle | StateEvent] = deque()
         """Services that came, went or changed since the last call, or events since then."""
         self._fired = self._failures = self._merged = 0
         self._last_error = ""
-        self._said: set[tuple[str, str]] = set()
+        self._logged: set[tuple[str, str]] = set()
         """Failures already reported: the part that failed, and its error."""
         self._cancel_due: Callable[[], None] = lambda: None
         self._clock = WaitClock()
@@ -163,7 +163,7 @@ class ActiveNotification(Notification):
             id=self.id,
             occasion=str(self.terms),
             call=text_of(self._call),
-            condition=", ".join(f"{word} {text_of(what)}" for word, what in conditions if what is not None),
+            condition=", ".join(f"{word} {text_of(target)}" for word, target in conditions if target is not None),
             owner=self.owner.session,
             container=self._client.name,
             state=self._state.value,
@@ -190,7 +190,7 @@ class ActiveNotification(Notification):
         if self.active:
             self._state = state
             self._cancel_due()
-            self._tell_ended(self)
+            self._on_ended(self)
 
     # --- firing
 
@@ -199,14 +199,14 @@ class ActiveNotification(Notification):
         assert self.terms.constraint is not None  # noqa: S101
         return self.terms.constraint.matches(record)
 
-    def add(self, about: Handle | StateEvent) -> None:
+    def add(self, event: Handle | StateEvent) -> None:
         """Include a service or an event in the report of the next run."""
-        self._concerned.append(about)
+        self._reports.append(event)
 
     def _act(self) -> int | None:
         now = self._clock.now_ns()
         if self._state is State.WAITING:
-            if not self._asked(self._when):
+            if not self._holds(self._when):
                 return now + int(self.terms.poll_s * 1e9)
             if not self.active:  # cancelled meanwhile
                 return None
@@ -220,7 +220,7 @@ class ActiveNotification(Notification):
                 return self._tick(now)
             case "at":
                 left_ns = int((self.terms.at - self._clock.time()) * 1e9)
-                return now + min(left_ns, _LOOK_NS) if left_ns > 0 else self._once()
+                return now + min(left_ns, _POLL_NS) if left_ns > 0 else self._once()
             case "after":
                 self._due_ns = self._due_ns or now + int(self.terms.s * 1e9)
                 return self._due_ns if self._due_ns > now else self._once()
@@ -245,12 +245,12 @@ class ActiveNotification(Notification):
         return self._due_ns
 
     def _report(self) -> None:
-        while self._concerned and self._state is State.STANDING:
-            self._fire(self._concerned.popleft())
+        while self._reports and self._state is State.STANDING:
+            self._fire(self._reports.popleft())
 
     def _fire(self, *given: Handle | StateEvent) -> None:
         if self._if is not None:
-            held, before = self._asked(self._if), self._held
+            held, before = self._holds(self._if), self._held
             self._held = held
             if not held or (self.terms.edge and before):
                 return
@@ -262,7 +262,7 @@ class ActiveNotification(Notification):
         except BaseException as error:  # noqa: BLE001 - an error of a callback ends nothing
             self._failed("call", self._call, error)
 
-    def _asked(self, condition: Target | None) -> bool:
+    def _holds(self, condition: Target | None) -> bool:
         """Whether a condition holds; one that fails does not."""
         assert condition is not None  # noqa: S101
         try:
@@ -292,11 +292,11 @@ class ActiveNotification(Notification):
         self._failures += 1
         kind = type(error).__name__
         self._last_error = f"{kind}: {error}"
-        if (part, kind) in self._said:  # the same error again is not news, whatever numbers its text has
+        if (part, kind) in self._logged:  # the same error again is not news, whatever numbers its text has
             return
-        self._said.add((part, kind))
+        self._logged.add((part, kind))
         over = self._state is not State.WAITING and self.terms.occasion in _SINGLE
         stays = "" if over else "; it stays attached, and this kind of error is logged once"
         text = "the %s of %r failed (%s, id %s)%s: %s"
         _logger.warning(text, part, self, text_of(target), self.id, stays, self._last_error)
-        self._tell_failed(self, self._last_error)
+        self._on_failed(self, self._last_error)

@@ -60,11 +60,11 @@ class States:
         """A hook, which last called this service, failed too often."""
         self.events.note("hook_suspended", hook, error, None if call is None else self._registry.get(call))
 
-    def listener_changed(self, key: ServiceKey, listener: tuple[str, str], came: bool) -> None:
+    def listener_changed(self, key: ServiceKey, listener: tuple[str, str], joined: bool) -> None:
         """A listener of a service, by its session and name, came or went."""
         record = self._registry.get(key)
         label = f"{key.domain}.{key.name}" if record is None else record.label
-        self.events.note("listener_joined" if came else "listener_left", label, listener[0], record)
+        self.events.note("listener_joined" if joined else "listener_left", label, listener[0], record)
 
     def _deviated(self, before: str, after: str, call_id: int) -> None:
         found = self._registry.select(as_constraint(after, "call_deviated", services_at))
@@ -90,7 +90,7 @@ class States:
 
 
 class StateServices:
-    """The wire side of `States`."""
+    """Gives the states of this container and its newest events to clients, and switches the watch on its calls."""
 
     def __init__(self, states: States) -> None:
         self._states = states

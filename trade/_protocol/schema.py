@@ -219,19 +219,19 @@ class _Comparison:
         return kind != "object" or self._object(given, wanted)
 
     def _array(self, given: _Schema, wanted: _Schema) -> bool:
-        places: Sequence[_Schema] = wanted.get("prefixItems", ())
-        own: Sequence[_Schema] = given.get("prefixItems", ())
+        items: Sequence[_Schema] = wanted.get("prefixItems", ())
+        given_items: Sequence[_Schema] = given.get("prefixItems", ())
         rest, own_rest = wanted.get("items", {}), given.get("items", {})
-        least = given.get("minItems", 0) if own else 0
-        if least < wanted.get("minItems", 0) and places:
+        least = given.get("minItems", 0) if given_items else 0
+        if least < wanted.get("minItems", 0) and items:
             return False
         if own_rest is False:
-            return all(self._place(item, places, rest, index) for index, item in enumerate(own))
-        return not places and rest is not False and all(self.fits(item, rest) for item in (*own, own_rest))
+            return all(self._item_fits(item, items, rest, index) for index, item in enumerate(given_items))
+        return not items and rest is not False and all(self.fits(item, rest) for item in (*given_items, own_rest))
 
-    def _place(self, item: _Schema, places: Sequence[_Schema], rest: Any, index: int) -> bool:
-        if index < len(places):
-            return self.fits(item, places[index])
+    def _item_fits(self, item: _Schema, items: Sequence[_Schema], rest: Any, index: int) -> bool:
+        if index < len(items):
+            return self.fits(item, items[index])
         return rest is not False and self.fits(item, rest)
 
     def _object(self, given: _Schema, wanted: _Schema) -> bool:
@@ -241,9 +241,9 @@ class _Comparison:
             return all(self.fits(value, values) for value in (*own.values(), *_open_values(given)))
         if "properties" not in given:
             return False
-        asked = set(wanted["properties"])
+        wanted_names = set(wanted["properties"])
         missing = set(wanted.get("required", ())) - set(given.get("required", ()))
-        if missing or (asked and not asked & set(own)):  # nothing in common, though nothing is required
+        if missing or (wanted_names and not wanted_names & set(own)):  # nothing in common, though nothing is required
             return False
         return all(self.fits(own[name], value) for name, value in wanted["properties"].items() if name in own)
 

@@ -155,9 +155,10 @@ def name_of(kind: type) -> str:
 
 
 def publish(package: str, *kinds: type) -> None:
-    """Name types after the package that exports them: such names stay valid when a module moves."""
+    """Name types after the package that exports them, where `imported` finds them: a module may move."""
     for kind in kinds:
         kind.__module__ = package
+        setattr(sys.modules[package], kind.__name__, kind)
 
 
 def _program() -> str:

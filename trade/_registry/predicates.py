@@ -67,13 +67,13 @@ class _Parser:
     def __init__(self, text: str) -> None:
         self._text = text
         self._tokens: list[str] = []
-        self._at = 0
+        self._position = 0
 
     def read(self) -> tuple[Predicate, ...]:
         self._split()
-        found = self._several(0)
-        if self._at < len(self._tokens):
-            raise self._wrong(f"{self._tokens[self._at]!r} is not expected there")
+        found = self._predicates(0)
+        if self._position < len(self._tokens):
+            raise self._syntax_error(f"{self._tokens[self._position]!r} is not expected there")
         return found
 
     def _split(self) -> None:
@@ -81,42 +81,42 @@ class _Parser:
         while end < len(self._text) <= _LONGEST:
             token = _TOKEN.match(self._text, end)
             if token is None:
-                raise self._wrong(f"{self._text[end]!r} is not allowed there")
+                raise self._syntax_error(f"{self._text[end]!r} is not allowed there")
             self._tokens.append(token[1])
             end = token.end()
         if len(self._text) > _LONGEST:
             raise ConfigurationError(problem=f"a predicate has at most {_LONGEST} characters, not {len(self._text)}")
 
-    def _several(self, depth: int) -> tuple[Predicate, ...]:
-        found = [self._one(depth)]
-        while self._take(","):
-            found.append(self._one(depth))
+    def _predicates(self, depth: int) -> tuple[Predicate, ...]:
+        found = [self._predicate(depth)]
+        while self._accept(","):
+            found.append(self._predicate(depth))
         return tuple(found)
 
-    def _one(self, depth: int) -> Predicate:
+    def _predicate(self, depth: int) -> Predicate:
         if depth > _DEEPEST:
-            raise self._wrong(f"it is nested deeper than {_DEEPEST}")
-        name = self._tokens[self._at] if self._at < len(self._tokens) else ""
+            raise self._syntax_error(f"it is nested deeper than {_DEEPEST}")
+        name = self._tokens[self._position] if self._position < len(self._tokens) else ""
         if name in ("", "(", ")", ","):
-            raise self._wrong("a name is missing")
-        self._at += 1
-        if not self._take("("):
+            raise self._syntax_error("a name is missing")
+        self._position += 1
+        if not self._accept("("):
             return Predicate(name)
         if name.startswith("?"):
-            raise self._wrong("a variable has no arguments")
-        if self._take(")"):
+            raise self._syntax_error("a variable has no arguments")
+        if self._accept(")"):
             return Predicate(name)
-        arguments = self._several(depth + 1)
-        if not self._take(")"):
-            raise self._wrong("a closing parenthesis is missing")
+        arguments = self._predicates(depth + 1)
+        if not self._accept(")"):
+            raise self._syntax_error("a closing parenthesis is missing")
         return Predicate(name, arguments)
 
-    def _take(self, token: str) -> bool:
-        there = self._at < len(self._tokens) and self._tokens[self._at] == token
-        self._at += there
+    def _accept(self, token: str) -> bool:
+        there = self._position < len(self._tokens) and self._tokens[self._position] == token
+        self._position += there
         return there
 
-    def _wrong(self, problem: str) -> ConfigurationError:
+    def _syntax_error(self, problem: str) -> ConfigurationError:
         return ConfigurationError(
             problem=f"{self._text!r} is no predicate: {problem}; write it like see(?x) or on(cup, table)"
         )

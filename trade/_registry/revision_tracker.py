@@ -2,9 +2,10 @@
 
 
 class RevisionTracker:
-    """Messages of a container come in two forms: single announcements, and replies with everything at once.
+    """Knows whether announcements of one container are missing, by the revisions in its messages.
 
-    Nothing is missing if the newest reply reaches the beginning of the unbroken run of announcements.
+    A container announces single changes, and replies with all of its entries at once. Nothing is missing if the newest
+    reply reaches the beginning of the unbroken run of announcements.
     """
 
     __slots__ = ("_first", "_last", "answered")

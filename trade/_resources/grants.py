@@ -68,7 +68,7 @@ class Waiter(Struct, eq=False):
     holder: Holder
     calls: frozenset[int]
     """The calls that led to the request: it does not wait for them."""
-    gone: str = ""
+    dropped: str = ""
     """Why it cannot get them any more."""
 
 

@@ -17,8 +17,7 @@ from trade._context.sessions import EndedSessions, foreign, within
 from trade._protocol.messages import Token
 from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, StopInfo, Waiter, withheld
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
-from trade._threads.alarm import Alarm
-from trade._transport.wait_clock import WaitClock
+from trade._threads.scheduler import Scheduler
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
@@ -26,27 +25,29 @@ _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock tha
 _REMEMBERED: Final = 256
 """How many ended grants it remembers, with the reasons."""
 _LEASE_ENDED: Final = "its lease ended"
+_END_S: Final = 2.0
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
 """Stops resources for a reason, without waiting; reports each stop when it is over, and why if it failed."""
 
 
 class LockTable:
-    """The resources of one container, and the locks that hold on them."""
+    """The resources of one container, and the locks that hold on them.
 
-    def __init__(
-        self,
-        epoch: str,
-        container: str,
-        clock: WaitClock | None = None,
-        audit: Audit | None = None,
-    ) -> None:
+    Args:
+        epoch: of the container.
+        container: its name.
+        timers: ends leases, on the clock of locks.
+        audit: records locks.
+    """
+
+    def __init__(self, epoch: str, container: str, timers: Scheduler, audit: Audit | None = None) -> None:
         self._audit = audit or Audit()
         self._epoch = epoch
         self._container = container
-        self._stop: Stop = _leave_it
+        self._stop: Stop = _stop_nothing
         self._on_loss: Callable[[int, str], None] = lambda _number, _reason: None
-        self._wait_clock = clock or WaitClock()
+        self._wait_clock = timers.clock
         self._clock = self._wait_clock.now
         self._resources: dict[str, tuple[Resource, int]] = {}
         """Resources by name, with the number of services that use them."""
@@ -60,7 +61,7 @@ class LockTable:
         """Requests that wait for their turn, or for running calls and motion."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
-        self._leases = Alarm("trade-leases", lambda: self.expire() * 1e9, self._wait_clock)
+        self._leases = timers.due(lambda: self.expire() * 1e9)
         self._closed = False
         self._estop: Latch | None = None
 
@@ -88,7 +89,8 @@ class LockTable:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
             if known is None:  # a newly offered resource has no holder
                 resource.live, resource.holder = 0, None
-            resource.epoch, resource.over, resource.gone = self._epoch, self.over, self._sessions.gone
+            resource.epoch, resource.why_ended = self._epoch, self.why_ended
+            resource.session_error = self._sessions.session_error
             resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
@@ -111,7 +113,7 @@ class LockTable:
             del self._resources[resource.name]
             for waiter in self._acquiring:
                 if resource in waiter.resources:
-                    waiter.gone = f"{resource.name} is no longer offered"
+                    waiter.dropped = f"{resource.name} is no longer offered"
             self._changed.notify_all()
         self.lose(resource.live, f"{resource.name} is no longer offered")
 
@@ -167,23 +169,23 @@ class LockTable:
         resources = tuple(one for one in self.named(names) if Token(self._epoch, one.live) not in mine)
         if not resources:
             return Granted(None, ())
-        asked = self._clock()
+        requested_at = self._clock()
         with self._changed:
-            if (ended := self.gone((holder.session,))) is not None:
+            if (ended := self.session_error((holder.session,))) is not None:
                 raise ended
             self._count += 1
             waiter = Waiter((-terms.priority, self._count), resources, holder, frozenset(calls))
             self._acquiring.append(waiter)
             try:
-                self._take_turn(waiter, asked + terms.wait_s)
-                return self._empty_and_grant(waiter, terms, asked)
+                self._take_turn(waiter, requested_at + terms.wait_s)
+                return self._empty_and_grant(waiter, terms, requested_at)
             finally:
                 self._acquiring.remove(waiter)
 
-    def _empty_and_grant(self, waiter: Waiter, terms: LockRequest, asked: float) -> Granted:
+    def _empty_and_grant(self, waiter: Waiter, terms: LockRequest, requested_at: float) -> Granted:
         try:
-            self._drain(waiter, asked + terms.wait_s)
-            return self._grant(waiter, terms, asked)
+            self._drain(waiter, requested_at + terms.wait_s)
+            return self._grant(waiter, terms, requested_at)
         finally:
             for resource in waiter.resources:
                 resource.pending = None
@@ -231,7 +233,7 @@ class LockTable:
 
     def _wait(self, waiter: Waiter, until: float, obstacle: TradeError) -> None:
         left = until - self._clock()
-        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, NotStopped):
+        if left <= 0 or waiter.dropped or self._closed or isinstance(obstacle, NotStopped):
             raise obstacle
         self._wait_clock.wait(self._changed, left, again=False)
 
@@ -243,9 +245,9 @@ class LockTable:
                 return resource
         return None
 
-    def _grant(self, waiter: Waiter, terms: LockRequest, asked: float) -> Granted:
-        if waiter.gone:
-            raise ServiceGone(service=", ".join(one.name for one in waiter.resources), reason=waiter.gone)
+    def _grant(self, waiter: Waiter, terms: LockRequest, requested_at: float) -> Granted:
+        if waiter.dropped:
+            raise ServiceGone(service=", ".join(one.name for one in waiter.resources), reason=waiter.dropped)
         self._count += 1
         now, number = self._clock(), self._count
         holder = structs.replace(waiter.holder, since=time.time())
@@ -255,8 +257,8 @@ class LockTable:
             resource.holder, resource.live = holder, number
             resource.uses, resource.used_at = 0, 0.0
         self._leases.by(grant.until * 1e9)
-        self._note("locked", grant, holder.purpose and f"for {holder.purpose}")
-        return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
+        self._record("locked", grant, holder.purpose and f"for {holder.purpose}")
+        return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - requested_at)
 
     # --- while it is held
 
@@ -270,7 +272,7 @@ class LockTable:
                 grant.until = now + grant.lease_s
             return [grant.number for grant in own]
 
-    def over(self, number: int) -> str:
+    def why_ended(self, number: int) -> str:
         """Why a grant no longer holds; empty if it holds."""
         grant = self._grants.get(number)
         if grant is None:
@@ -289,7 +291,7 @@ class LockTable:
             if grant is None or grant.holder.identity != identity:
                 return False
             self._end(grant, "it was given back")
-            self._note("unlocked", grant)
+            self._record("unlocked", grant)
             return True
 
     def retire(self, number: int, reason: str) -> Callable[[], None] | None:
@@ -302,7 +304,7 @@ class LockTable:
             if grant is None:
                 return None
             self._ended[number] = reason
-            self._note("lock lost", grant, reason)
+            self._record("lock lost", grant, reason)
 
         def free() -> None:
             with self._changed:
@@ -321,7 +323,7 @@ class LockTable:
                 return False
             busy = [resource for resource in grant.resources if resource.busy]
             self._end(grant, reason)
-            self._note("lock lost", grant, reason)
+            self._record("lock lost", grant, reason)
             for resource in busy:
                 resource.pending = _STOPPING
         self._on_loss(number, reason)
@@ -341,7 +343,7 @@ class LockTable:
             self._sessions.ended(session, reason)
             for waiter in self._acquiring:
                 if within(waiter.holder.session, session):
-                    waiter.gone = reason
+                    waiter.dropped = reason
             fallen = [grant.number for grant in self._grants.values() if within(grant.holder.session, session)]
             self._changed.notify_all()
         for number in fallen:
@@ -351,9 +353,9 @@ class LockTable:
         """Records that an unreachable session is back."""
         self._sessions.back(session)
 
-    def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
+    def session_error(self, sessions: Iterable[str]) -> SessionEnded | None:
         """Which of these has ended, as an error; None if all exist."""
-        return self._sessions.gone(sessions)
+        return self._sessions.session_error(sessions)
 
     def infos(self) -> list[LockInfo]:
         """The grants that hold, with their waiters."""
@@ -382,10 +384,10 @@ class LockTable:
                 resource.live, resource.holder = 0, None
         self._changed.notify_all()
 
-    def _note(self, what: str, grant: Grant, why: str = "") -> None:
+    def _record(self, event: str, grant: Grant, reason: str = "") -> None:
         names, holder = [resource.name for resource in grant.resources], grant.holder
-        who = foreign(holder.session) or holder.identity
-        self._audit.note("lock", what, about=names, who=who, session=holder.session, why=why)
+        identity = foreign(holder.session) or holder.identity
+        self._audit.note("lock", event, about=names, who=identity, session=holder.session, why=reason)
 
     def _stopped(self, resource: Resource, problem: str) -> None:
         with self._changed:
@@ -403,9 +405,9 @@ class LockTable:
         """Revokes grants whose lease has ended. Returns when the next one may end, by this clock, or infinity."""
         with self._changed:
             now = self._clock()
-            over = [grant.number for grant in self._grants.values() if grant.until <= now]
+            expired = [grant.number for grant in self._grants.values() if grant.until <= now]
             soonest = min((grant.until for grant in self._grants.values() if grant.until > now), default=math.inf)
-        for number in over:
+        for number in expired:
             self.lose(number, _LEASE_ENDED)
         return soonest
 
@@ -414,9 +416,9 @@ class LockTable:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._leases.close()
+        self._leases.cancel(_END_S)
 
 
-def _leave_it(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
+def _stop_nothing(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
     for resource in resources:
         done(resource, "")

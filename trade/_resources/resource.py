@@ -66,8 +66,8 @@ class Resource:
     """
 
     __slots__ = (
-        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "gone", "holder", "latch", "live"),
-        *("movers", "name", "over", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses", "why"),
+        *("_moving", "_on_rest", "calls", "coupled", "epoch", "estop", "session_error", "holder", "latch", "live"),
+        *("movers", "name", "why_ended", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses", "why"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -76,9 +76,9 @@ class Resource:
         """Names of resources of the same container that are only locked together with it."""
         self.epoch = ""
         """The epoch of the container that grants its locks."""
-        self.over: Callable[[int], str] = _every_grant_is_over
+        self.why_ended: Callable[[int], str] = _no_grantor
         """Why a grant no longer holds, by the clock of its lease; empty if it holds."""
-        self.gone: Callable[[Iterable[str]], SessionEnded | None] = _all_are_there
+        self.session_error: Callable[[Iterable[str]], SessionEnded | None] = _no_session_error
         """Which of some sessions has ended, as an error."""
         self.live = 0
         """The number of the grant that holds now; 0 is none."""
@@ -102,7 +102,7 @@ class Resource:
         """The number of calls under its present lock."""
         self.used_at = 0.0
         self._moving = False
-        self._rested: Callable[[], None] | None = None
+        self._on_rest: Callable[[], None] | None = None
 
     @property
     def moving(self) -> bool:
@@ -113,16 +113,16 @@ class Resource:
     def moving(self, value: bool) -> None:
         was, self._moving = self._moving, value
         if was and not value:
-            self.tell_rest()
+            self.notify_rest()
 
-    def on_rest(self, tell: Callable[[], None]) -> None:
+    def on_rest(self, callback: Callable[[], None]) -> None:
         """Calls this whenever it comes to rest, and when a call on it ends while a lock waits for that."""
-        self._rested = tell
+        self._on_rest = callback
 
-    def tell_rest(self) -> None:
+    def notify_rest(self) -> None:
         """Makes the waiters for it check again."""
-        if self._rested is not None:
-            self._rested()
+        if self._on_rest is not None:
+            self._on_rest()
 
     def stop(
         self, by: str, sessions: Iterable[str] = (), reason: str = "stop() was called", *, estop: bool = False
@@ -135,19 +135,19 @@ class Resource:
             reason: why.
             estop: whether it is an e-stop.
         """
-        asking = set(sessions)
+        stopping = set(sessions)
         used = self.holder is not None or self.busy or self.movers
-        if asking and used and not self._is_of(asking):
+        if stopping and used and not self._is_of(stopping):
             self.latch = Latch(by, reason, estop)  # first: a call admitted under the new number has seen it
         self.why = reason
         self.stops = _stop_numbers()  # not += 1: one of two concurrent stops would be lost
 
-    def _is_of(self, asking: set[str]) -> bool:
+    def _is_of(self, stopping: set[str]) -> bool:
         """Whether its lock, or all calls that move it, belong to these sessions."""
-        if self.holder is not None and self.holder.session in asking:
+        if self.holder is not None and self.holder.session in stopping:
             return True
         begun = [permit.sessions for permit in list(self.calls.values())] or [self.movers]
-        return all(not asking.isdisjoint(sessions) for sessions in begun)
+        return all(not stopping.isdisjoint(sessions) for sessions in begun)
 
     @property
     def sessions(self) -> frozenset[str]:
@@ -206,8 +206,8 @@ class Resource:
         pending, live, holder, shown = self.pending, self.live, self.holder, False  # in the order of `guarded`
         for token in tokens:
             if token.epoch == self.epoch:
-                if why := self.over(token.number):
-                    raise lapsed(self, why)
+                if reason := self.why_ended(token.number):
+                    raise lapsed(self, reason)
                 shown = shown or token.number == live
         if live:
             if not shown or holder is None or not (caller == holder.identity or caller in holder.delegates):
@@ -220,17 +220,17 @@ class Resource:
         return f"<Resource {self.name}>"
 
 
-def _all_are_there(_: Iterable[str]) -> None:
+def _no_session_error(_: Iterable[str]) -> None:
     return None
 
 
-def _every_grant_is_over(_: int) -> str:
+def _no_grantor(_: int) -> str:
     return "no container grants its locks"
 
 
-def lapsed(resource: Resource, why: str) -> LockLost:
+def lapsed(resource: Resource, reason: str) -> LockLost:
     """The error of calls under a grant that no longer holds."""
-    return LockLost(resources=(resource.name,), reason=why)
+    return LockLost(resources=(resource.name,), reason=reason)
 
 
 def locked(resource: Resource, holder: Holder | None, session: str = "") -> LockedByOther:
@@ -276,8 +276,8 @@ class Permit(Struct, eq=False):
                 latch = resource.estop or resource.latch
                 reason = "it was stopped" if latch is None else f"{latch.by}: {latch.reason}"
                 raise MotionStopped(device=resource.name, reason=reason)
-            if live and ((why := resource.over(live)) or resource.live != live):
-                raise lapsed(resource, why)
+            if live and ((reason := resource.why_ended(live)) or resource.live != live):
+                raise lapsed(resource, reason)
             if resource.live != live:
                 raise locked(resource, resource.holder)
 
@@ -291,7 +291,7 @@ class Permit(Struct, eq=False):
         for resource, _, _ in self.fences:
             resource.calls.pop(self.call_id, None)
             if resource.pending is not None:
-                resource.tell_rest()
+                resource.notify_rest()
 
 
 def admit(
@@ -318,7 +318,7 @@ def admit(
             permitted.fences.append((resource, resource.live, resource.stops))
             if tokens or resource.guarded or resource.latch is not None or resource.estop is not None:
                 resource.check(tokens, caller, sessions[0] if sessions else "")
-            if (ended := resource.gone(sessions)) is not None:
+            if (ended := resource.session_error(sessions)) is not None:
                 raise ended
     except BaseException as refused:
         permitted.close()

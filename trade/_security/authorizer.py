@@ -84,7 +84,7 @@ SOME_HAVE: Final = {
     "try_rules": "administer",  # its conditions are called with the rights of the container
     "save_rules": "administer",
 }
-"""Likewise, for functions of containers that supervise others, or run rules."""
+"""The same for functions that only some containers have: those that supervise others, or run rules."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
 _OPEN_TO_ALL: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor", "rule_file")
 """The providers of these functions: offering them needs no right, as each of their callers is checked."""
@@ -98,10 +98,10 @@ def verb_of(domain: str, name: str, effect: str) -> str:
     return _ALL_FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
 
 
-def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:
+def decide_call(policy: Policy, identity: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:
     """Whether an identity may call a service of a group: the verb that the call needs, and the decision."""
     verb = verb_of(domain, name, effect)
-    return (verb, policy.decide(who, verb, domain)) if verb else ("call", policy.authenticated(who))
+    return (verb, policy.decide(identity, verb, domain)) if verb else ("call", policy.authenticated(identity))
 
 
 class Authorizer:
@@ -135,82 +135,82 @@ class Authorizer:
         policy = self.policy if self._certified else None
         return [] if policy is None else [*policy.names(), *policy.gateways]
 
-    def hidden(self, who: str, group: str) -> str:
+    def hidden(self, identity: str, group: str) -> str:
         """Why the contents of a group are hidden from an identity, in the policy's words; empty: they are not."""
         if self.policy is None or not self._certified or group in ("", DOMAIN):
             return ""
-        decision = self.policy.decide(who, "read", group)
-        return "" if decision.allowed else f"{who} may not read {group}: {decision.rule}"
+        decision = self.policy.decide(identity, "read", group)
+        return "" if decision.allowed else f"{identity} may not read {group}: {decision.rule}"
 
     # --- calls
 
     def denied_call(
-        self, policy: Policy, who: str, domain: str, name: str, effect: str, what: str
+        self, policy: Policy, identity: str, domain: str, name: str, effect: str, what: str
     ) -> AccessDenied | None:
         """Why an identity may not call a service; None if it may."""
-        verb, decision = decide_call(policy, who, domain, name, effect)
-        return None if decision.allowed else AccessDenied(who=who, verb=verb, what=what, rule=decision.rule)
+        verb, decision = decide_call(policy, identity, domain, name, effect)
+        return None if decision.allowed else AccessDenied(who=identity, verb=verb, what=what, rule=decision.rule)
 
-    def require_call(self, who: str, domain: str, name: str, effect: str, what: str) -> None:
+    def require_call(self, identity: str, domain: str, name: str, effect: str, what: str) -> None:
         """Raises AccessDenied: the identity may not call the service."""
         if self.policy is not None:
-            denied = self.denied_call(self.policy, who, domain, name, effect, what)
+            denied = self.denied_call(self.policy, identity, domain, name, effect, what)
             if denied is not None:
                 raise denied
 
     # --- everything else
 
-    def require(self, who: str, verb: str, group: str, what: str) -> None:
+    def require(self, identity: str, verb: str, group: str, what: str) -> None:
         """Raises AccessDenied: the identity does not have the verb over the group."""
-        self.require_any(who, verb, (group,), what)
+        self.require_any(identity, verb, (group,), what)
 
-    def denied(self, who: str, verb: str, group: str, what: str) -> AccessDenied | None:
+    def denied(self, identity: str, verb: str, group: str, what: str) -> AccessDenied | None:
         """Why the identity does not have the verb over the group; None if it has."""
-        return self._denied_all(who, verb, (group,), what)
+        return self._denied_all(identity, verb, (group,), what)
 
-    def require_any(self, who: str, verb: str, groups: Iterable[str], what: str) -> None:
+    def require_any(self, identity: str, verb: str, groups: Iterable[str], what: str) -> None:
         """Raises AccessDenied: the identity has the verb over none of the groups."""
-        denied = self._denied_all(who, verb, groups, what)
+        denied = self._denied_all(identity, verb, groups, what)
         if denied is not None:
             raise denied
 
-    def _denied_all(self, who: str, verb: str, groups: Iterable[str], what: str) -> AccessDenied | None:
+    def _denied_all(self, identity: str, verb: str, groups: Iterable[str], what: str) -> AccessDenied | None:
         if self.policy is None:
             return None
         rule = f"no offered service uses {what}"
         for group in sorted(groups):
-            decision = self.policy.decide(who, verb, group)
+            decision = self.policy.decide(identity, verb, group)
             if decision.allowed:
                 return None
             rule = decision.rule
-        return AccessDenied(who=who, verb=verb, what=what, rule=rule)
+        return AccessDenied(who=identity, verb=verb, what=what, rule=rule)
 
-    def denied_lock(self, who: str, resources: Iterable[tuple[str, Iterable[str]]]) -> AccessDenied | None:
+    def denied_lock(self, identity: str, resources: Iterable[tuple[str, Iterable[str]]]) -> AccessDenied | None:
         """Why an identity may not lock resources, each given with the groups that use it; None if it may."""
-        denials = (self._denied_all(who, "lock", groups, name) for name, groups in resources)
+        denials = (self._denied_all(identity, "lock", groups, name) for name, groups in resources)
         return next((denied for denied in denials if denied is not None), None)
 
-    def denied_order(self, who: str, *, clears: bool) -> AccessDenied | None:
+    def denied_order(self, identity: str, *, clears: bool) -> AccessDenied | None:
         """Why an e-stop order is refused: any identity may stop, but only an administrator of the system may clear."""
         if self.policy is None:
             return None
         verb = "administer" if clears else "call"
-        decision = self.policy.decide(who, verb, DOMAIN) if clears else self.policy.authenticated(who)
-        return None if decision.allowed else AccessDenied(who=who, verb=verb, what="estop", rule=decision.rule)
+        decision = self.policy.decide(identity, verb, DOMAIN) if clears else self.policy.authenticated(identity)
+        return None if decision.allowed else AccessDenied(who=identity, verb=verb, what="estop", rule=decision.rule)
 
-    def may_have_stops(self, who: str) -> bool:
+    def may_have_stops(self, identity: str) -> bool:
         """Whether an identity may offer any service: otherwise it has nothing to stop."""
-        return self.policy is None or bool(self.policy.groups_of(who, ("register",)))
+        return self.policy is None or bool(self.policy.groups_of(identity, ("register",)))
 
-    def may_offer(self, who: str, domain: str, provider: str, groups: Sequence[str]) -> bool:
+    def may_offer(self, identity: str, domain: str, provider: str, groups: Sequence[str]) -> bool:
         """Whether an identity may offer what a registry entry describes: own functions, or what the policy allows."""
         if self.policy is None:
             return True
         if domain == DOMAIN and provider in _OPEN_TO_ALL and tuple(groups) == (DOMAIN,):
-            return self.policy.authenticated(who).allowed
-        return all(self.policy.decide(who, "register", group).allowed for group in (domain, *groups))
+            return self.policy.authenticated(identity).allowed
+        return all(self.policy.decide(identity, "register", group).allowed for group in (domain, *groups))
 
-    def require_offer(self, who: str, groups: tuple[str, ...], what: str) -> None:
+    def require_offer(self, identity: str, groups: tuple[str, ...], what: str) -> None:
         """Raises AccessDenied: the identity may not offer something in all of these groups."""
         for group in groups or (domain_of(groups),):
-            self.require(who, "register", group, f"{what} in {group}")
+            self.require(identity, "register", group, f"{what} in {group}")

@@ -8,14 +8,11 @@ import codecs
 import contextlib
 import hashlib
 import ipaddress
-import logging
 import os
 import ssl
 import stat
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -185,53 +182,3 @@ def _shaken_hands(client: ssl.SSLContext, server: ssl.SSLContext) -> dict[str, A
 def _refusal(refused: ssl.SSLCertVerificationError) -> str:
     foreign = f"was not issued by the authority in {_CA} beside it ({refused.verify_message}); {_ISSUE}"
     return _REFUSALS.get(refused.verify_code, foreign)
-
-
-_logger = logging.getLogger("trade")
-
-_WARN_AHEAD: Final = (timedelta(days=1), timedelta(hours=1))
-"""Times before the end at which a warning is logged, each once; times already past at the start cause one warning."""
-_LOOK_S: Final = 600.0
-"""A computer that slept checks the time again within this interval."""
-
-
-class ExpiryWatch:
-    """Warns before the certificate expires, until it is closed."""
-
-    def __init__(self, certificate: Certificate, warned: Callable[[str], None] = lambda _: None) -> None:
-        """Warn now if it is due; ``warned`` is called with the time of the end."""
-        self._certificate = certificate
-        self._tell_warned = warned
-        self._warned = 0
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="trade-certificate", daemon=True)
-        self._warn()
-        self._thread.start()
-
-    def _run(self) -> None:
-        while self._warned < len(_WARN_AHEAD) and not self._closed.wait(self._until_next_s()):
-            self._warn()
-
-    def _until_next_s(self) -> float:
-        left = self._left() - _WARN_AHEAD[self._warned]
-        return min(_LOOK_S, max(0.0, left.total_seconds()))
-
-    def _left(self) -> timedelta:
-        return self._certificate.until - datetime.now(timezone.utc)
-
-    def _warn(self) -> None:
-        due = sum(self._left() <= ahead for ahead in _WARN_AHEAD)
-        if due > self._warned:
-            self._warned = due
-            who, until = self._certificate.identity, f"{self._certificate.until:%Y-%m-%d %H:%M} UTC"
-            _logger.warning(
-                "the certificate of %s ends %s: renew it (`trade pki issue %s`) and start this container again before "
-                "that, or all its links end then (`trade gateway` loads the new one by itself)",
-                *(who, until, who),
-            )
-            self._tell_warned(until)
-
-    def close(self) -> None:
-        """End the thread. Idempotent."""
-        self._closed.set()
-        self._thread.join(2)

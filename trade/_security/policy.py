@@ -74,43 +74,49 @@ class Policy:
 
     # --- asking
 
-    def decide(self, who: str, verb: str, group: str) -> Decision:
+    def decide(self, identity: str, verb: str, group: str) -> Decision:
         """Whether an identity may do something in a group.
 
         Args:
-            who: the identity.
+            identity: the identity.
             verb: one of ``VERBS``.
             group: a whole dotted group; ``_`` for what is in none.
         """
-        if who in self.revoked:
-            return Decision(False, f"{who} is revoked")
-        rights = self._of.get(who)
+        if identity in self.revoked:
+            return Decision(False, f"{identity} is revoked")
+        rights = self._of.get(identity)
         if rights is None:
-            rights = self._learn(who)
+            rights = self._learn(identity)
         rule = rights.get((verb, EVERYTHING))
         above = group
         while rule is None and above:
             rule = rights.get((verb, above))
             above = above.rpartition(".")[0]
         if rule is None:
-            return Decision(False, self._why_not(who, verb, group))
+            return Decision(False, self._why_not(identity, verb, group))
         return Decision(True, rule)
 
-    def authenticated(self, who: str) -> Decision:
+    def authenticated(self, identity: str) -> Decision:
         """Whether an identity may do what needs no right: every one that is not revoked."""
-        return Decision(False, f"{who} is revoked") if who in self.revoked else Decision(True, "every identity may")
+        return (
+            Decision(False, f"{identity} is revoked")
+            if identity in self.revoked
+            else Decision(True, "every identity may")
+        )
 
-    def asks_first(self, who: str, group: str) -> bool:
+    def asks_first(self, identity: str, group: str) -> bool:
         """Whether an agent of that name needs a person's approval for what acts in a whole dotted group."""
-        marked = {one for name, groups in self.approval.items() if fnmatch.fnmatchcase(who, name) for one in groups}
+        marked = {
+            one for name, groups in self.approval.items() if fnmatch.fnmatchcase(identity, name) for one in groups
+        }
         words = group.split(".")
         return not marked.isdisjoint({EVERYTHING, *(".".join(words[:count]) for count in range(1, len(words) + 1))})
 
-    def roles_of(self, who: str) -> tuple[str, ...]:
+    def roles_of(self, identity: str) -> tuple[str, ...]:
         """The roles of an identity, in the order of the policy; a revoked one has none."""
-        if who in self.revoked:
+        if identity in self.revoked:
             return ()
-        found = (names for pattern, names in self.identities.items() if fnmatch.fnmatchcase(who, pattern))
+        found = (names for pattern, names in self.identities.items() if fnmatch.fnmatchcase(identity, pattern))
         return tuple(dict.fromkeys(name for names in found for name in names))
 
     def roles_with(self, verb: str, group: str) -> tuple[str, ...]:
@@ -119,10 +125,10 @@ class Policy:
         covering = [EVERYTHING, *(".".join(words[:count]) for count in range(1, len(words) + 1))]
         return tuple(name for name, rights in self._of_role.items() if any((verb, one) in rights for one in covering))
 
-    def groups_of(self, who: str, verbs: Iterable[str]) -> list[str]:
+    def groups_of(self, identity: str, verbs: Iterable[str]) -> list[str]:
         """The groups an identity has one of these verbs over, as the rules name them, sorted; only ``*`` if all."""
         wanted = set(verbs)
-        groups = {group for verb, group in self._rights(who) if verb in wanted}
+        groups = {group for verb, group in self._rights(identity) if verb in wanted}
         return [EVERYTHING] if EVERYTHING in groups else sorted(groups)
 
     def names(self) -> list[str]:
@@ -135,17 +141,17 @@ class Policy:
 
     # --- compiling
 
-    def _rights(self, who: str) -> _Rights:
+    def _rights(self, identity: str) -> _Rights:
         rights: _Rights = {}
-        for name in self.roles_of(who):
+        for name in self.roles_of(identity):
             for right, rule in self._of_role[name].items():
                 rights.setdefault(right, rule)
         return rights
 
-    def _learn(self, who: str) -> _Rights:
+    def _learn(self, identity: str) -> _Rights:
         if len(self._of) >= _MOST_STRANGERS:
             self._of.clear()
-        return self._of.setdefault(who, self._rights(who))
+        return self._of.setdefault(identity, self._rights(identity))
 
     def _rights_of_role(self, name: str) -> _Rights:
         rights: _Rights = {}
@@ -161,10 +167,10 @@ class Policy:
                     rights.setdefault((verb, group), f"role {role.name}: {verb} {group}")
         return rights
 
-    def _why_not(self, who: str, verb: str, group: str) -> str:
-        roles = self.roles_of(who)
+    def _why_not(self, identity: str, verb: str, group: str) -> str:
+        roles = self.roles_of(identity)
         if not roles:
-            return f"no rule gives {who} a role"
+            return f"no rule gives {identity} a role"
         return f"no rule of role{'s' if len(roles) > 1 else ''} {', '.join(roles)} allows {verb} in {group}"
 
 

@@ -138,9 +138,9 @@ def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
     ]
 
 
-def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence[str], pattern: str) -> list[str]:
+def _over(policy: Policy | None, identity: str, verbs: Iterable[str], among: Sequence[str], pattern: str) -> list[str]:
     """Keys of those of some groups over which an identity has one of the verbs, and of the middleware's own."""
-    groups = _both([EVERYTHING] if policy is None else policy.groups_of(who, verbs), among)
+    groups = _both([EVERYTHING] if policy is None else policy.groups_of(identity, verbs), among)
     if groups == [EVERYTHING]:
         return [pattern.format("*")]
     own = [DOMAIN] if DOMAIN not in groups else []
@@ -150,7 +150,7 @@ def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence
 
 def _paced(
     policy: Policy | None,
-    who: str,
+    identity: str,
     verb: str,
     among: Sequence[str],
     limits: Mapping[str, float],
@@ -161,7 +161,7 @@ def _paced(
     for limit in sorted({limits.get(group, inf) for group in among} or {inf}):
         groups = [group for group in among if limits.get(group, inf) == limit]
         rates = ["*"] if limit == inf else [_SLOWER, *(str(step) for step in STEPS_HZ if step <= limit)]
-        keys += [f"{key}/{rate}" for key in _over(policy, who, (verb,), groups, pattern) for rate in rates]
+        keys += [f"{key}/{rate}" for key in _over(policy, identity, (verb,), groups, pattern) for rate in rates]
     return list(dict.fromkeys(keys))
 
 
@@ -180,9 +180,9 @@ def _trusted() -> list[_Row]:
     return [(flow, message, ["**"]) for flow in (_IN, _OUT) for message in _ALL_MESSAGES]
 
 
-def _rule(who: str, flow: str, message: str, keys: Sequence[str], namespace: str) -> dict[str, Any]:
+def _rule(identity: str, flow: str, message: str, keys: Sequence[str], namespace: str) -> dict[str, Any]:
     return {
-        "id": f"{who} {flow} {message}",
+        "id": f"{identity} {flow} {message}",
         "permission": "allow",
         "flows": [flow],
         "messages": [message],

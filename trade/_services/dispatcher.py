@@ -48,6 +48,7 @@ from trade._services.local_service import LocalService
 from trade._services.providers import Providers
 from trade._services.serial_queue import SerialQueue
 from trade._threads.channel_workers import WorkerPool
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import ChannelClosed, Message, Publisher, Transport
 from trade.errors import (
     AccessDenied,
@@ -126,6 +127,7 @@ class Dispatcher:
         loop: AsyncLoop,
         access: Authorizer,
         audit: Audit,
+        timers: Scheduler,
     ) -> None:
         self._transport = transport
         self._audit = audit
@@ -141,7 +143,7 @@ class Dispatcher:
         self._leaving = False
         self._closed = False
         self._deduplicator = CallDeduplicator()
-        self._progress_reporter = ProgressReporter(self._send_progress)
+        self._progress_reporter = ProgressReporter(self._send_progress, timers)
         self.malformed = 0
         self.callers = set[str]()
         """Identities with channels of their own; empty: all share the same channels."""
@@ -337,10 +339,10 @@ class Dispatcher:
             return None
         return IncomingCall(call, caller, replier, place[len(self._here) :])
 
-    def drop(self, where: str, who: str, bad: Exception) -> None:
+    def drop(self, where: str, identity: str, bad: Exception) -> None:
         """Records that something came in that is no call."""
         self.malformed += 1
-        self._audit.refused(where, str(bad), who=who)
+        self._audit.refused(where, str(bad), who=identity)
         if self.malformed == 1:
             _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", where, bad)
 

@@ -296,10 +296,10 @@ class LocalServer:
         if channel.problem is not None:
             raise channel.problem
 
-    def _process(self, who: str, message: Message, *, stops: bool) -> None:
+    def _process(self, identity: str, message: Message, *, stops: bool) -> None:
         with self._lock:
-            full = self._working[who] >= MOST_THREADS and not stops
-            self._working[who] += 1
+            full = self._working[identity] >= MOST_THREADS and not stops
+            self._working[identity] += 1
             self.taken += not full
         try:
             if full:
@@ -312,7 +312,7 @@ class LocalServer:
             _logger.exception("a call on %s could not be answered", message.key)
         finally:
             with self._lock:
-                self._working[who] -= 1
+                self._working[identity] -= 1
 
     def close(self) -> None:
         """Takes no more calls; those under way still get their answers. Idempotent."""

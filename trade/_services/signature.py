@@ -36,15 +36,18 @@ _infos: Final[WeakValueDictionary[tuple[str, ServiceMark, Callable[..., Any]], S
 
 
 class Signature:
-    """Made once for all objects that share the method; each use passes the service's name, for errors."""
+    """Checks and converts the arguments and the result of a service method, and describes both as JSON Schema.
+
+    All objects that share the method share one. Each use passes the service's name, for errors.
+    """
 
     def __init__(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any], codec: Codec) -> None:
         hints = _hints(where, function)
         parameters = _parameters(where, function)
         self._names = [parameter.name for parameter in parameters]
-        kinds = {parameter.name: hints.get(parameter.name, Any) for parameter in parameters}
+        types = {parameter.name: hints.get(parameter.name, Any) for parameter in parameters}
         returns = hints.get("return", Any)
-        self._secrets = frozenset(name for name, kind in kinds.items() if is_secret(kind))
+        self._secrets = frozenset(name for name, kind in types.items() if is_secret(kind))
         self.has_secrets = bool(self._secrets)
         """Whether an argument is secret."""
         self._codec = codec
@@ -52,28 +55,28 @@ class Signature:
         self._positional = [p.name for p in parameters if p.kind in _POSITIONAL]
         self._keyword_only = [p.name for p in parameters if p.kind not in _POSITIONAL]
         self._all_given = not self._keyword_only and all(p.default is p.empty for p in parameters)
-        self._decode_array, self._decode_map = self._decoders(where, parameters, kinds)
-        self._must_be_finite = mark.effect != "read" and any(_mentions_float(kind) for kind in kinds.values())
-        self._is_finite = math.isfinite if all(_is_number(kind) for kind in kinds.values()) else _finite
+        self._decode_array, self._decode_map = self._decoders(where, parameters, types)
+        self._must_be_finite = mark.effect != "read" and any(_mentions_float(kind) for kind in types.values())
+        self._is_finite = math.isfinite if all(_is_number(kind) for kind in types.values()) else _finite
         self._result_is_plain = returns if returns is Any or (isinstance(returns, type) and returns in _PLAIN) else None
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
         key = (name, mark, function)
         # Code executed from text may have no module.
         known = _infos.get(key) if (function.__module__ or "").startswith("trade.") else None
-        self.info = known or describe(where, name, mark, function, parameters, kinds, returns, codec)
+        self.info = known or describe(where, name, mark, function, parameters, types, returns, codec)
         _infos[key] = self.info
 
     def _decoders(
-        self, where: str, parameters: Sequence[inspect.Parameter], kinds: Mapping[str, Any]
+        self, where: str, parameters: Sequence[inspect.Parameter], types: Mapping[str, Any]
     ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        fields = [field_of(parameter, kinds[parameter.name]) for parameter in parameters]
-        places = [field for field, p in zip(fields, parameters, strict=True) if p.kind in _POSITIONAL]
+        fields = [field_of(parameter, types[parameter.name]) for parameter in parameters]
+        positional = [field for field, p in zip(fields, parameters, strict=True) if p.kind in _POSITIONAL]
 
         def build() -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-            array: Any = tuple.__class_getitem__(tuple(kinds[name] for name in self._positional))
+            array: Any = tuple.__class_getitem__(tuple(types[name] for name in self._positional))
             if not self._all_given:
-                array = msgspec.defstruct("Arguments", places, array_like=True, forbid_unknown_fields=True)
+                array = msgspec.defstruct("Arguments", positional, array_like=True, forbid_unknown_fields=True)
             named = msgspec.defstruct("Arguments", fields, kw_only=True, forbid_unknown_fields=True)
             return self._codec.decoder(array), self._codec.decoder(named)
 
@@ -218,8 +221,8 @@ class Signature:
         return InvalidArgument(service=service, argument=name, problem=NOT_FINITE, signature=self.info.signature)
 
 
-def too_many(places: int, given: int) -> str:
-    return f"takes at most {places} positional argument{'' if places == 1 else 's'}, got {given}"
+def too_many(positional: int, given: int) -> str:
+    return f"takes at most {positional} positional argument{'' if positional == 1 else 's'}, got {given}"
 
 
 def _hints(where: str, function: Callable[..., Any]) -> dict[str, Any]:

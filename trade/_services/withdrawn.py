@@ -21,7 +21,7 @@ class WithdrawnInfo(Struct, frozen=True):
     groups: tuple[str, ...]
 
 
-class Withdrawn:
+class WithdrawnProviders:
     """Owns the withdrawn providers; the code that registered an object keeps the final say over it."""
 
     def __init__(self, providers: Providers, rest: Callable[[Sequence[Resource], str], list[str]]) -> None:

@@ -90,7 +90,7 @@ class _Push:
         self._target = target
         self._problem = ""
         due = scheduler.due(self._act)
-        stream.tell(lambda: due.at(time.monotonic_ns()))
+        stream.on_sample(lambda: due.at(time.monotonic_ns()))
         due.at(time.monotonic_ns())  # samples may have arrived already
 
     def _act(self) -> None:

@@ -55,21 +55,21 @@ class Rate:
         self._put: tuple[bool, bytes] | None = None
         self._put_ns = 0
 
-    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: ActiveRate, every_ns: int) -> None:
+    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, requested: ActiveRate, every_ns: int) -> None:
         """Publish a sample, unless it is too soon, or unchanged for listeners of changes only.
 
         Args:
             answer: whether the service failed, and its result.
             at: ``time.time()`` of the call.
             at_ns: the monotonic clock at that moment.
-            wished: the requests for this rate.
+            requested: the requests for this rate.
             every_ns: the period of sampling.
         """
         stale = at_ns - self._put_ns >= SIGN_S * 1e9
-        if not (wished.newly or stale or wished.always or answer != self._put):
+        if not (requested.newly or stale or requested.always or answer != self._put):
             return
         on_time = every_ns >= self._period_ns or self._pace.takes(at_ns)
-        if not (wished.newly or on_time):
+        if not (requested.newly or on_time):
             return
         self._number += 1
         self._publisher.put(encode_message(StreamSample(PROTOCOL, self._number, at, at_ns, answer[0], Raw(answer[1]))))

@@ -13,7 +13,7 @@ Hz = Annotated[float, Meta(ge=LEAST_HZ, le=MOST_HZ)]
 
 
 class StreamServices:
-    """The wire side of `Streams`."""
+    """Starts and ends streams of this container's services for clients in other containers, and lists them."""
 
     def __init__(self, streams: Streams) -> None:
         self._streams = streams
@@ -24,8 +24,8 @@ class StreamServices:
 
         ``name`` is the listener's own; the samples are published on the key of the stream.
         """
-        asked = served_call()
-        self._streams.listen(service, (asked.session, name), RateRequest(asked.caller, hz, on_change))
+        call = served_call()
+        self._streams.listen(service, (call.session, name), RateRequest(call.caller, hz, on_change))
 
     @service(effect="read")
     def stream_listeners(self) -> list[ListenerInfo]:

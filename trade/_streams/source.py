@@ -80,17 +80,17 @@ class Source:
         services: Callable[[ServiceKey], LocalService | None],
         transport: Transport,
         new_id: Callable[[], int],
-        tell: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None,
+        callback: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None,
     ) -> None:
         self._key = key
         self._services = services
         self._transport = transport
         self._new_id = new_id
-        self._tell = tell
+        self._tell = callback
         """Called with each listener that comes (True) or goes."""
         self._shown = ExitStack()
         self._lock = threading.Lock()
-        self._wishes: dict[Listener, RateRequest] = {}
+        self._requests: dict[Listener, RateRequest] = {}
         self._new: set[float] = set()
         """Rates at which a listener wants a sample at once."""
         self._rates: dict[float, Rate] = {}
@@ -102,7 +102,7 @@ class Source:
         for hz in STEPS_HZ:
             self._shown.callback(self._transport.appear(stream_key(self._key, hz)).close)
 
-    def wish(self, listener: Listener, wish: RateRequest) -> bool:
+    def request(self, listener: Listener, request: RateRequest) -> bool:
         """Add or renew a listener; returns whether its request has changed.
 
         Raises:
@@ -110,17 +110,17 @@ class Source:
         """
         where = f"{self._key.domain}.{self._key.name}"
         with self._lock:
-            before = self._wishes.get(listener)
-            if before is None and len(self._wishes) >= _MOST:
+            before = self._requests.get(listener)
+            if before is None and len(self._requests) >= _MOST:
                 raise ConfigurationError(where=where, problem=f"it has {_MOST} listeners already")
-            rates = {other.hz for other in self._wishes.values()}
-            if wish.hz not in rates and len(rates) >= _MOST_RATES:
+            rates = {other.hz for other in self._requests.values()}
+            if request.hz not in rates and len(rates) >= _MOST_RATES:
                 problem = f"it is sampled at {_MOST_RATES} different rates already; ask for one of {sorted(rates)}"
                 raise ConfigurationError(where=where, problem=problem)
-            self._wishes[listener] = wish
-            new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
+            self._requests[listener] = request
+            new = before is None or (before.hz, before.on_change) != (request.hz, request.on_change)
             if new:
-                self._new.add(wish.hz)
+                self._new.add(request.hz)
         if before is None:
             self._tell(self._key, listener, True)
         return new
@@ -128,53 +128,55 @@ class Source:
     def drop(self, which: Callable[[Listener, RateRequest], bool]) -> None:
         """Remove listeners."""
         with self._lock:
-            gone = [who for who, wish in self._wishes.items() if which(who, wish)]
+            gone = [who for who, request in self._requests.items() if which(who, request)]
             for who in gone:
-                del self._wishes[who]
+                del self._requests[who]
         for who in gone:
             self._tell(self._key, who, False)
 
-    def wishes(self) -> dict[Listener, RateRequest]:
+    def requests(self) -> dict[Listener, RateRequest]:
         """The requests by listener."""
         with self._lock:
-            return dict(self._wishes)
+            return dict(self._requests)
 
     def identities(self) -> set[str]:
         """The identities of the listeners."""
         with self._lock:
-            return {wish.identity for wish in self._wishes.values()}
+            return {request.identity for request in self._requests.values()}
 
     def tick(self) -> int | None:
         """Sample the service if it has listeners; returns the time of the next tick."""
         now = time.monotonic_ns()
-        self.drop(lambda _, wish: wish.until_ns <= now)
+        self.drop(lambda _, request: request.until_ns <= now)
         service = self._services(self._key)
-        wished = {} if service is None else self._wished()
+        requested = {} if service is None else self._rates_requested()
         try:
-            self._keep_only(wished)
-            if service is None or not wished:
+            self._keep_only(requested)
+            if service is None or not requested:
                 self._next_ns = 0
                 return None
-            at, every_ns = time.time(), period_ns(max(wished))
+            at, every_ns = time.time(), period_ns(max(requested))
             answer = self._sampled(service, now)
-            for hz, how in wished.items():
+            for hz, how in requested.items():
                 self._rates[hz].offer(answer, at, now, how, every_ns)
         except ChannelClosed:
             return None
         return self._after(now, every_ns)
 
-    def _wished(self) -> dict[float, ActiveRate]:
+    def _rates_requested(self) -> dict[float, ActiveRate]:
         """The combined requests by rate."""
         with self._lock:
             new, self._new = self._new, set[float]()
-            always = {wish.hz for wish in self._wishes.values() if not wish.on_change}
-            return {wish.hz: ActiveRate(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
+            always = {request.hz for request in self._requests.values() if not request.on_change}
+            return {
+                request.hz: ActiveRate(request.hz in always, request.hz in new) for request in self._requests.values()
+            }
 
-    def _keep_only(self, wished: dict[float, ActiveRate]) -> None:
+    def _keep_only(self, requested: dict[float, ActiveRate]) -> None:
         """Publish at these rates only."""
-        for hz in [hz for hz in self._rates if hz not in wished]:
+        for hz in [hz for hz in self._rates if hz not in requested]:
             self._rates.pop(hz).close()
-        for hz in wished:
+        for hz in requested:
             if hz not in self._rates:
                 self._rates[hz] = Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
 
@@ -204,7 +206,7 @@ class Source:
 
     def close(self) -> None:
         """Stop sampling; the last tick releases the keys. Idempotent."""
-        self.drop(lambda _listener, _wish: True)
+        self.drop(lambda _listener, _request: True)
         self._shown.close()
 
 
@@ -241,7 +243,7 @@ class Streams:
         self.notify: Callable[[ServiceKey, Listener, bool], None] = lambda _key, _listener, _came: None
         """Called with each listener that comes (True) or goes."""
 
-    def listen(self, handle: Handle, listener: Listener, wish: RateRequest) -> None:
+    def listen(self, handle: Handle, listener: Listener, request: RateRequest) -> None:
         """Sample a service of this container for a listener, for as long as the lease.
 
         Raises:
@@ -258,11 +260,11 @@ class Streams:
         if service is None:
             raise ServiceGone(service=handle.label)
         check_sampled(handle)
-        self._client.require_call(wish.identity, handle)
+        self._client.require_call(request.identity, handle)
         source, again = self._source(key)
         until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
-        in_key = float(f"{wish.hz:g}")  # smaller differences are one rate
-        if source.wish(listener, structs.replace(wish, hz=in_key, until_ns=until_ns)):
+        in_key = float(f"{request.hz:g}")  # smaller differences are one rate
+        if source.request(listener, structs.replace(request, hz=in_key, until_ns=until_ns)):
             again(time.monotonic_ns())
 
     def _source(self, key: ServiceKey) -> tuple[Source, Callable[[int], None]]:
@@ -289,34 +291,34 @@ class Streams:
                 container=self._client.name,
                 service=self._client.handle(key).label,
                 session=session,
-                identity=wish.identity,
-                hz=wish.hz,
-                on_change=wish.on_change,
-                left_s=max(0.0, (wish.until_ns - now_ns) / 1e9),
+                identity=request.identity,
+                hz=request.hz,
+                on_change=request.on_change,
+                left_s=max(0.0, (request.until_ns - now_ns) / 1e9),
             )
             for key, (source, _) in sources
-            for (session, _), wish in source.wishes().items()
+            for (session, _), request in source.requests().items()
         ]
 
     def unlisten(self, listener: Listener) -> None:
         """Remove a listener."""
-        self._drop(lambda who, _wish: who == listener)
+        self._drop(lambda known, _request: known == listener)
 
     def session_ended(self, session: str) -> None:
         """Remove the listeners of a session that ended."""
-        self._drop(lambda who, _wish: who[0] == session)
+        self._drop(lambda listener, _request: listener[0] == session)
 
     def recheck_access(self) -> None:
         """Drop the listeners that may no longer read a service; they are refused when they renew."""
         with self._lock:
             sources = list(self._sources.items())
         for key, (source, _) in sources:
-            denied = {who for who in source.identities() if self._denied(who, key)}
-            source.drop(lambda _, wish, denied=denied: wish.identity in denied)
+            denied = {identity for identity in source.identities() if self._denied(identity, key)}
+            source.drop(lambda _, request, denied=denied: request.identity in denied)
 
-    def _denied(self, who: str, key: ServiceKey) -> bool:
+    def _denied(self, identity: str, key: ServiceKey) -> bool:
         try:
-            self._client.require_call(who, self._client.handle(key))
+            self._client.require_call(identity, self._client.handle(key))
         except (AccessDenied, ServiceGone):
             return True
         return False

@@ -22,7 +22,7 @@ _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 If = Callable[[Any], object]
 
 
-class _Heard(NamedTuple):
+class _PendingSample(NamedTuple):
     """A sample that has not been taken yet."""
 
     sample: Sample
@@ -62,9 +62,9 @@ class Stream(Generic[Value]):
         """The session that it ends with; None: its container."""
         self._decode = decode
         self._if = if_
-        self._tell_ended = ended
+        self._on_ended = ended
         self._lock = threading.Lock()
-        self._waiting: deque[_Heard | BaseException] = deque()
+        self._waiting: deque[_PendingSample | BaseException] = deque()
         self._keep = keep
         self._body: tuple[bool, bytes] | None = None
         """The last message received that is its own."""
@@ -73,7 +73,7 @@ class Stream(Generic[Value]):
         self._end: BaseException | None = None
         self._closed = False
         self._changed = InterruptibleCondition()
-        self._on_more: set[Callable[[], None]] = set()
+        self._callbacks: set[Callable[[], None]] = set()
 
     # --- taking
 
@@ -94,12 +94,12 @@ class Stream(Generic[Value]):
         """
         taken: list[Sample[Value]] = []
 
-        def came() -> bool:
+        def received() -> bool:
             sample = self.take()
             taken.extend([] if sample is None else [sample])
             return bool(taken)
 
-        if not self._changed.wait_for(came, timeout_s):
+        if not self._changed.wait_for(received, timeout_s):
             raise TimeoutError(f"no sample of {self.source.label} came within {timeout_s} s")
         return taken[0]
 
@@ -111,18 +111,18 @@ class Stream(Generic[Value]):
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(woken.set)
 
-        self.tell(wake)
+        self.on_sample(wake)
         try:
             while (taken := self.take()) is None:
                 await woken.wait()
                 woken.clear()
         finally:
-            self._on_more.discard(wake)
+            self._callbacks.discard(wake)
         return taken
 
-    def tell(self, more: Callable[[], None]) -> None:
+    def on_sample(self, callback: Callable[[], None]) -> None:
         """Have a function called whenever there is more to take, or the stream ends; it must not block."""
-        self._on_more.add(more)
+        self._callbacks.add(callback)
 
     def take(self) -> Sample[Value] | None:
         """The oldest sample not taken yet, None if there is none now. Raises like `next`."""
@@ -131,12 +131,12 @@ class Stream(Generic[Value]):
                 if self._end is not None:
                     raise self._end
                 return None
-            heard = self._waiting.popleft()
-            if isinstance(heard, BaseException):
-                raise heard
-            dropped = heard.missed - self._reported + self._overflowed
-            self._reported, self._overflowed = heard.missed, 0
-        return msgspec.structs.replace(heard.sample, dropped=dropped) if dropped else heard.sample
+            pending = self._waiting.popleft()
+            if isinstance(pending, BaseException):
+                raise pending
+            dropped = pending.missed - self._reported + self._overflowed
+            self._reported, self._overflowed = pending.missed, 0
+        return msgspec.structs.replace(pending.sample, dropped=dropped) if dropped else pending.sample
 
     def latest(self) -> Sample[Value] | None:
         """The newest sample, None before the first; neither takes nor waits.
@@ -184,14 +184,14 @@ class Stream(Generic[Value]):
             self._waiting.clear()
         self.end(ConfigurationError(where=self.source.label, problem="this stream was closed; open another one"))
 
-    def end(self, why: BaseException) -> None:
+    def end(self, error: BaseException) -> None:
         """Called by the container: no more samples come. Those already here can still be taken."""
         with self._lock:
             if self._end is not None:
                 return
-            self._end = why
+            self._end = error
         self._ring()
-        self._tell_ended(self)
+        self._on_ended(self)
 
     def session_ended(self, session: str) -> None:
         """Called by the container."""
@@ -261,12 +261,12 @@ class Stream(Generic[Value]):
             if self._end is not None:
                 return
             self._latest = heard
-            if len(self._waiting) >= self._keep and isinstance(self._waiting.popleft(), _Heard):
+            if len(self._waiting) >= self._keep and isinstance(self._waiting.popleft(), _PendingSample):
                 self._overflowed += 1
-            self._waiting.append(heard if isinstance(heard, BaseException) else _Heard(heard, self._missed))
+            self._waiting.append(heard if isinstance(heard, BaseException) else _PendingSample(heard, self._missed))
         self._ring()
 
     def _ring(self) -> None:
         self._changed.notify_all()
-        for tell in list(self._on_more):
+        for tell in list(self._callbacks):
             tell()

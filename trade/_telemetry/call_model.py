@@ -138,10 +138,10 @@ def made_here(span: Span) -> bool:
 class CallWatch:
     """Reports each pair of calls that a container makes and that its model does not have, once."""
 
-    def __init__(self, usual: CallModel, tell: Callable[[str, str, int], None]) -> None:
+    def __init__(self, usual: CallModel, callback: Callable[[str, str, int], None]) -> None:
         self.usual: Final = usual
         """The model."""
-        self._tell = tell
+        self._tell = callback
         """Called with the service before, the service after, and the id of its call."""
         self._lock = threading.Lock()
         self._last: OrderedDict[str | int, str] = OrderedDict()

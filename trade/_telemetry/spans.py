@@ -75,28 +75,28 @@ class Spans:
         identity: str,
         session: str,
         locks: Callable[[Sequence[Token]], list[str]],
-        tell: Callable[[Span], None] | None = None,
+        on_span: Callable[[Span], None] | None = None,
     ) -> None:
         self._container = container
         self._identity = identity
         self._session = session
         self.locks = locks
         """Describes the locks of tokens."""
-        self._tell = tell
+        self._on_span = on_span
         """Called with each span."""
         self.watch: Callable[[Span], None] | None = None
         """Also called with each span, while calls are compared with usual ones."""
         self._lock = Lock()
-        self._kept: deque[Span] = deque(maxlen=MOST)
-        self._noted = 0
+        self._spans: deque[Span] = deque(maxlen=MOST)
+        self._count = 0
 
-    def asked(self, call_id: int, service: str, request: Request, error: BaseException | None) -> None:
+    def record_outgoing(self, call_id: int, service: str, request: Request, error: BaseException | None) -> None:
         """Record the end of a call to another container."""
         now_ns = time.monotonic_ns()
         took_s = (now_ns - request.deadline_ns) / 1e9 + request.deadline_s
         inherited = request.inherited
         outer, client = (None, None) if inherited is None else (inherited.outer, inherited.client)
-        self._keep(
+        self._store(
             Span(
                 call_id=call_id,
                 calls=() if outer is None else (outer.id, *ancestors(outer)),
@@ -111,7 +111,7 @@ class Spans:
             )
         )
 
-    def served(
+    def record_incoming(
         self,
         context: CallContext,
         calls: tuple[int, ...],
@@ -123,7 +123,7 @@ class Spans:
         """Record the end of a call to this container."""
         ongoing = context.ongoing
         queued_ns = 0 if ongoing is None else ongoing.queued_ns
-        self._keep(
+        self._store(
             Span(
                 call_id=context.id,
                 calls=calls,
@@ -142,21 +142,21 @@ class Spans:
             )
         )
 
-    def _keep(self, span: Span) -> None:
+    def _store(self, span: Span) -> None:
         with self._lock:
-            self._noted += 1
-            structs.force_setattr(span, "number", self._noted)
-            self._kept.append(span)
-        if self._tell is not None:
-            self._tell(span)
+            self._count += 1
+            structs.force_setattr(span, "number", self._count)
+            self._spans.append(span)
+        if self._on_span is not None:
+            self._on_span(span)
         if self.watch is not None:
             self.watch(span)
 
     def kept(self, calls: Collection[int] | None = None, after: int = 0) -> list[Span]:
         """Spans with higher numbers, oldest first; of these calls and those that they led to, or of all."""
         with self._lock:
-            old = max(0, after - self._noted + len(self._kept))
-            kept = list(itertools.islice(self._kept, old, None))
+            old = max(0, after - self._count + len(self._spans))
+            kept = list(itertools.islice(self._spans, old, None))
         return kept if calls is None else [span for span in kept if not frozenset(span.ids).isdisjoint(calls)]
 
 
@@ -180,7 +180,7 @@ class SpanRecorder(Interceptor):
             failed = error
             raise
         finally:
-            self._spans.served(context, calls, began, began_ns, locks, failed)
+            self._spans.record_incoming(context, calls, began, began_ns, locks, failed)
             del failed  # it refers to this frame
 
 
@@ -193,7 +193,7 @@ def _outcome(error: BaseException | None) -> str:
     return "ok" if error is None else type(error).__name__
 
 
-def new_spans(own: Address, session: str, table: "LockTable", tell: Callable[[Span], None] | None) -> Spans:
+def new_spans(own: Address, session: str, table: "LockTable", on_span: Callable[[Span], None] | None) -> Spans:
     """The spans of a container; also starts the log buffer of its process."""
     listen()
 
@@ -201,4 +201,4 @@ def new_spans(own: Address, session: str, table: "LockTable", tell: Callable[[Sp
         held = (info.holder for info in table.infos() if info.token in tokens)
         return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
 
-    return Spans(own.container, own.identity, session, purposes, tell)
+    return Spans(own.container, own.identity, session, purposes, on_span)

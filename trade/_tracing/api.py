@@ -121,7 +121,7 @@ class TraceApi:
         Raises:
             AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
         """
-        outcomes = self._client.asked("set_tracing", on, container=container)
+        outcomes = self._client.call_everywhere("set_tracing", on, container=container)
         return sorted(outcome.handle.container for outcome in outcomes)
 
     def spans(self, *, container: str = "*") -> list[Span]:
@@ -161,7 +161,7 @@ class TraceApi:
         return LogReader(self._client, container).read()
 
     def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
-        outcomes = self._client.asked("spans", calls, container=container)
+        outcomes = self._client.call_everywhere("spans", calls, container=container)
         return sorted(itertools.chain.from_iterable(one.result for one in outcomes), key=_when)
 
 

@@ -233,7 +233,7 @@ class Rules:
         *,
         audit: Path | None = None,
         dry_run: bool = False,
-        tell: Callable[[Firing], object] = lambda _firing: None,
+        callback: Callable[[Firing], object] = lambda _firing: None,
     ) -> None:
         """Start the rules.
 
@@ -242,7 +242,7 @@ class Rules:
             file: the rules file.
             audit: a file that gets a line of JSON for every firing, in addition to the logger ``trade.rules``.
             dry_run: report the calls of each event without making them.
-            tell: called with every firing, on the thread that fired.
+            callback: called with every firing, on the thread that fired.
 
         Raises:
             ConfigurationError: the file is wrong; the error names the place.
@@ -252,7 +252,7 @@ class Rules:
         self.dry_run: Final = dry_run
         self.causes: Final = LoopDetector()
         self._audit = audit
-        self._tell = tell
+        self._tell = callback
         self._firings: deque[Firing] = deque(maxlen=_KEPT)
         self._numbers = itertools.count(1)
         self._active: dict[str, _ActiveRule] = {}

@@ -17,16 +17,13 @@ from trade._protocol.messages import Scalar
 from trade._registry.constraints import Constraint, where
 from trade.errors import ConfigurationError
 from trade.text_files import read_text
-from trade.toml_files import read_toml_text
+from trade.toml_files import mismatch, read_toml_text
 
 SERVICE: Final = "$service"
 """The service that joined, left or changed; for an event without one, the service that ``if`` calls."""
 CONTAINER: Final = "$container"
 """The name of that service's container."""
 
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _EXAMPLES: Final = {
     "when": 'when = { left = { name = "look", group = "rosie" } }',
     "do": 'do = [{ call = { name = "set_broadcast", group = "trade", local = true }, args = [true] }]',
@@ -217,16 +214,13 @@ def _converted(raw: Any, kind: Any, where: str, joint: str) -> Any:
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
-        message = str(bad)
-    at = _AT.search(message)
-    path = at.group(1) if at else ""
-    place = f"{where}{joint or ': '}{path}" if path else where
-    if missing := _MISSING.search(message):
-        key = missing.group(1)
+        found = mismatch(bad)
+    place = f"{where}{joint or ': '}{found.place}" if found.place else where
+    if key := found.missing:
         raise ConfigurationError(where=place, problem=f"{key} is missing; write {_EXAMPLES.get(key, key)}")
-    if unknown := _UNKNOWN.search(message):
-        raise ConfigurationError(where=place, problem=f"has no {unknown.group(1)!r}; {_known(path, kind)}")
-    raise ConfigurationError(where=place, problem=message[: at.start()] if at else message)
+    if found.unknown:
+        raise ConfigurationError(where=place, problem=f"has no {found.unknown!r}; {_known(found.place, kind)}")
+    raise ConfigurationError(where=place, problem=found.problem)
 
 
 def _known(path: str, kind: Any) -> str:

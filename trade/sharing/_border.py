@@ -200,10 +200,10 @@ class BorderDirection:
         self._guests.leave(place)
         self._origins.pop(offered.place, None)
 
-    def _complain(self, place: Exposed, why: str) -> None:
-        if self._refused.get(place) != why:
-            self._refused[place] = why
-            _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, why)
+    def _complain(self, place: Exposed, reason: str) -> None:
+        if self._refused.get(place) != reason:
+            self._refused[place] = reason
+            _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, reason)
 
     # --- handles
 
@@ -243,7 +243,7 @@ class BorderDirection:
         calls = () if call.behalf is None else call.behalf.calls
         behalf = Behalf(tuple(names[1:]), calls, ())
         there = structs.replace(call, session=names[0], behalf=behalf, ongoing=None, permit=None)
-        locks = self._remote.federation.remote_locks.shown(call)
+        locks = self._remote.federation.remote_locks.of_call(call)
         with ExitStack() as after:
             after.callback(running.reset, running.set(there))
             after.callback(holding.reset, holding.set(locks))

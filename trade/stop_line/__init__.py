@@ -7,7 +7,7 @@ docs/wire-protocol.md, "The stop line", describes its messages.
 from trade.stop_line.api import StopApi
 from trade.stop_line.client import LineCall, StopLines
 from trade.stop_line.elsewhere import elsewhere
-from trade.stop_line.group_stop import GroupStop, GroupStopServices, StopReport, session_for, together
+from trade.stop_line.group_stop import GroupStop, GroupStopServices, StopReport, merge_reports, session_for
 from trade.stop_line.relayed_estop import RelayedEstop
 from trade.stop_line.service import StopLineService
 
@@ -21,6 +21,6 @@ __all__ = [
     "StopLines",
     "StopReport",
     "elsewhere",
+    "merge_reports",
     "session_for",
-    "together",
 ]

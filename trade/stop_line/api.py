@@ -7,7 +7,7 @@ from trade._calls.client import CallClient
 from trade._estop.controller import LIMIT_S, check_limit
 from trade._registry.constraints import where
 from trade.stop_line.client import StopLines
-from trade.stop_line.group_stop import GroupStop, StopReport, session_for, together
+from trade.stop_line.group_stop import GroupStop, StopReport, merge_reports, session_for
 
 
 class StopApi:
@@ -33,18 +33,18 @@ class StopApi:
             ConfigurationError: the group or the limit is not valid.
         """
         check_limit(limit_s, "stop")
-        until, wanted, registry = time.monotonic() + limit_s, where(group=group), self._client.registry
-        beside = self._stop_lines.stop(group, reason, limit_s)
-        begun = GroupStop(self._client, group, reason)
+        until, constraint, registry = time.monotonic() + limit_s, where(group=group), self._client.registry
+        line_call = self._stop_lines.stop(group, reason, limit_s)
+        group_stop = GroupStop(self._client, group, reason)
 
         def ready() -> bool:
-            found = bool(registry.select(wanted)) or bool(begun.report().stopped)
-            return found or (beside.over() and (bool(beside.report().stopped) or self._sees_all()))
+            found = bool(registry.select(constraint)) or bool(group_stop.report().stopped)
+            return found or (line_call.is_done() and (bool(line_call.report().stopped) or self._sees_all()))
 
-        report = begun.wait(until, ready)
-        return together(group, [report, beside.report() if report.complete else beside.wait()])
+        report = group_stop.wait(until, ready)
+        return merge_reports(group, [report, line_call.report() if report.complete else line_call.wait()])
 
-    def stop_for(self, who: str, group: str, limit_s: float, known: Sequence[str] = ()) -> StopReport:
+    def stop_for(self, client: str, group: str, limit_s: float, known: Sequence[str] = ()) -> StopReport:
         """Calls the stop services of a group that are known here, in a session of the client that asks.
 
         Args:
@@ -54,7 +54,7 @@ class StopApi:
             known: the keys of services that the client stops itself.
         """
         until = time.monotonic() + limit_s
-        with session_for(self._client.address, who).use():
+        with session_for(self._client.address, client).use():
             return GroupStop(self._client, group, None, known).wait(until, lambda: True)
 
     def _sees_all(self) -> bool:

@@ -15,7 +15,7 @@ from trade._estop.broadcast import EstopReport, all_of, as_seen_here
 from trade._protocol.messages import Malformed
 from trade._settings import Settings
 from trade._transport.endpoints import accepts
-from trade.stop_line.group_stop import StopReport, together
+from trade.stop_line.group_stop import StopReport, merge_reports
 from trade.stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
 from trade.stop_line.places import Place, places
 
@@ -28,7 +28,7 @@ _CONNECT_S: Final = 1.0
 _MOST_BYTES: Final = 1 << 20
 _REACH_S: Final = 0.8
 """How long a place may take to accept a connection once all others have confirmed: a dead address delays no report."""
-_LOOK_S: Final = 0.02
+_POLL_S: Final = 0.02
 _Report = TypeVar("_Report", EstopReport, StopReport)
 
 
@@ -37,7 +37,7 @@ class LineCall(Generic[_Report]):
 
     def __init__(
         self,
-        asked: Sequence[tuple[Place, StopRequest]],
+        requests: Sequence[tuple[Place, StopRequest]],
         limit_s: float,
         report_of: Callable[[StopAnswer], _Report | None],
         merge: Callable[[list[_Report]], _Report],
@@ -47,15 +47,15 @@ class LineCall(Generic[_Report]):
         self._report_of = report_of
         self._merge = merge
         self._reports: list[_Report] = []
-        self._left = len(asked)
-        self._waiting = deque(asked)
+        self._remaining = len(requests)
+        self._waiting = deque(requests)
         self._changed = threading.Condition()
-        self._unreached = {place.name for place, _ in asked if place.path is None}
-        self._pending = {place.name for place, _ in asked if place.path is not None}
+        self._unreached = {place.name for place, _ in requests if place.path is None}
+        self._pending = {place.name for place, _ in requests if place.path is not None}
         """The places that have accepted a connection, or are on this host, and that have not answered yet."""
         self.problems: Final[dict[str, str]] = {}
         """Places that did not answer, and why."""
-        for _ in range(min(_THREADS, len(asked))):
+        for _ in range(min(_THREADS, len(requests))):
             threading.Thread(target=self._work, name="trade-stop-ask", daemon=True).start()
 
     def report(self) -> _Report:
@@ -63,14 +63,14 @@ class LineCall(Generic[_Report]):
         with self._changed:
             return self._merge(list(self._reports))
 
-    def over(self) -> bool:
+    def is_done(self) -> bool:
         """Whether all have answered or failed."""
-        return self._left == 0
+        return self._remaining == 0
 
     def wait(self) -> _Report:
         """Waits until all have answered, or the time is over; returns the answers, merged."""
         with self._changed:
-            self._changed.wait_for(self.over, max(0.0, self._until - time.monotonic()))
+            self._changed.wait_for(self.is_done, max(0.0, self._until - time.monotonic()))
         return self.report()
 
     def unreached(self) -> list[str]:
@@ -81,8 +81,8 @@ class LineCall(Generic[_Report]):
     def is_enough(self) -> bool:
         """Whether the report is complete, and all places that accept a connection have answered."""
         with self._changed:
-            tried = self.over() or (not self._pending and time.monotonic() >= self._reach_until)
-            return tried and self.problems.keys() <= self._unreached and self._merge(list(self._reports)).complete
+            reached_all = self.is_done() or (not self._pending and time.monotonic() >= self._reach_until)
+            return reached_all and self.problems.keys() <= self._unreached and self._merge(list(self._reports)).complete
 
     def wait_enough(self, incomplete_s: float = math.inf) -> _Report:
         """Waits as `wait` does, but not for places that accept no connection, once all others have confirmed.
@@ -91,11 +91,11 @@ class LineCall(Generic[_Report]):
             incomplete_s: after this time in seconds, it does not wait for a report that is still incomplete.
         """
         patient_until = time.monotonic() + incomplete_s
-        while not (self.over() or self.is_enough()) and (left_s := self._until - time.monotonic()) > 0:
+        while not (self.is_done() or self.is_enough()) and (left_s := self._until - time.monotonic()) > 0:
             if time.monotonic() >= patient_until and not self.report().complete:
                 break
             with self._changed:
-                self._changed.wait(min(_LOOK_S, left_s))
+                self._changed.wait(min(_POLL_S, left_s))
         return self.report()
 
     def _work(self) -> None:
@@ -127,7 +127,7 @@ class LineCall(Generic[_Report]):
                 _logger.debug("no answer on the stop line at %s: %s", place.name, problem)
             else:
                 self._reports.append(report)
-            self._left -= 1
+            self._remaining -= 1
             self._changed.notify_all()
 
     def _left_s(self) -> float:
@@ -136,14 +136,14 @@ class LineCall(Generic[_Report]):
 
 def _answers(sock: socket.socket, left_s: Callable[[], float]) -> "deque[StopAnswer]":
     """All answers until the other end closes."""
-    heard, found = bytearray(), deque[StopAnswer]()
-    while len(heard) <= _MOST_BYTES:
+    received, found = bytearray(), deque[StopAnswer]()
+    while len(received) <= _MOST_BYTES:
         sock.settimeout(left_s())
         more = sock.recv(65536)
         if not more:
             break
-        heard += more
-    for line in heard.splitlines():
+        received += more
+    for line in received.splitlines():
         with contextlib.suppress(Malformed):
             found.append(read_answer(bytes(line)))
     return found
@@ -163,22 +163,22 @@ class StopLines:
 
     def estop(self, estop_id: str, reason: str, limit_s: float) -> LineCall[EstopReport]:
         """Begins to stop everything, as the e-stop with that id; does not wait."""
-        relays, asked = _RELAYS, list[tuple[Place, StopRequest]]()
+        relays, requests = _RELAYS, list[tuple[Place, StopRequest]]()
         for place in self._places():
             relays -= place.path is not None
             beyond = place.path is None or relays >= 0
-            asked.append((place, self._request("estop", limit_s, reason, id=estop_id, pass_on=beyond)))
+            requests.append((place, self._request("estop", limit_s, reason, id=estop_id, pass_on=beyond)))
 
         def report_of(answer: StopAnswer) -> EstopReport | None:
             return None if answer.estop is None else as_seen_here(answer.estop)
 
-        return LineCall(asked, limit_s, report_of, lambda reports: all_of(estop_id, reports))
+        return LineCall(requests, limit_s, report_of, lambda reports: all_of(estop_id, reports))
 
     def stop(self, group: str, reason: str, limit_s: float) -> LineCall[StopReport]:
         """Begins to stop a whole group; does not wait."""
         request = self._request("stop", limit_s, reason, group=group)
-        asked = [(place, request) for place in self._places()]
-        return LineCall(asked, limit_s, lambda answer: answer.stop, lambda reports: together(group, reports))
+        requests = [(place, request) for place in self._places()]
+        return LineCall(requests, limit_s, lambda answer: answer.stop, lambda reports: merge_reports(group, reports))
 
     def without_line(self) -> dict[str, bool]:
         """The endpoints of ``Settings.connect`` that have no stop line, and whether each accepts a connection."""

@@ -22,9 +22,9 @@ from trade._transport.base import Presence
 _logger = logging.getLogger("trade")
 
 STOP_GROUP: Final = "stop_group"
-_SOON_S: Final = 0.5
+_RETRY_S: Final = 0.5
 """After this time, others are also asked to stop what has not confirmed here."""
-_LOOK_S: Final = 0.1
+_POLL_S: Final = 0.1
 _LONGEST_REASON: Final = 500
 _UNSEEN: Final = "it may see more of the group"
 
@@ -68,12 +68,12 @@ class GroupStop:
         self._group = group
         self._reason = reason
         self._known = frozenset(known)
-        self._own: dict[str, tuple[Record, Run[Any] | str]] = {}
+        self._calls: dict[str, tuple[Record, Run[Any] | str]] = {}
         """By key: a service that it calls, and the call, or why that could not begin."""
-        self._asked: dict[tuple[Address, bool], Run[Any] | str] = {}
+        self._requests: dict[tuple[Address, bool], Run[Any] | str] = {}
         """By container, and whether it was asked for what has not confirmed here, too."""
         self._changed = InterruptibleCondition()
-        self._soon = time.monotonic() + _SOON_S
+        self._retry_at = time.monotonic() + _RETRY_S
 
     def wait(self, until: float, ready: Callable[[], bool]) -> StopReport:
         """Stops what is found until then, and returns the report.
@@ -84,34 +84,34 @@ class GroupStop:
         """
         self._begin()
         while not (self._ended() and ready()) and (left_s := until - time.monotonic()) > 0:
-            self._changed.wait_for(self._ended, min(_LOOK_S, left_s))
+            self._changed.wait_for(self._ended, min(_POLL_S, left_s))
             self._begin()
         return self.report()
 
     def _begin(self) -> None:
         """Begins the calls to services and containers that are new since the last time."""
         for record in stops_of(self._registry, self._group):
-            if (key := str(record.key)) not in self._own and key not in self._known:
-                self._own[key] = (record, self._start(record))
+            if (key := str(record.key)) not in self._calls and key not in self._known:
+                self._calls[key] = (record, self._start(record))
         if self._reason is None:
             return
-        missing = {key for key, (_, run) in self._own.items() if _problem(run) is not None}
-        again = bool(missing) and (time.monotonic() >= self._soon or self._all_over())
-        known = [key for key in self._own if not (again and key in missing)]
+        missing = {key for key, (_, run) in self._calls.items() if _problem(run) is not None}
+        again = bool(missing) and (time.monotonic() >= self._retry_at or self._all_done())
+        known = [key for key in self._calls if not (again and key in missing)]
         for record in self._registry.select(where(name=STOP_GROUP, group=DOMAIN)):
-            if not record.local and (record.key.address, again) not in self._asked:
-                self._asked[record.key.address, again] = self._start(record, self._group, self._reason, known)
+            if not record.local and (record.key.address, again) not in self._requests:
+                self._requests[record.key.address, again] = self._start(record, self._group, self._reason, known)
 
     def _start(self, record: Record, *args: object) -> "Run[Any] | str":
         try:
             run = self._client.handle_of(record).start(*args)
         except Exception as error:  # noqa: BLE001 - after any error, the others still have to stop
-            return _said(error)
+            return _error_text(error)
         run.add_done_callback(lambda _: self._changed.notify_all())
         return run
 
-    def _all_over(self) -> bool:
-        return all(_over(run) for _, run in self._own.values())
+    def _all_done(self) -> bool:
+        return all(_is_done(run) for _, run in self._calls.values())
 
     def _ended(self) -> bool:
         """Whether nothing is awaited: each service is stopped, on any way, or has failed, and each other one has said.
@@ -119,21 +119,21 @@ class GroupStop:
         A container whose services are stopped need not answer itself: its link may be broken.
         """
         stopped = set(self._merged().stopped)
-        late = any(not _over(run) and record.label not in stopped for record, run in self._own.values())
-        return not late and all(_over(run) for _, run in self._others(stopped))
+        late = any(not _is_done(run) and record.label not in stopped for record, run in self._calls.values())
+        return not late and all(_is_done(run) for _, run in self._others(stopped))
 
     def _others(self, stopped: Collection[str]) -> "list[tuple[str, Run[Any] | str]]":
         """The containers that were asked, but those whose services are stopped."""
-        safe = {record.key.address for record, _ in self._own.values() if record.label in stopped}
-        return [(address.who, run) for (address, _), run in self._asked.items() if address not in safe]
+        safe = {record.key.address for record, _ in self._calls.values() if record.label in stopped}
+        return [(address.who, run) for (address, _), run in self._requests.items() if address not in safe]
 
     def _merged(self) -> StopReport:
         """The results of services so far."""
-        problems = [(record.label, _problem(run)) for record, run in self._own.values()]
+        problems = [(record.label, _problem(run)) for record, run in self._calls.values()]
         done = tuple(label for label, problem in problems if problem is None)
-        own = StopReport(self._group, done, {label: why for label, why in problems if why is not None})
-        asked = [run for run in self._asked.values() if isinstance(run, Run) and _problem(run) is None]
-        return together(self._group, [own, *(_read(self._group, run.result(0)) for run in asked)])
+        own = StopReport(self._group, done, {label: reason for label, reason in problems if reason is not None})
+        answered = [run for run in self._requests.values() if isinstance(run, Run) and _problem(run) is None]
+        return merge_reports(self._group, [own, *(_read(self._group, run.result(0)) for run in answered)])
 
     def report(self) -> StopReport:
         """The results so far.
@@ -141,8 +141,12 @@ class GroupStop:
         A container that has ended is a failure only if nothing was stopped; one that is silent may see what moves.
         """
         found = self._merged()
-        problems = [(who, _problem(run), _over(run)) for who, run in self._others(found.stopped)]
-        unseen = {who: f"{_UNSEEN}: {why}" for who, why, over in problems if why and not (over and found.stopped)}
+        problems = [(container, _problem(run), _is_done(run)) for container, run in self._others(found.stopped)]
+        unseen = {
+            container: f"{_UNSEEN}: {reason}"
+            for container, reason, is_done in problems
+            if reason and not (is_done and found.stopped)
+        }
         return structs.replace(found, failed=found.failed | unseen)
 
 
@@ -182,7 +186,7 @@ def _read(group: str, problems: dict[str, str]) -> StopReport:
     return StopReport(group, done, {label: problem for label, problem in problems.items() if problem})
 
 
-def _over(run: "Run[Any] | str") -> bool:
+def _is_done(run: "Run[Any] | str") -> bool:
     return isinstance(run, str) or run.done()
 
 
@@ -193,10 +197,10 @@ def _problem(run: "Run[Any] | str") -> str | None:
     if not run.done():
         return "no answer in time"
     error = run.exception(0)
-    return None if error is None else _said(error)
+    return None if error is None else _error_text(error)
 
 
-def together(group: str, reports: Iterable[StopReport]) -> StopReport:
+def merge_reports(group: str, reports: Iterable[StopReport]) -> StopReport:
     """Merges the reports of several containers: a service that one of them stopped is stopped."""
     stopped: set[str] = set()
     failed: dict[str, str] = {}
@@ -206,5 +210,5 @@ def together(group: str, reports: Iterable[StopReport]) -> StopReport:
     return StopReport(group, tuple(sorted(stopped)), {k: failed[k] for k in sorted(failed) if k not in stopped})
 
 
-def _said(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"

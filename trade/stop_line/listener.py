@@ -22,11 +22,11 @@ from trade.stop_line.messages import MOST_BYTES
 _logger = logging.getLogger("trade")
 
 MOST_STRANGERS: Final = 256
-_STRANGE_S: Final = 1.0
-_AT_ONCE: Final = 64
+_REQUEST_TIMEOUT_S: Final = 1.0
+_MOST_ACCEPTS: Final = 64
 """How many connections it accepts before it reads from the others again."""
-_LOOK_S: Final = 0.1
-_WANTS: Final = (ssl.SSLWantReadError, ssl.SSLWantWriteError, BlockingIOError)
+_POLL_S: Final = 0.1
+_WOULD_BLOCK: Final = (ssl.SSLWantReadError, ssl.SSLWantWriteError, BlockingIOError)
 
 Serve = Callable[[socket.socket, str, bytes], None]
 """Takes over a connection, with its certificate's identity (empty on this host) and its line. Does not wait."""
@@ -35,14 +35,14 @@ Serve = Callable[[socket.socket, str, bytes], None]
 class Stranger:
     """A connection that has not made its request yet."""
 
-    __slots__ = ("address", "heard", "secure", "since", "sock")
+    __slots__ = ("address", "received", "secure", "since", "sock")
 
     def __init__(self, sock: socket.socket, address: str, now: float) -> None:
         self.sock = sock
         self.address = address
         self.since = now
         self.secure = not isinstance(sock, ssl.SSLSocket)
-        self.heard: bytes | None = None
+        self.received: bytes | None = None
         """None: nothing yet, not even a part of a handshake."""
 
 
@@ -58,38 +58,38 @@ class Listener:
         self._serve = serve
         self._strangers: dict[socket.socket, Stranger] = {}
         """The oldest first."""
-        self._ending = threading.Event()
+        self._closing = threading.Event()
         self._selector = selectors.DefaultSelector()
         self._sockets = [server for server, _ in servers]
         for server, context in servers:
             server.setblocking(False)
             self._selector.register(server, selectors.EVENT_READ, context)
-        self._bell, self._ear = socket.socketpair()
-        self._selector.register(self._ear, selectors.EVENT_READ)
+        self._wake_write, self._wake_read = socket.socketpair()
+        self._selector.register(self._wake_read, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="trade-stop-line", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        while not self._ending.is_set():
-            for key, _ in self._selector.select(_LOOK_S if self._strangers else None):
+        while not self._closing.is_set():
+            for key, _ in self._selector.select(_POLL_S if self._strangers else None):
                 try:
-                    self._hear(key)
+                    self._handle_ready(key)
                 except Exception:
                     _logger.exception("the stop line dropped a connection")
-            self._forget_the_slow()
+            self._drop_expired()
         for stranger in list(self._strangers.values()):
             self._drop(stranger)
 
-    def _hear(self, key: selectors.SelectorKey) -> None:
+    def _handle_ready(self, key: selectors.SelectorKey) -> None:
         sock = key.fileobj
         assert isinstance(sock, socket.socket)  # noqa: S101 - nothing else is registered
         if sock in self._strangers:
-            self._listen_to(self._strangers[sock])
-        elif sock is not self._ear:
-            self._welcome(sock, key.data)
+            self._read_from(self._strangers[sock])
+        elif sock is not self._wake_read:
+            self._accept(sock, key.data)
 
-    def _welcome(self, server: socket.socket, context: ssl.SSLContext | None) -> None:
-        for _ in range(_AT_ONCE):
+    def _accept(self, server: socket.socket, context: ssl.SSLContext | None) -> None:
+        for _ in range(_MOST_ACCEPTS):
             try:
                 sock, address = server.accept()
             except OSError:  # no more connections, or no descriptors: then slow ones are dropped soon
@@ -104,35 +104,35 @@ class Listener:
                 secure = context.wrap_socket(sock, server_side=True, do_handshake_on_connect=False)
                 stranger = Stranger(secure, str(address[0]), time.monotonic())
             if len(self._strangers) >= MOST_STRANGERS:
-                self._drop(self._least())
+                self._drop(self._eviction_candidate())
             self._strangers[stranger.sock] = stranger
             self._selector.register(stranger.sock, selectors.EVENT_READ)
 
-    def _least(self) -> Stranger:
+    def _eviction_candidate(self) -> Stranger:
         """The stranger to drop if there are too many."""
         strangers = list(self._strangers.values())
         busiest, _ = Counter(stranger.address for stranger in strangers).most_common(1)[0]
         its = [stranger for stranger in strangers if stranger.address == busiest]
-        return next((stranger for stranger in its if stranger.heard is None), its[0])
+        return next((stranger for stranger in its if stranger.received is None), its[0])
 
-    def _listen_to(self, stranger: Stranger) -> None:
+    def _read_from(self, stranger: Stranger) -> None:
         sock = stranger.sock
         try:
             if not stranger.secure:
                 assert isinstance(sock, ssl.SSLSocket)  # noqa: S101 - the others are secure from the start
-                stranger.heard = stranger.heard or b""
+                stranger.received = stranger.received or b""
                 sock.do_handshake()
                 stranger.secure = True
-            while b"\n" not in (heard := stranger.heard or b""):
+            while b"\n" not in (received := stranger.received or b""):
                 more = sock.recv(MOST_BYTES)
-                stranger.heard = heard + more
-                if not more or len(stranger.heard) > MOST_BYTES:
+                stranger.received = received + more
+                if not more or len(stranger.received) > MOST_BYTES:
                     self._drop(stranger)
                     return
         except ssl.SSLWantWriteError:
             self._selector.modify(sock, selectors.EVENT_READ | selectors.EVENT_WRITE)
             return
-        except _WANTS:
+        except _WOULD_BLOCK:
             self._selector.modify(sock, selectors.EVENT_READ)
             return
         except (OSError, ValueError):
@@ -141,7 +141,7 @@ class Listener:
         self._hand_over(stranger)
 
     def _hand_over(self, stranger: Stranger) -> None:
-        sock, line = stranger.sock, (stranger.heard or b"").partition(b"\n")[0]
+        sock, line = stranger.sock, (stranger.received or b"").partition(b"\n")[0]
         self._selector.unregister(sock)
         del self._strangers[sock]
         sock.setblocking(True)
@@ -155,8 +155,8 @@ class Listener:
             sock.close()
             raise
 
-    def _forget_the_slow(self) -> None:
-        too_old = time.monotonic() - _STRANGE_S
+    def _drop_expired(self) -> None:
+        too_old = time.monotonic() - _REQUEST_TIMEOUT_S
         while self._strangers:
             oldest = next(iter(self._strangers.values()))
             if oldest.since > too_old:
@@ -171,11 +171,11 @@ class Listener:
 
     def close(self) -> None:
         """Closes all connections. Idempotent."""
-        if self._ending.is_set():
+        if self._closing.is_set():
             return
-        self._ending.set()
-        self._bell.send(b"!")
+        self._closing.set()
+        self._wake_write.send(b"!")
         self._thread.join(2)
-        for sock in (*self._sockets, self._bell, self._ear):
+        for sock in (*self._sockets, self._wake_write, self._wake_read):
             sock.close()
         self._selector.close()

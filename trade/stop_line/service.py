@@ -50,21 +50,21 @@ class StopLineService:
         settings: Settings,
         access: Authorizer,
         audit: Audit,
-        estopping: EstopController,
+        estop: EstopController,
         stop: Callable[[str, str, float], StopReport],
     ) -> None:
         self._own = own
         self._system = settings.system
         self._access = access
         self._audit = audit
-        self._estopping = estopping
+        self._estop = estop
         self._stop = stop
         self._guard = threading.Lock()
         self._busy: Counter[str] = Counter()
         self._listeners: list[Listener] = []
         self._path: Path | None = None
         self._on_host: Listener | None = None
-        self._wanted = False
+        self._listens_on_host = False
         """Whether it has to listen on this host."""
         self._warned = False
         self._closed = False
@@ -80,7 +80,7 @@ class StopLineService:
     def listen_on_host(self) -> None:
         """Listens for this user on this host, too. Idempotent; logs a problem."""
         with self._guard:
-            self._wanted = True
+            self._listens_on_host = True
             if self._path is None and not self._closed:
                 self._open_on_host()
 
@@ -101,7 +101,7 @@ class StopLineService:
     def keep_place(self) -> None:
         """Listens on this host again if no client can reach it there, as when the folder was emptied. Called often."""
         with self._guard:
-            if self._closed or not self._wanted or (self._path is not None and not is_deaf(self._path)):
+            if self._closed or not self._listens_on_host or (self._path is not None and not is_deaf(self._path)):
                 return
             if self._path is not None:
                 _logger.warning("%s, the stop line on this host, has vanished, and is made again", self._path)
@@ -125,8 +125,10 @@ class StopLineService:
             if not full:
                 self._busy[identity] += 1
         if full:
-            why = f"{MOST_OF_ONE} requests of {identity}, or {MOST} in all, are in progress; ask again when one is over"
-            self._end(sock, StopAnswer(who=self._own.who, error=LimitExceeded.__name__, why=why))
+            reason = (
+                f"{MOST_OF_ONE} requests of {identity}, or {MOST} in all, are in progress; ask again when one is over"
+            )
+            self._end(sock, StopAnswer(who=self._own.who, error=LimitExceeded.__name__, why=reason))
             return
         work = (sock, identity, request)
         threading.Thread(target=self._work, args=work, name="trade-stop-work", daemon=True).start()
@@ -146,32 +148,30 @@ class StopLineService:
         self._end(sock, answer)
 
     def _answer(self, sock: socket.socket, identity: str, request: StopRequest) -> StopAnswer:
-        own, asked = self._own.who, f"{identity}/{request.by.partition('/')[2]}".rstrip("/")
+        own, requester = self._own.who, f"{identity}/{request.by.partition('/')[2]}".rstrip("/")
         denied = self._access.denied_order(identity, clears=False)
         if denied is not None:
             self._audit.refused(f"trade.{request.ask}", denied, who=identity)
             raise denied
         if request.ask == "open":
-            return StopAnswer(who=own, open=tuple(estop_fields(estop) for estop in self._estopping.estops()))
-        self._say(sock, StopAnswer(who=own, taken=True))
+            return StopAnswer(who=own, open=tuple(estop_fields(estop) for estop in self._estop.estops()))
+        self._send(sock, StopAnswer(who=own, taken=True))
         if request.ask == "stop":
             self._audit.note("stop", "stop line", about=request.group, who=identity, why=request.reason)
-            _logger.warning("stopping %s, asked by %s on the stop line: %s", request.group, asked, request.reason)
+            _logger.warning("stopping %s, asked by %s on the stop line: %s", request.group, requester, request.reason)
             return StopAnswer(who=own, stop=self._stop(identity, request.group, request.limit_s))
-        if not self._estopping.knows(request.id):  # else it was received, and is on record
+        if not self._estop.knows(request.id):  # else it was received, and is on record
             self._audit.note("stop", "stop line", about=request.id, who=identity, why=request.reason)
-        reason = f"{request.reason} (asked by {asked} on the stop line)".lstrip()
-        return StopAnswer(
-            who=own, estop=self._estopping.relay(request.id, reason, request.limit_s, beyond=request.pass_on)
-        )
+        reason = f"{request.reason} (asked by {requester} on the stop line)".lstrip()
+        return StopAnswer(who=own, estop=self._estop.relay(request.id, reason, request.limit_s, beyond=request.pass_on))
 
-    def _say(self, sock: socket.socket, answer: StopAnswer) -> None:
+    def _send(self, sock: socket.socket, answer: StopAnswer) -> None:
         with contextlib.suppress(OSError):  # the client need not wait for the answer
             sock.settimeout(_ANSWER_S)
             sock.sendall(encoded(answer))
 
     def _end(self, sock: socket.socket, answer: StopAnswer) -> None:
-        self._say(sock, answer)
+        self._send(sock, answer)
         sock.close()
 
     def close(self) -> None:

@@ -156,9 +156,9 @@ class MemorySystem:
         """The number of messages between containers so far, of these kinds or of all."""
         return sum(count for kind, count in self.network.sent.items() if kind in kinds or not kinds)
 
-    def tap(self, hear: Callable[[InFlightMessage], None]) -> Callable[[], None]:
+    def tap(self, callback: Callable[[InFlightMessage], None]) -> Callable[[], None]:
         """See every message between two containers; see `Network.tap`. Returns a function that ends it."""
-        return self.network.tap(hear)
+        return self.network.tap(callback)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from trade import Resource
 from trade.errors import DeviceError, DeviceFault, DeviceSilent, TradeError
 from trade_drivers.bus._attempts import ATTEMPTS
 from trade_drivers.bus._jobs import Device, Work
-from trade_drivers.robotfile import Bus
+from trade_robotfile import Bus
 
 PROBE_NS: Final = 500_000_000
 """The first pause before a device that did not answer is tried again."""
@@ -76,7 +76,7 @@ class BusDevice(ABC, Generic[_Sample]):
         return ""
 
     @abstractmethod
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         """Returns the error for a fault; by default the latched one."""
 
     def age_ns(self, now_ns: int) -> int:
@@ -90,10 +90,10 @@ class BusDevice(ABC, Generic[_Sample]):
             DeviceSilent: the measurement is too old, or there is none.
         """
         if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         return self.sample
 
-    def deaf(self, now_ns: int) -> DeviceSilent:
+    def silent_error(self, now_ns: int) -> DeviceSilent:
         """Returns the error for a device that does not answer."""
         waited_s = self.age_ns(now_ns) / 1e9
         return DeviceSilent(device=self.name, bus=self.bus, waited_s=waited_s, reason=self.why_silent)
@@ -266,10 +266,10 @@ class BusCycle(ABC, Generic[_Device]):
         error: TradeError | None = None
         for device in ticket.devices:
             if device.silent or device.age_ns(now_ns) > self.stale_after_ns:
-                error = device.deaf(now_ns)
+                error = device.silent_error(now_ns)
             elif device.halting_since_ns and now_ns - device.halting_since_ns > HALT_NS:
                 why = f": {device.unheld}" if device.unheld else ""
-                error = device.faulty(f"a stop was sent, but it is still moving{why}")
+                error = device.fault_error(f"a stop was sent, but it is still moving{why}")
             elif device.halting_since_ns:
                 return
         self._stopping.remove(ticket)

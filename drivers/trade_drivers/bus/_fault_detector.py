@@ -41,14 +41,14 @@ class FaultDetector:
             device = seen.device
             if (fault := device.fault) != seen.fault:
                 seen.fault = fault
-                self._say(device, "fault", device.faulty() if fault else None)
+                self._say(device, "fault", device.fault_error() if fault else None)
             if refusing is None and not device.silent and device.age_ns(now_ns) <= stale_ns:
                 if seen.link:
                     seen.link, seen.refusing = False, None
                     self._say(device, "link", None)
             elif not seen.link or (refusing is not None and refusing != seen.refusing):
                 seen.link, seen.refusing = True, refusing  # until it answers, only this cause is reported
-                self._say(device, "link", device.deaf(now_ns) if refusing is None else refusing(device))
+                self._say(device, "link", device.silent_error(now_ns) if refusing is None else refusing(device))
 
     def _say(self, device: BusDevice[Any], respect: Respect, error: TradeError | None) -> None:
         found = () if error is None else found_in(device.name, error)

@@ -83,7 +83,7 @@ class Device(Protocol):
         """The full name, such as ``rosie.neck.pan``."""
         ...
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         """Returns the error for a fault; by default the latched one."""
         ...
 
@@ -152,6 +152,6 @@ class Work(Generic[DeviceT_co]):
             if tell is not None:
                 tell()
             if not alive():
-                self.finish(self.devices[0].faulty("the thread of its bus has ended"))
+                self.finish(self.devices[0].fault_error("the thread of its bus has ended"))
         if self._error is not None:
             raise self._error

@@ -14,7 +14,7 @@ from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._fault_detector import FaultDetector
 from trade_drivers.bus._jobs import Device, PortFull, PortLost, PortOpening, WireError
 from trade_drivers.faults import Tell
-from trade_drivers.robotfile import Bus
+from trade_robotfile import Bus
 
 _log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1
@@ -129,7 +129,7 @@ class BusThread(Generic[_Exchange_co]):
             problem, failed = f"the thread of its bus failed: {defect!r}", True
             _log.exception("bus %s: its thread failed; its devices stop by their watchdogs", self._bus.name)
         finally:
-            self.exchange.refusing = lambda device: device.faulty(problem)
+            self.exchange.refusing = lambda device: device.fault_error(problem)
             self._wire.close()
             self.exchange.fail_all(self.exchange.refusing)
             if failed:
@@ -234,7 +234,7 @@ class BusThread(Generic[_Exchange_co]):
         return healthy
 
     def _unhealthy(self, device: Device) -> TradeError:
-        return device.faulty("its driver's process is not healthy")
+        return device.fault_error("its driver's process is not healthy")
 
 
 @contextmanager

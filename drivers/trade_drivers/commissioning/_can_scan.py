@@ -1,18 +1,22 @@
 """Scanning an open CAN bus for devices before they are in a robot file. Reads only; commands nothing."""
 
+import time
 from abc import abstractmethod
-from collections.abc import Collection
-from typing import ClassVar, Final, NoReturn, TypeVar
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, ClassVar, Final, NoReturn, TypeVar
 
 from trade.errors import ConfigurationError
-from trade_drivers.bus.can._port import CanPort
-from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.commissioning._commissioner import Bench, Found
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import CanPort, Frame, Talk
 
 _LISTEN_S: Final = 1.0
 """How long to listen for other drivers, and for devices that report by themselves."""
+_ATTEMPTS: Final = 3
 
 _Self = TypeVar("_Self", bound="CanBench")
+_Value = TypeVar("_Value")
 
 
 class CanBench(Bench):
@@ -24,7 +28,7 @@ class CanBench(Bench):
     zero: ClassVar[str]
     """How to set the zero of its devices."""
 
-    def __init__(self, port: CanPort, bitrate: int) -> None:
+    def __init__(self, port: "CanPort", bitrate: int) -> None:
         self._port, self._bitrate, self._talk = port, bitrate, port.talk
 
     @classmethod
@@ -35,7 +39,10 @@ class CanBench(Bench):
             ConfigurationError: another driver commands its devices, there is no such interface, or a device would take
                 a request for a command.
             PortLost: the interface does not exist or is down.
+            ImportError: python-can is missing.
         """
+        from trade_drivers.bus.can import CanPort  # noqa: PLC0415 - python-can is optional
+
         wire = CanPort(port, bitrate, "", _LISTEN_S, cls.orders)
         wire.open()
         try:
@@ -48,7 +55,7 @@ class CanBench(Bench):
 
     @staticmethod
     @abstractmethod
-    def orders(talk: Talk) -> Collection[int]:
+    def orders(talk: "Talk") -> Collection[int]:
         """Returns the identifiers among the frames that only a driver of such devices sends."""
 
     def refuse(self) -> None:
@@ -57,6 +64,31 @@ class CanBench(Bench):
             numbers = ", ".join(map(str, sorted(nodes)))
             problem = f"ODrives talk on this bus (node {numbers}) and would take its requests for commands"
             raise ConfigurationError(where=f"driver {self.driver}", problem=problem)
+
+    def ask(
+        self,
+        can_id: int,
+        data: bytes,
+        decode: "Callable[[Frame], _Value | None]",
+        patience_s: float,
+        second_s: float = 0.0,
+    ) -> list[_Value]:
+        """Sends a request up to three times, and returns the answers to one of them; none if nothing answers.
+
+        After the first answer, it waits ``second_s`` for that of another device with the same number.
+        """
+        answers: list[_Value] = []
+        for _ in range(_ATTEMPTS):
+            self._port.send(can_id, data)
+            until = time.monotonic() + patience_s
+            while (left_s := until - time.monotonic()) > 0:
+                frame = self._port.receive(left_s)
+                if frame is not None and (answer := decode(frame)) is not None:
+                    answers.append(answer)
+                    until = min(until, time.monotonic() + second_s)
+            if answers:
+                break
+        return answers
 
     def found(
         self,

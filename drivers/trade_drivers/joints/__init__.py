@@ -2,11 +2,9 @@
 
 from trade_drivers.bus._jobs import Gate, PortLost, Steps, Work
 from trade_drivers.bus._thread import BusThread, Port, start_thread
-from trade_drivers.joints._axis import Axis, AxisT, Goal, Resolution, Sample
-from trade_drivers.joints._cycle import Exchange
+from trade_drivers.joints._axis import Axis, AxisMotion, AxisT, Goal, Resolution, Sample
+from trade_drivers.joints._cycle import ControlMode, Exchange, Motion
 from trade_drivers.joints._inspect import Unfit, check_joints, check_least, check_rate
-from trade_drivers.joints._jobs import ControlMode
-from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
 from trade_drivers.joints._ramp import Ramp, towards
 from trade_drivers.joints._waiting import next_measurement, until
@@ -14,6 +12,7 @@ from trade_drivers.joints._waiting import next_measurement, until
 __all__ = [
     "AttachedJoints",
     "Axis",
+    "AxisMotion",
     "AxisT",
     "BusMotor",
     "BusThread",

@@ -4,19 +4,17 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from math import ceil, floor
-from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from msgspec import Struct
 
-from trade import Resource
+from trade import Permit, Resource
 from trade.errors import DeviceFault, LimitExceeded
 from trade_drivers.bus._cycle import BusDevice
+from trade_drivers.bus._jobs import Work
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints._zero import Zero
-from trade_drivers.robotfile import Joint
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._motion import Motion
+from trade_robotfile import Joint
 
 AxisT = TypeVar("AxisT", bound="Axis")
 """The axis type of one vendor."""
@@ -106,7 +104,7 @@ class Axis(BusDevice[Sample]):
         """The remedy for a fault that the device itself has latched."""
         self.ready = False
         """True after this driver has enabled the joint, with its checks done and its watchdog armed."""
-        self.motion: Motion[Any] | None = None
+        self.motion: AxisMotion[Any] | None = None
         self.held_counts: int | None = None
         """The position of the last hold command."""
         self.zero = Zero(joint, within_turn=self.within_turn)
@@ -200,7 +198,7 @@ class Axis(BusDevice[Sample]):
         """
         self.check_zero()
         if self.fault:
-            raise self.faulty()
+            raise self.fault_error()
         return self.fresh(now_ns, stale_after_ns)
 
     def _compare_zero(self, sample: Sample, elapsed_s: float) -> None:
@@ -224,23 +222,23 @@ class Axis(BusDevice[Sample]):
         elif self.sample is not None:
             position = self.sample.position
         if position is not None and (doubt := self.zero.doubt(self.scale.angle_rad(position))):
-            raise self._faulty(doubt, self.zero_remedy)
+            raise self._fault_error(doubt, self.zero_remedy)
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
         """Returns the last measurement. Its age alone decides: a joint just found silent has one that is recent."""
         if self.sample is None or self.age_ns(now_ns) > stale_after_ns:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         return self.sample
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         remedy = "remove the cause, then call enable()"
         if not fault and self.zero.in_doubt:
             remedy = self.zero_remedy
         elif not fault and self.remedy:
             remedy = self.remedy
-        return self._faulty(fault or self.fault, remedy)
+        return self._fault_error(fault or self.fault, remedy)
 
-    def _faulty(self, fault: str, remedy: str) -> DeviceFault:
+    def _fault_error(self, fault: str, remedy: str) -> DeviceFault:
         return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
     def measured(
@@ -268,3 +266,17 @@ class Axis(BusDevice[Sample]):
             measured_at=time.monotonic() - age_s,
             age_s=age_s,
         )
+
+
+class AxisMotion(Work[AxisT]):
+    """A motion of one or more joints, as far as a joint knows it."""
+
+    permit: Permit
+
+    def goal_of(self, axis: AxisT) -> int:
+        """Returns a joint's goal, in counts."""
+        raise NotImplementedError
+
+    def watch(self, now_ns: int) -> None:
+        """Checks the newest measurements, and ends the motion if it is over or must not continue."""
+        raise NotImplementedError

@@ -1,17 +1,28 @@
-"""The cyclic exchange with the joints of one bus: stops, work, motions, holding."""
+"""The cyclic exchange with the joints of one bus: stops, work, motions, holding; and the base of its motions."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from enum import Enum
 
-from trade.errors import MotionStopped, TradeError
+from trade.errors import DeviceSilent, MotionStopped, TradeError
 from trade_drivers.bus._angle_store import Span
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
+from trade_drivers.bus._gate import Command
 from trade_drivers.bus._jobs import Device, Gate, Steps, Work
-from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import Leave
-from trade_drivers.joints._motion import Motion
-from trade_drivers.robotfile import Bus
+from trade_drivers.joints._axis import AxisMotion, AxisT, Goal
+from trade_robotfile import Bus
+
+
+class ControlMode(Enum):
+    """The kind of a motion's commands, for devices with a mode for each."""
+
+    GOALS = "goals"
+    """A goal to move to."""
+    POSITIONS = "positions"
+    """A position in each cycle."""
+    SPEEDS = "speeds"
+    """A velocity, and the position where it must end."""
 
 
 class Exchange(BusCycle[AxisT]):
@@ -66,7 +77,7 @@ class Exchange(BusCycle[AxisT]):
     def looking(self, axis: AxisT) -> Steps:
         """Reads the joint's health now."""
 
-    def making_way(self, job: Motion[AxisT]) -> Steps:  # noqa: ARG002 - as above
+    def making_way(self, job: "Motion[AxisT]") -> Steps:  # noqa: ARG002 - as above
         """Waits until the joints can accept the commands; ends their current motion if they must be at rest."""
         yield from ()
 
@@ -119,7 +130,7 @@ class Exchange(BusCycle[AxisT]):
         if (motion := axis.motion) is not None:
             self.halt(motion.devices, reason)
 
-    def release(self, motion: Motion[AxisT], error: TradeError | None) -> None:
+    def release(self, motion: AxisMotion[AxisT], error: TradeError | None) -> None:
         """Completes a watched motion: successfully, or with an error and all its joints holding."""
         try:
             if error is not None:
@@ -129,7 +140,7 @@ class Exchange(BusCycle[AxisT]):
         finally:
             self._forget(motion, error)
 
-    def take_over(self, motion: Motion[AxisT]) -> None:
+    def take_over(self, motion: "Motion[AxisT]") -> None:
         """Starts to watch a motion after its goals are sent; ends the motions it replaces, whose other joints hold."""
         motion.note("wrote goal")
         motion.attended_ns = self.lasting_clock()
@@ -149,7 +160,7 @@ class Exchange(BusCycle[AxisT]):
     def require_answering(self, axis: AxisT) -> None:
         """Raises ``DeviceSilent`` for a joint that is left out of the cycles because it does not answer."""
         if axis.silent:
-            raise axis.deaf(self.clock())
+            raise axis.silent_error(self.clock())
 
     # --- parts of a cycle
 
@@ -196,9 +207,74 @@ class Exchange(BusCycle[AxisT]):
         if positions:
             self.write_holds(positions)
 
-    def _forget(self, motion: Motion[AxisT], error: TradeError | None) -> None:
+    def _forget(self, motion: AxisMotion[AxisT], error: TradeError | None) -> None:
         for axis in motion.devices:
             if axis.motion is motion:
                 axis.motion = None
                 axis.tell_moving()
         motion.finish(error)
+
+
+class Motion(AxisMotion[AxisT], Command[AxisT, Exchange[AxisT]]):
+    """A command that moves joints, and is watched until it ends."""
+
+    control_mode = ControlMode.GOALS
+    attended_ns = 0
+    """When it was last checked, by the lasting clock."""
+
+    def steps(self) -> Steps:
+        """Enables relaxed joints, then launches."""
+        exchange = self.exchange
+        for axis in self.devices:
+            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
+        for axis in self.devices:
+            if not axis.ready:
+                yield from exchange.enabling(self, axis)
+        yield from exchange.making_way(self)
+        self.launch()
+
+    def launch(self) -> None:
+        """Writes all goals in one packet, and takes the joints over."""
+        raise NotImplementedError
+
+    def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
+        """Returns why the motion must end: an interrupted driver, a fault, an offline joint, or the call's deadline."""
+        attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
+        if held_up := self.exchange.held_up(attended_ns):
+            axis = next((axis for axis in self.devices if axis.fault), self.devices[0])
+            return axis.fault_error(f"{axis.fault}; {held_up}" if axis.fault else held_up)
+        for axis in self.devices:
+            if axis.fault:
+                return axis.fault_error()
+            if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
+                return axis.silent_error(now_ns)
+        if until_ns is not None and now_ns >= until_ns:
+            return MotionStopped(device=self.devices[0].name, reason="its call reached its deadline", late=True)
+        return None
+
+    def done_stepping(self) -> None:
+        """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
+
+
+class Leave(Work[AxisT]):
+    """The shutdown of the driver after all joints were stopped: hold or relax, as the robot file says.
+
+    The watchdog of a holding joint is disarmed after the joint was seen at rest, since the driver's silence is then
+    intended and an expired watchdog would hinder the next driver. Otherwise it stays armed.
+    """
+
+    def __init__(self, exchange: Exchange[AxisT], axes: Sequence[AxisT], *, relax: bool) -> None:
+        super().__init__(axes)
+        self._exchange = exchange
+        self._relax = relax
+
+    def steps(self) -> Steps:
+        for axis in self.devices:
+            if axis.silent:
+                continue
+            try:
+                yield from self._exchange.leaving(self, axis, relax=self._relax)
+            except DeviceSilent:
+                continue  # like a joint that was silent before: ``unseen()`` reports it
+            except TradeError as problem:
+                self.finish(problem)

@@ -7,7 +7,7 @@ from trade.errors import ConfigurationError
 from trade_drivers.joints._axis import Axis, AxisT
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import Bus
+    from trade_robotfile import Bus
 
 _BRAKING_S: Final = 1.5
 

@@ -1,19 +1,15 @@
-"""Motions: checked immediately before they are sent, and watched until they are at rest or ended."""
+"""Moves to goals: checked immediately before they are sent, and watched until they are at rest or ended."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from msgspec import Struct
 
-from trade.errors import MotionStopped, TradeError
-from trade_drivers.bus._gate import Command, Terms
-from trade_drivers.bus._jobs import Steps
+from trade.errors import TradeError
+from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import ControlMode
+from trade_drivers.joints._cycle import Exchange, Motion
 from trade_drivers.joints._profile import Leg, together
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._cycle import Exchange
 
 _SETTLING_S: Final = 0.15
 _STUCK_S: Final = 0.5
@@ -33,61 +29,12 @@ class _Progress(Struct):
     """How long the joint has made no progress."""
 
 
-class Motion(Command[AxisT, "Exchange[AxisT]"]):
-    """A command that moves joints, and is watched until it ends."""
-
-    control_mode = ControlMode.GOALS
-    attended_ns = 0
-    """When it was last checked, by the lasting clock."""
-
-    def steps(self) -> Steps:
-        """Enables relaxed joints, then launches."""
-        exchange = self.exchange
-        for axis in self.devices:
-            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
-        for axis in self.devices:
-            if not axis.ready:
-                yield from exchange.enabling(self, axis)
-        yield from exchange.making_way(self)
-        self.launch()
-
-    def launch(self) -> None:
-        """Writes all goals in one packet, and takes the joints over."""
-        raise NotImplementedError
-
-    def goal_of(self, axis: AxisT) -> int:
-        """Returns a joint's goal, in counts."""
-        raise NotImplementedError
-
-    def watch(self, now_ns: int) -> None:
-        """Checks the newest measurements, and ends the motion if it is over or must not continue."""
-        raise NotImplementedError
-
-    def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
-        """Returns why the motion must end: an interrupted driver, a fault, an offline joint, or the call's deadline."""
-        attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
-        if held_up := self.exchange.held_up(attended_ns):
-            axis = next((axis for axis in self.devices if axis.fault), self.devices[0])
-            return axis.faulty(f"{axis.fault}; {held_up}" if axis.fault else held_up)
-        for axis in self.devices:
-            if axis.fault:
-                return axis.faulty()
-            if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
-                return axis.deaf(now_ns)
-        if until_ns is not None and now_ns >= until_ns:
-            return MotionStopped(device=self.devices[0].name, reason="its call reached its deadline", late=True)
-        return None
-
-    def done_stepping(self) -> None:
-        """Does nothing: the motion is watched until it ends. (It has already ended if it was refused.)"""
-
-
 class Move(Motion[AxisT]):
     """A move of one or more joints to goals in counts."""
 
     def __init__(
         self,
-        exchange: "Exchange[AxisT]",
+        exchange: Exchange[AxisT],
         axes: Sequence[AxisT],
         goals: Sequence[int],
         speeds: Sequence[int],
@@ -167,5 +114,5 @@ class Move(Motion[AxisT]):
                 fault = f"it makes no progress, {short_rad:.3g} rad short of its goal, as if blocked"
                 if blocked:  # blocked: latched, so that it does not move until a client enables it
                     axis.fault, axis.ready = fault, False
-                return axis.faulty(fault)
+                return axis.fault_error(fault)
         return None

@@ -11,8 +11,8 @@ from trade_drivers.bus._gate import Command, admitted, at_once, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis, AxisT
-from trade_drivers.joints._cycle import Exchange
-from trade_drivers.joints._jobs import ControlMode, Enable, Halt, Relax
+from trade_drivers.joints._cycle import ControlMode, Exchange
+from trade_drivers.joints._jobs import Enable, Halt, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._trajectory_run import Follow

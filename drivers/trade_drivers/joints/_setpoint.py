@@ -1,16 +1,11 @@
 """Set-points: goals that are valid for a short time; if they are not renewed, the joints ramp to a stop."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from trade.errors import TradeError
 from trade_drivers.bus._gate import Terms
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import ControlMode
-from trade_drivers.joints._motion import Motion
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._cycle import Exchange
+from trade_drivers.joints._cycle import ControlMode, Exchange, Motion
 
 
 class SetPoint(Motion[AxisT]):
@@ -21,7 +16,7 @@ class SetPoint(Motion[AxisT]):
 
     def __init__(
         self,
-        exchange: "Exchange[AxisT]",
+        exchange: Exchange[AxisT],
         axes: Sequence[AxisT],
         goals: Sequence[int],
         speeds: Sequence[int],

@@ -1,18 +1,14 @@
 """The execution of a trajectory on one bus: each cycle sends the set-points due and compares each joint with them."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError, TrajectoryPart
 from trade_drivers.bus._gate import Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
-from trade_drivers.joints._jobs import ControlMode
-from trade_drivers.joints._motion import Motion
+from trade_drivers.joints._cycle import ControlMode, Exchange, Motion
 from trade_drivers.motion._plan import Plan
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._cycle import Exchange
 
 _VALID_NS: Final = 200_000_000
 """The validity of a sent goal, as for a set-point; the trajectory ends if no goal is sent for longer."""
@@ -31,7 +27,7 @@ class Follow(Motion[AxisT]):
 
     def __init__(
         self,
-        exchange: "Exchange[AxisT]",
+        exchange: Exchange[AxisT],
         axes: Sequence[AxisT],
         plan: Plan,
         terms: Terms,
@@ -134,7 +130,7 @@ class Follow(Motion[AxisT]):
         off = [problem for axis in self.devices if (problem := self._astray(axis, "goal", tolerances.goal_rad))]
         moving = [axis for axis in self.devices if axis.still < 2]
         if late_s > tolerances.goal_time_s and (off or moving):
-            raise off[0] if off else moving[0].faulty("it does not come to rest at the end of its trajectory")
+            raise off[0] if off else moving[0].fault_error("it does not come to rest at the end of its trajectory")
         return not off and not moving
 
     def _astray(self, axis: AxisT, what: TrajectoryPart, tolerance_rad: float) -> ToleranceExceeded | None:

@@ -1,27 +1,25 @@
 """Waiting for reports of a device, for devices that send frames by themselves instead of being read."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT
-
-if TYPE_CHECKING:
-    from trade_drivers.joints._cycle import Exchange
+from trade_drivers.joints._cycle import Exchange
 
 _CHANGE_NS: Final = 600_000_000
 """The time allowed for a device's change of state."""
 _WAIT_S: Final = 0.001
 
 
-def next_measurement(bus: "Exchange[AxisT]", axis: AxisT) -> Steps:
+def next_measurement(bus: Exchange[AxisT], axis: AxisT) -> Steps:
     """Waits for a measurement requested after this call."""
     since_ns = bus.clock()
     yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
 
 
 def until(
-    bus: "Exchange[AxisT]",
+    bus: Exchange[AxisT],
     axis: AxisT,
     condition: Callable[[], bool],
     otherwise: str,
@@ -37,6 +35,6 @@ def until(
     while not condition():
         bus.require_answering(axis)
         if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # it answers, but the condition is not met
-            raise axis.faulty(otherwise)
+            raise axis.fault_error(otherwise)
         bus.idle(_WAIT_S)
         yield

@@ -5,7 +5,7 @@ from math import ceil, floor, inf, tau
 from typing import Final
 
 from trade_drivers.bus._angle_store import Span
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 _SLACK_RAD: Final = 0.05
 """How far a joint without power may sag unnoticed, if its encoder loses its zero altogether."""

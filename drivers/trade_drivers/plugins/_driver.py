@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from msgspec import Struct
 
+import trade_robotfile
 from trade import Measure
 from trade.errors import ConfigurationError
-from trade_drivers import robotfile
 from trade_drivers.bus._angle_store import AngleStore
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._cycle import BusCycle
@@ -20,7 +20,7 @@ from trade_drivers.faults import Tell
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
-from trade_drivers.robotfile import Bus, Robot
+from trade_robotfile import Bus, Robot
 
 _GROUP = "trade.drivers"
 
@@ -131,7 +131,7 @@ class Driver(AnyDriver, ABC):
 
     without_watchdog: ClassVar[str] = ""
     """What the devices do without a driver if they have no watchdog; empty if they have one."""
-    devices: ClassVar[tuple[type[Struct], ...]] = (robotfile.Joint, robotfile.Gripper, robotfile.Arm)
+    devices: ClassVar[tuple[type[Struct], ...]] = (trade_robotfile.Joint, trade_robotfile.Gripper, trade_robotfile.Arm)
     """The kinds of device on its buses."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
@@ -141,7 +141,9 @@ class Driver(AnyDriver, ABC):
             ConfigurationError: the vendor library is missing, or ``attach`` would refuse the file; names file and key.
         """
 
-    def fits(self, bench: Bench, robot: Robot, bus: Bus, device: robotfile.Joint | robotfile.Gripper) -> None:
+    def fits(
+        self, bench: Bench, robot: Robot, bus: Bus, device: trade_robotfile.Joint | trade_robotfile.Gripper
+    ) -> None:
         """Checks that a device on an open line is set up as the robot file requires. Writes nothing.
 
         Raises:
@@ -169,7 +171,7 @@ class Driver(AnyDriver, ABC):
 class SenseDriver(AnyDriver, ABC):
     """The driver of one kind of camera or sensor; constructed without arguments and without side effects."""
 
-    def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
+    def check(self, device: trade_robotfile.Camera | trade_robotfile.Sensor) -> None:
         """Checks the options without access to the device.
 
         Raises:
@@ -177,7 +179,9 @@ class SenseDriver(AnyDriver, ABC):
         """
 
     @abstractmethod
-    def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
+    def attach(
+        self, name: str, device: trade_robotfile.Camera | trade_robotfile.Sensor, port: str | None
+    ) -> Camera | Sensor:
         """Opens the device and checks that it is the one in the file; moves, resets and sets nothing.
 
         Args:

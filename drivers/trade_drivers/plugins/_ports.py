@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
-from trade_drivers.robotfile import Bus, CanBus, Robot, UrBus
+from trade_robotfile import Bus, CanBus, Robot, UrBus
 
 _SOCKETCAND_PORT: Final = "29536"
 

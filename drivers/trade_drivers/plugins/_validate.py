@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 
+import trade_robotfile
 from trade.errors import ConfigurationError
-from trade_drivers import robotfile
+from trade_drivers._robot_file import robot_file_errors
 from trade_drivers.plugins._driver import AnyDriver, Driver, SenseDriver, load_driver
 from trade_drivers.plugins._ports import check_ports
-from trade_drivers.robotfile import Bus, Robot
+from trade_robotfile import Bus, Robot
 
 
 def check(robot: Robot, ports: Mapping[str, str] | None = None) -> None:
@@ -29,7 +30,8 @@ def refusals(robot: Robot) -> Iterator[tuple[str, ConfigurationError]]:
     parts = (*robot.buses, *robot.cameras, *robot.sensors)
     for part in parts:
         try:
-            _check_bus(robot, part) if isinstance(part, Bus) else _check_sense(part)
+            with robot_file_errors():
+                _check_bus(robot, part) if isinstance(part, Bus) else _check_sense(part)
         except ConfigurationError as refusal:
             yield part.name, refusal
 
@@ -47,7 +49,7 @@ def own_clocks(robot: Robot) -> Iterator[tuple[str, str]]:
             yield f"{key}.driver", f"driver {driver}: {why}"
 
 
-def _check_bus(robot: Robot, bus: robotfile.SerialBus | robotfile.CanBus | robotfile.UrBus) -> None:
+def _check_bus(robot: Robot, bus: trade_robotfile.SerialBus | trade_robotfile.CanBus | trade_robotfile.UrBus) -> None:
     driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver", Driver)
     devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name), *robot.arms_on(bus.name))
     for device in devices:
@@ -62,5 +64,5 @@ def _check_bus(robot: Robot, bus: robotfile.SerialBus | robotfile.CanBus | robot
         driver.check(robot, bus)
 
 
-def _check_sense(sense: robotfile.Camera | robotfile.Sensor) -> None:
+def _check_sense(sense: trade_robotfile.Camera | trade_robotfile.Sensor) -> None:
     load_driver(sense.driver, f"{sense.where}: {sense.key}.driver", SenseDriver).check(sense)

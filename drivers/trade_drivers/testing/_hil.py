@@ -13,12 +13,12 @@ import trade
 from trade import where
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._attach import AttachedRobot, attach
+from trade_drivers._robot_file import load
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
-from trade_drivers.robotfile import Robot
-from trade_drivers.robotfile._load import load
 from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
+from trade_robotfile import Robot
 
 _SUITE: Final = Path(__file__).with_name("_suite.py")
 _KINDS: Final[Mapping[str, type[object]]] = {

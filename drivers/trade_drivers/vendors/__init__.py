@@ -1,5 +1,5 @@
 """One folder for each vendor's protocol, with the same file names in each.
 
-``_driver`` attaches, ``_inspect`` checks, ``_axis`` has a joint's state, ``_cycle`` and ``_jobs`` use the bus,
-``_frames``, ``_table`` and ``_wire`` implement the protocol, ``_commission`` and ``_scan`` find devices.
+``_table`` has the registers and models as data, ``_wire`` makes and reads the bytes, ``_axis`` has a joint's state,
+``_exchange`` runs the cycles and jobs of a bus, ``_driver`` attaches, checks, scans and sets devices up.
 """

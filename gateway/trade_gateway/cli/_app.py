@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Annotated, Final
 
 import typer
@@ -11,74 +10,11 @@ import typer
 from trade import errors
 from trade.errors import TradeError
 from trade_gateway._usage import ABSENT, UsageError
-from trade_gateway.cli._output import NOT_FOUND, is_providers, say_error
-from trade_gateway.cli._system_choice import SystemChoice
+from trade_gateway.cli._commands import add_all
 from trade_gateway.process._parent_watch import end_with_stdin
+from trade_gateway.terminal._output import NOT_FOUND, is_providers, say_error
+from trade_gateway.terminal._system_choice import SystemChoice
 
-_SERVICES: Final = "Services"
-_MOTION: Final = "Locks and stops"
-_ROBOTS: Final = "Robots, containers and networks"
-_OPERATION: Final = "Operation"
-_HARDWARE: Final = "Hardware setup"
-_WATCHING: Final = "Watching and rules"
-_RECORDINGS: Final = "Recordings and live views"
-_RIGHTS: Final = "Identities and rights"
-
-_COMMANDS: Final = {
-    "up": (_ROBOTS, "cli.robots._up:up"),
-    "gateway": (_ROBOTS, "cli.robots._gateway:gateway"),
-    "hub": (_ROBOTS, "cli.robots._hub:hub"),
-    "container": (_ROBOTS, "cli.robots._container:container"),
-    "start": (_ROBOTS, "cli.robots._start:start"),
-    "code": (_ROBOTS, "cli.robots._code:code"),
-    "migrate": (_ROBOTS, "cli.robots._migrate:migrate"),
-    "http": (_ROBOTS, "cli.robots._http:app"),
-    "system": (_ROBOTS, "cli.robots._system:app"),
-    "install": (_OPERATION, "cli.operation._install:install"),
-    "backup": (_OPERATION, "cli.operation._backup:backup"),
-    "restore": (_OPERATION, "cli.operation._backup:restore"),
-    "scan": (_HARDWARE, "cli.hardware._scan:scan"),
-    "set-id": (_HARDWARE, "cli.hardware._scan:set_id"),
-    "set-baud": (_HARDWARE, "cli.hardware._scan:set_baud"),
-    "calibrate": (_HARDWARE, "cli.hardware._calibrate:calibrate"),
-    "doctor": (_HARDWARE, "cli.hardware._doctor:doctor"),
-    "drill": (_HARDWARE, "cli.hardware._drill:drill"),
-    "conformance": (_OPERATION, "cli.operation._conformance:conformance"),
-    "services": (_SERVICES, "cli.services._services:services"),
-    "containers": (_SERVICES, "cli.services._services:containers"),
-    "use": (_SERVICES, "cli.services._use:use"),
-    "call": (_SERVICES, "cli.services._call:call"),
-    "stream": (_SERVICES, "cli.services._stream:stream"),
-    "stubs": (_SERVICES, "cli.services._stubs:stubs"),
-    "ask": (_SERVICES, "cli.services._ask:ask"),
-    "mcp": (_SERVICES, "cli.services._mcp:mcp"),
-    "ros": (_ROBOTS, "cli.robots._ros:ros"),
-    "lock": (_MOTION, "cli.motion._lock:lock"),
-    "locks": (_MOTION, "cli.motion._locks:locks"),
-    "unlock": (_MOTION, "cli.motion._locks:unlock"),
-    "resume": (_MOTION, "cli.motion._locks:resume"),
-    "stop": (_MOTION, "cli.motion._stop:stop"),
-    "estop": (_MOTION, "cli.motion._estop:estop"),
-    "watch": (_WATCHING, "cli.watching._watch:watch"),
-    "top": (_WATCHING, "cli.watching._top:top"),
-    "notifications": (_WATCHING, "cli.watching._notifications:notifications"),
-    "hooks": (_WATCHING, "cli.watching._notifications:hooks"),
-    "record": (_RECORDINGS, "cli.recordings._record:record"),
-    "foxglove": (_RECORDINGS, "cli.recordings._foxglove:foxglove"),
-    "replay": (_RECORDINGS, "cli.recordings._replay:replay"),
-    "export": (_RECORDINGS, "cli.recordings._export:export"),
-    "tracing": (_WATCHING, "cli.watching._trace:tracing"),
-    "trace": (_WATCHING, "cli.watching._trace:trace"),
-    "logs": (_WATCHING, "cli.watching._logs:logs"),
-    "faults": (_WATCHING, "cli.watching._faults:app"),
-    "audit": (_WATCHING, "cli.watching._audit:app"),
-    "profile": (_WATCHING, "cli.watching._profile:profile"),
-    "rules": (_WATCHING, "cli.watching._rules:app"),
-    "pki": (_RIGHTS, "cli.rights._pki:app"),
-    "policy": (_RIGHTS, "cli.rights._policy:app"),
-    "approvals": (_RIGHTS, "cli.rights._approvals:app"),
-}
-"""By name: the help panel, and the function or group of commands that implements it."""
 _COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")
 """Environment variables in which a shell passes the line to complete."""
 _FAILED: Final = 1
@@ -102,7 +38,7 @@ def build(only: str | None = None) -> typer.Typer:
     """Builds the command line.
 
     Args:
-        only: the only command that will run, so that the others are not imported. None: all commands.
+        only: the only command that will run, so that the others are not imported. All, if there is none of that name.
     """
     made = typer.Typer(
         name="trade",
@@ -113,16 +49,7 @@ def build(only: str | None = None) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     made.callback()(options)
-    for name, (panel, where) in _COMMANDS.items():
-        if only is not None and name != only:
-            continue
-        module, _, attribute = where.partition(":")
-        room = import_module(f"trade_gateway.{module}")
-        does = getattr(room, attribute)
-        if isinstance(does, typer.Typer):
-            made.add_typer(does, name=name, rich_help_panel=panel)
-        else:
-            made.command(name, rich_help_panel=panel, **getattr(room, "COMMAND", {}))(does)
+    add_all(made, only)
     return made
 
 
@@ -133,7 +60,7 @@ def _asked_for(words: Sequence[str]) -> str | None:
         if word in _WITH_VALUE:
             next(left, None)
         elif not word.startswith("-"):
-            return word if word in _COMMANDS else None
+            return word
     return None
 
 

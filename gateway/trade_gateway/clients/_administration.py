@@ -40,16 +40,16 @@ class Administration:
 
     # --- what there is
 
-    async def system(self, who: str) -> list[ContainerState]:
+    async def system(self, identity: str) -> list[ContainerState]:
         """Returns the containers, and the supervised ones without a process. Raises AccessDenied.
 
         Links, switches and supervision are shown to clients that may read the system.
         """
-        self._judge.require_some(who, "system")
-        return await self._counted(who, self._system, who)
+        self._judge.require_some(identity, "system")
+        return await self._counted(identity, self._system, identity)
 
-    def _system(self, who: str) -> list[ContainerState]:
-        reads = self._judge.may_system(who, "read")
+    def _system(self, identity: str) -> list[ContainerState]:
+        reads = self._judge.may_system(identity, "read")
         children = self._by_container("children") if reads else {}
         network = self._by_container("network") if reads else {}
         by_child = {child["name"]: (gateway, child) for gateway, found in children.items() for child in found}
@@ -68,7 +68,7 @@ class Administration:
                     own=info.epoch == self._container.address.epoch,
                     services=len(offered),
                     actuating=sum(one.effect == "actuate" for one in offered),
-                    groups=tuple(sorted({one.key.domain for one in offered if self._judge.sees(who, one)})),
+                    groups=tuple(sorted({one.key.domain for one in offered if self._judge.sees(identity, one)})),
                     links=_others(reported.get("links")),
                     discovery=reported.get("discovery"),
                     broadcast=reported.get("broadcast"),
@@ -95,9 +95,9 @@ class Administration:
 
     # --- containers
 
-    async def restart(self, who: str, name: str, body: ReasonBody) -> Done:
+    async def restart(self, identity: str, name: str, body: ReasonBody) -> Done:
         """Starts a supervised container, or starts it again. Raises AccessDenied, NoSuchService: none supervises it."""
-        self._judge.require_system(who, "administer", f"container {name}")
+        self._judge.require_system(identity, "administer", f"container {name}")
 
         def restart() -> Done:
             by = self._supervisor(name)
@@ -106,91 +106,91 @@ class Administration:
             self.own("restart_child", by)(name)
             return Done(f"{by} starts {name} again.")
 
-        return await self.noted(who, "restart", name, restart, body.reason)
+        return await self.noted(identity, "restart", name, restart, body.reason)
 
-    async def end(self, who: str, name: str, body: ReasonBody) -> Done:
+    async def end(self, identity: str, name: str, body: ReasonBody) -> Done:
         """Ends a container; a supervised one then stays ended. Raises AccessDenied, NoSuchService: there is none."""
-        self._judge.require_system(who, "administer", f"container {name}")
+        self._judge.require_system(identity, "administer", f"container {name}")
 
         def end() -> Done:
             by = self._supervisor(name)
             if by is not None:
                 self.own("stop_child", by)(name)
                 return Done(f"{by} ends {name}.")
-            reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
+            reason = f"{identity}: {body.reason}" if body.reason else f"by {identity}"
             failed: list[str] = self.own("terminate_container", name)(reason)
             return Done("; ".join([f"{name} ends.", *failed]))
 
-        return await self.noted(who, "end", name, end, body.reason)
+        return await self.noted(identity, "end", name, end, body.reason)
 
     def _supervisor(self, name: str) -> str | None:
         """The gateway that supervises a container of a name."""
         children = self._by_container("children").items()
         return next((by for by, found in children if name in {child["name"] for child in found}), None)
 
-    async def switch(self, who: str, name: str, what: str, *, on: bool) -> Done:
+    async def switch(self, identity: str, name: str, what: str, *, on: bool) -> Done:
         """Switches ``discovery`` or ``broadcast`` of a container. Raises AccessDenied, NoSuchService."""
-        self._judge.require_system(who, "administer", f"container {name}")
+        self._judge.require_system(identity, "administer", f"container {name}")
 
         def switch() -> Done:
             self.own(f"set_{what}", name)(on)
             return Done(f"{what.capitalize()} is {'on' if on else 'off'} in {name}.")
 
-        return await self.noted(who, f"{what} {'on' if on else 'off'}", name, switch)
+        return await self.noted(identity, f"{what} {'on' if on else 'off'}", name, switch)
 
     # --- providers
 
-    async def migrate(self, who: str, body: MigrateBody) -> Done:
+    async def migrate(self, identity: str, body: MigrateBody) -> Done:
         """Moves a provider. Raises AccessDenied, NoSuchService, TooManyServices; and like `trade.Container.migrate`."""
-        service = self._one(who, body.group, body.name, body.container)
-        self._judge.require_groups(who, "administer", service)
+        service = self._one(identity, body.group, body.name, body.container)
+        self._judge.require_groups(identity, "administer", service)
 
         def migrate() -> Done:
             moved = self._container.migrate(service, to=body.to)
             return Done(f"{body.group} is in {', '.join(sorted({one.container for one in moved}))} now.")
 
-        return await self.noted(who, "migrate", f"{service.label} to {body.to}", migrate)
+        return await self.noted(identity, "migrate", f"{service.label} to {body.to}", migrate)
 
-    async def instantiate(self, who: str, body: InstantiateBody) -> Done:
+    async def instantiate(self, identity: str, body: InstantiateBody) -> Done:
         """Creates a provider in a container, which must allow its class. Raises AccessDenied, NotInstantiable."""
-        self._judge.require_system(who, "administer", f"{body.class_path} in {body.container}")
+        self._judge.require_system(identity, "administer", f"{body.class_path} in {body.container}")
 
         def instantiate() -> Done:
             made = self.own("instantiate", body.container)(body.class_path, body.args, tuple(body.groups))
             return Done(f"{body.container} offers {', '.join(one.label for one in made)}.")
 
-        return await self.noted(who, "instantiate", f"{body.class_path} in {body.container}", instantiate)
+        return await self.noted(identity, "instantiate", f"{body.class_path} in {body.container}", instantiate)
 
-    async def terminate(self, who: str, body: ProviderBody) -> Done:
+    async def terminate(self, identity: str, body: ProviderBody) -> Done:
         """Ends a provider that `instantiate` created. Raises AccessDenied, NoSuchService, TooManyServices."""
-        self._judge.require_system(who, "administer", body.group)
-        service = self._one(who, body.group, body.name, body.container)
+        self._judge.require_system(identity, "administer", body.group)
+        service = self._one(identity, body.group, body.name, body.container)
 
         def terminate() -> Done:
             self.own("terminate", service.container)(service)
             return Done(f"{body.group} ended in {service.container}.")
 
-        return await self.noted(who, "terminate", service.label, terminate)
+        return await self.noted(identity, "terminate", service.label, terminate)
 
     # --- notifications and hooks
 
-    async def cancel_notification(self, who: str, name: str) -> Done:
+    async def cancel_notification(self, identity: str, name: str) -> Done:
         """Ends a notification of any client. Raises AccessDenied, NoSuchNotification."""
-        self._judge.require_system(who, "administer", f"notification {name}")
+        self._judge.require_system(identity, "administer", f"notification {name}")
         cancel = self._container.cancel_notification
         return await self.noted(
-            who, "cancel_notification", name, lambda: _done(cancel(name), f"Notification {name} ended.")
+            identity, "cancel_notification", name, lambda: _done(cancel(name), f"Notification {name} ended.")
         )
 
-    async def detach_hook(self, who: str, name: str) -> Done:
+    async def detach_hook(self, identity: str, name: str) -> Done:
         """Detaches a hook of any client. Raises AccessDenied, NoSuchHook."""
-        self._judge.require_system(who, "administer", f"hook {name}")
+        self._judge.require_system(identity, "administer", f"hook {name}")
         detach = self._container.detach_hook
-        return await self.noted(who, "detach_hook", name, lambda: _done(detach(name), f"Hook {name} is detached."))
+        return await self.noted(identity, "detach_hook", name, lambda: _done(detach(name), f"Hook {name} is detached."))
 
     # --- parts
 
-    async def noted(self, who: str, what: str, about: str, do: Callable[[], Done], why: str = "") -> Done:
+    async def noted(self, identity: str, what: str, about: str, do: Callable[[], Done], why: str = "") -> Done:
         """Makes a change, and audits it in its client's name."""
 
         def noted() -> Done:
@@ -199,12 +199,14 @@ class Administration:
             except TradeError as error:
                 if not isinstance(error, AccessDenied):  # which the protocol audits
                     message = str(error)
-                    self._container.note_asked(what, about, who=who, outcome=type(error).__name__, why=message)
+                    self._container.note_request(
+                        what, about, client=identity, outcome=type(error).__name__, error=message
+                    )
                 raise
-            self._container.note_asked(what, about, who=who, why=why)
+            self._container.note_request(what, about, client=identity, error=why)
             return done
 
-        return await self._counted(who, noted)
+        return await self._counted(identity, noted)
 
     def own(self, name: str, container: str) -> Callable[..., Any]:
         """One of the middleware's services of a container. Raises NoSuchService."""
@@ -213,9 +215,9 @@ class Administration:
             raise NoSuchService(constraint=f"container {container}", groups=[])
         return found[0].with_(deadline_s=_DEADLINE_S)
 
-    def _one(self, who: str, group: str, name: str, container: str) -> Handle:
+    def _one(self, identity: str, group: str, name: str, container: str) -> Handle:
         """A service of the only provider of a group. Raises NoSuchService, TooManyServices."""
-        seen = [one for one in self._container.services() if self._judge.sees(who, one)]
+        seen = [one for one in self._container.services() if self._judge.sees(identity, one)]
         inside = [one for one in seen if any(f"{each}.".startswith(f"{group}.") for each in one.groups)]
         found = [one for one in inside if name in ("", one.name) and container in ("", one.container)]
         if not found:

@@ -71,9 +71,9 @@ class ClientApi:
         """Runs a function that may block in a thread; one that stops something never waits for a free thread."""
         return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
 
-    async def counted(self, who: str, do: Callable[..., T], *args: Any) -> T:
-        """Likewise, counted against the limits of pending operations. Raises TooMany."""
-        ended = self._quota.take(who)
+    async def counted(self, identity: str, do: Callable[..., T], *args: Any) -> T:
+        """Runs a function as `in_thread` does, counted against the limits of pending operations. Raises TooMany."""
+        ended = self._quota.take(identity)
         try:
             return await self.in_thread(do, *args)
         finally:
@@ -83,7 +83,7 @@ class ClientApi:
 
     def seen(
         self,
-        who: str,
+        identity: str,
         group: str | None = None,
         name: str | None = None,
         needs: str | None = None,
@@ -95,20 +95,20 @@ class ClientApi:
             found = self._container.services(_wanted(group, name) & conditions)
         except ConfigurationError:  # not the name of a group, or no predicate
             return []
-        return [handle for handle in found if self.judge.sees(who, handle)]
+        return [handle for handle in found if self.judge.sees(identity, handle)]
 
-    def find(self, who: str, group: str, name: str, container: str = "") -> Handle:
+    def find(self, identity: str, group: str, name: str, container: str = "") -> Handle:
         """Finds a service by group and name; one of exactly this group has priority over those beneath it.
 
         Raises:
             NoSuchService, TooManyServices: none, or several, of the services that the client may see match.
         """
-        inside = self.seen(who, None if group == _NO_GROUP else group)
+        inside = self.seen(identity, None if group == _NO_GROUP else group)
         found = [one for one in inside if one.name == name and container in ("", one.container)]
         exact = [one for one in found if one.key.domain == group or group in one.groups]
         found = exact or (found if group != _NO_GROUP else [])
         if not found:
-            raise NoSuchService(constraint=f"{group}.{name}", groups=_groups(self.seen(who)))
+            raise NoSuchService(constraint=f"{group}.{name}", groups=_groups(self.seen(identity)))
         if len(found) > 1:
             matches = [f"{one.label} in {one.container}" for one in found]
             raise TooManyServices(constraint=f"{group}.{name}", matches=matches, differ=("group", "container"))
@@ -253,31 +253,37 @@ class ClientApi:
         self.judge.require(client.identity, "lock", handles)
         return handles
 
-    async def locks(self, who: str) -> list[messages.LockView]:
+    async def locks(self, identity: str) -> list[messages.LockView]:
         """The locks on services that an identity may know of."""
-        known = {name for _, name in places(self.seen(who))}
-        found = await self.counted(who, self._container.locks)
+        known = {name for _, name in places(self.seen(identity))}
+        found = await self.counted(identity, self._container.locks)
         return [messages.lock_view(info) for info in found if not known.isdisjoint(info.resources)]
 
-    async def request_release(self, who: str, body: messages.RequestBody) -> list[str]:
+    async def request_release(self, identity: str, body: messages.RequestBody) -> list[str]:
         """Asks the owners of locks to release them; returns the owners. Raises NoSuchService."""
-        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
-        return await self.counted(who, self._container.request_release, handles, reason)
+        handles, reason = (
+            self._using(identity, body.resources),
+            f"{identity}: {body.reason}" if body.reason else f"by {identity}",
+        )
+        return await self.counted(identity, self._container.request_release, handles, reason)
 
-    async def break_locks(self, who: str, body: messages.RequestBody) -> list[messages.LockView]:
+    async def break_locks(self, identity: str, body: messages.RequestBody) -> list[messages.LockView]:
         """Breaks locks of other owners; motion under them stops. Raises AccessDenied, NoSuchService."""
-        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
-        self.judge.require(who, "administer", handles)
-        broken = await self.counted(who, self._container.break_lock, handles, reason)
+        handles, reason = (
+            self._using(identity, body.resources),
+            f"{identity}: {body.reason}" if body.reason else f"by {identity}",
+        )
+        self.judge.require(identity, "administer", handles)
+        broken = await self.counted(identity, self._container.break_lock, handles, reason)
         return [messages.lock_view(info) for info in broken]
 
-    def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
+    def _using(self, identity: str, resources: Sequence[str]) -> list[Handle]:
         """The services that use exactly these resources. Raises NoSuchService: the client may see no such service."""
         wanted = set(resources)
-        actuating = [one for one in self.seen(who) if one.effect == "actuate"]
+        actuating = [one for one in self.seen(identity) if one.effect == "actuate"]
         found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]
         if not found:
-            raise NoSuchService(constraint=", ".join(resources), groups=_groups(self.seen(who)))
+            raise NoSuchService(constraint=", ".join(resources), groups=_groups(self.seen(identity)))
         return found
 
     async def resume(self, client: Client, body: messages.GroupBody) -> list[str]:
@@ -294,13 +300,13 @@ class ClientApi:
 
         return await self.counted(client.identity, resume)
 
-    async def estop(self, who: str, body: messages.EstopBody) -> messages.Stopped:
+    async def estop(self, identity: str, body: messages.EstopBody) -> messages.Stopped:
         """Stops everything in the system.
 
         Raises:
             NoContainerFound: no container is known to have received it. It is open here; joining containers receive it.
         """
-        reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
+        reason = f"{identity}: {body.reason}" if body.reason else f"by {identity}"
         report = await self.in_thread(self._container.estop, reason, stops=True)
         look = partial(self._container.reachability, limit_s=0)
         reachability = await self.in_thread(look, stops=True)  # only after the e-stop, as it waits
@@ -308,7 +314,7 @@ class ClientApi:
             raise reachability.as_error(self._container.settings.system, f"e-stop {report.id}: {_NOT_RECEIVED}")
         return _stopped(report, reachability)
 
-    async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
+    async def clear(self, identity: str, body: messages.ClearBody) -> messages.Stopped:
         """Clears e-stops.
 
         Raises:
@@ -317,59 +323,61 @@ class ClientApi:
             NoContainerFound: no e-stop is known, and a container does not answer.
         """
         ids = body.ids or [one.id for one in self._container.estops()]
-        self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
+        self.judge.require_system(identity, "administer", f"e-stop {', '.join(ids)}")
         if not ids:
-            await self.counted(who, self._require_answers)
+            await self.counted(identity, self._require_answers)
             return messages.Stopped("", True, (), (), {})
-        report = await self.counted(who, self._container.estop_clear, ids)
-        self._container.note_asked("e-stop clearing", ", ".join(ids), kind="stop", who=who)
+        report = await self.counted(identity, self._container.estop_clear, ids)
+        self._container.note_request("e-stop clearing", ", ".join(ids), kind="stop", client=identity)
         return _stopped(report)
 
     def note_refused(self, error: BaseException) -> None:
         """Audits the policy's refusal of a client; a refusal of this container is recorded already."""
         if isinstance(error, AccessDenied) and error.who != self._container.address.identity:
             why, outcome = str(error), type(error).__name__
-            self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
+            self._container.note_request(error.what, kind="refused", client=error.who, outcome=outcome, error=why)
 
     def _require_answers(self) -> None:
         reachability = self._container.reachability(limit_s=_ANSWERED_S)
         if not reachability.complete:
             raise reachability.as_error(self._container.settings.system, "so an open e-stop may be unknown here")
 
-    def estops(self, who: str) -> list[messages.EstopView]:
+    def estops(self, identity: str) -> list[messages.EstopView]:
         """The open e-stops. Raises AccessDenied: an identity may do nothing here but stop."""
-        self.judge.require_some(who, "estops")
+        self.judge.require_some(identity, "estops")
         return [messages.EstopView(one.id, one.by, one.reason, one.at, one.told_by) for one in self._container.estops()]
 
     # --- subscriptions
 
-    async def stream(self, client: Client, handle: Handle, asked: messages.Stream) -> Samples:
+    async def stream(self, client: Client, handle: Handle, request: messages.Stream) -> Samples:
         """Streams samples of a service until the client is gone. Raises like `trade.Container.stream`."""
         self.judge.require_call(client.identity, handle)
 
         def listen() -> Samples:
             with client.session.use():
-                return self._container.stream(handle, hz=asked.hz, on_change=asked.on_change)
+                return self._container.stream(handle, hz=request.hz, on_change=request.on_change)
 
         return await self.counted(client.identity, listen)
 
-    def view(self, who: str, handle: Handle) -> messages.ServiceView:
+    def view(self, identity: str, handle: Handle) -> messages.ServiceView:
         """The description of a service for an identity."""
-        return messages.service_view(handle, allowed=self.judge.may_call(who, handle))
+        return messages.service_view(handle, allowed=self.judge.may_call(identity, handle))
 
-    def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
+    def watch(
+        self, client: Client, request: messages.Watch, callback: Callable[[str, Handle], object]
+    ) -> list[Notification]:
         """Notifies a client of services that come, go or change, if it may know of them, until it is gone."""
 
-        wanted, here = _wanted(asked.group, asked.name), self._container
+        wanted, here = _wanted(request.group, request.name), self._container
         with client.session.use():
             kinds = {
-                "joined": partial(here.joined, existing=asked.existing),
+                "joined": partial(here.joined, existing=request.existing),
                 "left": here.left,
                 "changed": here.changed,
             }
             return [
-                kinds[one](wanted, _Notified(client, one, self.judge, tell).hear)
-                for one in dict.fromkeys(asked.occasions)
+                kinds[one](wanted, _Notified(client, one, self.judge, callback).hear)
+                for one in dict.fromkeys(request.occasions)
             ]
 
 
@@ -377,12 +385,12 @@ class _Notified:
     """Forwards notifications of services to a client, if it may know of them."""
 
     def __init__(
-        self, client: Client, occasion: str, judge: ClientAuthorizer, tell: Callable[[str, Handle], object]
+        self, client: Client, occasion: str, judge: ClientAuthorizer, callback: Callable[[str, Handle], object]
     ) -> None:
         self._client = client
         self._occasion = occasion
         self._judge = judge
-        self._tell = tell
+        self._tell = callback
         self.target_text = f"notify {client.identity} (a client of the HTTP gateway)"
         """Its text in lists of notifications."""
 
@@ -400,6 +408,6 @@ def _groups(handles: Sequence[Handle]) -> list[str]:
 
 
 def _stopped(report: EstopReport, reachability: Reachability | None = None) -> messages.Stopped:
-    apart = reachability.apart if reachability is not None else {}
+    apart = reachability.unreached if reachability is not None else {}
     complete = report.complete and not apart
     return messages.Stopped(report.id, complete, report.confirmed, report.missing, report.failed, apart)

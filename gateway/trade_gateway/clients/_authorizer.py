@@ -50,34 +50,34 @@ class ClientAuthorizer:
         """The file of the current policy."""
         return self._access.path
 
-    def admits(self, who: str) -> bool:
+    def admits(self, identity: str) -> bool:
         """Whether an identity is admitted at all: it is not revoked."""
         policy = self._access.policy
-        return policy is None or policy.authenticated(who).allowed
+        return policy is None or policy.authenticated(identity).allowed
 
-    def sees(self, who: str, handle: Handle) -> bool:
+    def sees(self, identity: str, handle: Handle) -> bool:
         """Whether an identity may know of a service. No client may know of the middleware's own services."""
         policy, group = self._access.policy, handle.key.domain
         if group == _OWN:
             return False
-        return policy is None or any(policy.decide(who, verb, group).allowed for verb in _TO_SEE)
+        return policy is None or any(policy.decide(identity, verb, group).allowed for verb in _TO_SEE)
 
-    def may_call(self, who: str, handle: Handle) -> bool:
+    def may_call(self, identity: str, handle: Handle) -> bool:
         """Whether an identity may call a service."""
         try:
-            self.require_call(who, handle)
+            self.require_call(identity, handle)
         except AccessDenied:
             return False
         return True
 
-    def require_call(self, who: str, handle: Handle) -> None:
+    def require_call(self, identity: str, handle: Handle) -> None:
         """Raises AccessDenied: the identity may not call the service; a stop needs no right."""
         if handle.key.domain == _OWN:
             rule = "the HTTP gateway forwards no calls to the middleware's own services"
-            raise AccessDenied(who=who, verb="call", what=handle.label, rule=rule)
-        self._container.client.require_call(who, handle)
+            raise AccessDenied(who=identity, verb="call", what=handle.label, rule=rule)
+        self._container.client.require_call(identity, handle)
 
-    def needs_approval(self, who: str, handle: Handle, ask_first: Collection[str] = ()) -> bool:
+    def needs_approval(self, identity: str, handle: Handle, ask_first: Collection[str] = ()) -> bool:
         """Whether a call of an identity needs a person's approval, by the policy or because its group is listed.
 
         Calls that move a marked group need it whichever service moves it: the head also as two joints of the neck.
@@ -86,7 +86,9 @@ class ClientAuthorizer:
             return False
 
         def is_marked(one: Handle) -> bool:
-            return any(self._marks(who, group, ask_first) for group in dict.fromkeys((one.key.domain, *one.groups)))
+            return any(
+                self._marks(identity, group, ask_first) for group in dict.fromkeys((one.key.domain, *one.groups))
+            )
 
         if is_marked(handle):
             return True
@@ -94,45 +96,45 @@ class ClientAuthorizer:
         others = (one for one in self._container.services(where()) if one.effect == "actuate")
         return any(not own.isdisjoint(places([one])) and is_marked(one) for one in others)
 
-    def _marks(self, who: str, domain: str, ask_first: Collection[str]) -> bool:
+    def _marks(self, identity: str, domain: str, ask_first: Collection[str]) -> bool:
         if any(domain == group or domain.startswith(f"{group}.") for group in ask_first):
             return True
-        return self.policy is not None and self.policy.asks_first(who, domain)
+        return self.policy is not None and self.policy.asks_first(identity, domain)
 
-    def require_unmarked(self, who: str, handle: Handle) -> None:
+    def require_unmarked(self, identity: str, handle: Handle) -> None:
         """Raises NeedsApproval: the policy lets the identity call the service only after an approval."""
-        if self.needs_approval(who, handle):
+        if self.needs_approval(identity, handle):
             raise NeedsApproval(service=handle.label, reason="only its calls over MCP can wait for one")
 
-    def require(self, who: str, verb: str, handles: Iterable[Handle]) -> None:
+    def require(self, identity: str, verb: str, handles: Iterable[Handle]) -> None:
         """Raises AccessDenied: the identity lacks the right over one of these services."""
         for handle in handles:
             if handle.key.domain == _OWN:
                 rule = "the HTTP gateway forwards no calls to the middleware's own services"
-                raise AccessDenied(who=who, verb=verb, what=handle.label, rule=rule)
-            self._access.require(who, verb, handle.key.domain, handle.label)
+                raise AccessDenied(who=identity, verb=verb, what=handle.label, rule=rule)
+            self._access.require(identity, verb, handle.key.domain, handle.label)
 
-    def require_groups(self, who: str, verb: str, handle: Handle) -> None:
+    def require_groups(self, identity: str, verb: str, handle: Handle) -> None:
         """Raises AccessDenied: the identity lacks the right over one of the groups of a service."""
         for group in handle.groups or (handle.key.domain,):
-            self._access.require(who, verb, group, handle.label)
+            self._access.require(identity, verb, group, handle.label)
 
-    def require_some(self, who: str, what: str) -> None:
+    def require_some(self, identity: str, what: str) -> None:
         """Raises AccessDenied: the identity has no role, so it may read nothing of the system."""
         policy = self._access.policy
-        if policy is not None and not policy.groups_of(who, _TO_SEE):
+        if policy is not None and not policy.groups_of(identity, _TO_SEE):
             rule = "it has no right over any group, so it may read nothing of the system; a stop needs no right"
-            raise AccessDenied(who=who, verb="read", what=what, rule=rule)
+            raise AccessDenied(who=identity, verb="read", what=what, rule=rule)
 
-    def require_system(self, who: str, verb: str, what: str) -> None:
+    def require_system(self, identity: str, verb: str, what: str) -> None:
         """Raises AccessDenied: the identity may not ``administer`` or ``read`` the system itself."""
-        self._access.require(who, verb, _OWN, what)
+        self._access.require(identity, verb, _OWN, what)
 
-    def may_system(self, who: str, verb: str) -> bool:
+    def may_system(self, identity: str, verb: str) -> bool:
         """Whether the identity may."""
-        return self._access.denied(who, verb, _OWN, "the system") is None
+        return self._access.denied(identity, verb, _OWN, "the system") is None
 
-    def groups_of(self, who: str, verb: str) -> tuple[str, ...]:
+    def groups_of(self, identity: str, verb: str) -> tuple[str, ...]:
         """The groups over which the identity has a right, as the policy names them; only ``*`` if all."""
         policy = self._access.policy
-        return ("*",) if policy is None else tuple(policy.groups_of(who, (verb,)))
+        return ("*",) if policy is None else tuple(policy.groups_of(identity, (verb,)))

@@ -145,11 +145,11 @@ class Client:
 
     # --- its end
 
-    def when_closed(self, tell: Callable[[], object]) -> None:
+    def when_closed(self, callback: Callable[[], object]) -> None:
         """Registers a callback for its end, on any thread; it runs at once if the client is closed."""
-        self._callbacks.append(tell)
+        self._callbacks.append(callback)
         if self.closed:
-            tell()
+            callback()
 
     def close(self) -> None:
         """Stops its motion, releases its locks and cancels its calls. Idempotent."""

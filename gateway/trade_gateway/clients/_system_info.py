@@ -121,48 +121,48 @@ class Overview:
         self._reachability: Reachability | None = None
         self._looked_at = 0.0
 
-    def me(self, who: str) -> messages.Me:
+    def me(self, identity: str) -> messages.Me:
         """Returns the identity and its rights over the system."""
         administers, reads, instruments = (
-            self._judge.may_system(who, verb) for verb in ("administer", "read", "instrument")
+            self._judge.may_system(identity, verb) for verb in ("administer", "read", "instrument")
         )
-        return messages.Me(who, administers, reads, instruments, self._judge.groups_of(who, "administer"))
+        return messages.Me(identity, administers, reads, instruments, self._judge.groups_of(identity, "administer"))
 
-    def policy(self, who: str) -> messages.PolicyView:
+    def policy(self, identity: str) -> messages.PolicyView:
         """Returns the access policy. Raises AccessDenied."""
-        self._judge.require_system(who, "read", "policy")
+        self._judge.require_system(identity, "read", "policy")
         return messages.policy_view(self._judge.policy)
 
-    async def audit(self, who: str) -> list[messages.AuditView]:
+    async def audit(self, identity: str) -> list[messages.AuditView]:
         """Returns the newest rows of the audit records of this host. Raises AccessDenied, NoAuditRecord."""
-        self._judge.require_system(who, "administer", "audit")
+        self._judge.require_system(identity, "administer", "audit")
         folder = self._container.settings.audit
         if folder is None:
             raise NoAuditRecord
-        return await self._counted(who, newest, folder, _ROWS)
+        return await self._counted(identity, newest, folder, _ROWS)
 
-    async def set_tracing(self, who: str, *, on: bool) -> list[str]:
+    async def set_tracing(self, identity: str, *, on: bool) -> list[str]:
         """Turns tracing on or off in the system's containers; returns those that trace. Raises AccessDenied."""
-        self._judge.require_system(who, "instrument", "tracing")
-        return await self._counted(who, self._container.set_tracing, on)
+        self._judge.require_system(identity, "instrument", "tracing")
+        return await self._counted(identity, self._container.set_tracing, on)
 
-    async def calls(self, who: str, reader: CallReader) -> list[Span]:
+    async def calls(self, identity: str, reader: CallReader) -> list[Span]:
         """Returns the calls that have ended since the last read. Raises AccessDenied."""
-        self._judge.require_system(who, "read", "calls")
-        return await self._counted(who, reader.read)
+        self._judge.require_system(identity, "read", "calls")
+        return await self._counted(identity, reader.read)
 
     def ended(self, *, reads: bool) -> CallReader:
         """Returns a reader of the system's recorded calls."""
         return CallReader(self._container, reads=reads)
 
-    async def reachability(self, who: str) -> Reachability:
+    async def reachability(self, identity: str) -> Reachability:
         """Returns the containers found and the endpoints without any; shared by requests within two seconds.
 
         Raises:
             AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
         """
-        self._judge.require_some(who, "sight")
-        return await self._counted(who, self._look)
+        self._judge.require_some(identity, "sight")
+        return await self._counted(identity, self._look)
 
     def _look(self) -> Reachability:
         with self._looking:
@@ -171,30 +171,30 @@ class Overview:
                 self._looked_at = time.monotonic()
             return self._reachability
 
-    def containers(self, who: str) -> list[messages.ContainerView]:
+    def containers(self, identity: str) -> list[messages.ContainerView]:
         """Returns the containers of the system."""
-        self._judge.require_some(who, "containers")
+        self._judge.require_some(identity, "containers")
         return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
 
-    async def loads(self, who: str) -> list[LoadInfo]:
+    async def loads(self, identity: str) -> list[LoadInfo]:
         """Returns the containers' load; takes a second."""
-        self._judge.require_some(who, "loads")
-        return await self._counted(who, loads, self._container)
+        self._judge.require_some(identity, "loads")
+        return await self._counted(identity, loads, self._container)
 
-    async def notifications(self, who: str) -> list[NotificationInfo]:
+    async def notifications(self, identity: str) -> list[NotificationInfo]:
         """Returns the active notifications. Raises AccessDenied."""
-        self._judge.require_system(who, "read", "notifications")
-        return await self._counted(who, self._container.notifications)
+        self._judge.require_system(identity, "read", "notifications")
+        return await self._counted(identity, self._container.notifications)
 
-    async def hooks(self, who: str) -> list[HookInfo]:
+    async def hooks(self, identity: str) -> list[HookInfo]:
         """Returns the attached hooks. Raises AccessDenied."""
-        self._judge.require_system(who, "read", "hooks")
-        return await self._counted(who, self._container.hooks)
+        self._judge.require_system(identity, "read", "hooks")
+        return await self._counted(identity, self._container.hooks)
 
-    async def log_lines(self, who: str, reader: LogReader) -> list[LogLine]:
+    async def log_lines(self, identity: str, reader: LogReader) -> list[LogLine]:
         """Returns the system's log lines since the last read. Raises AccessDenied."""
-        self._judge.require_system(who, "read", "log")
-        return await self._counted(who, reader.read)
+        self._judge.require_system(identity, "read", "log")
+        return await self._counted(identity, reader.read)
 
     def log(self) -> LogReader:
         """Returns a reader of all logs of the system, from the lines that are still kept."""

@@ -1,1 +1,1 @@
-"""Configuration files: gateway files, system files, and their tables."""
+"""Configuration files: the gateway file, and the tables of containers."""

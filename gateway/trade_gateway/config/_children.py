@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 from msgspec import Meta
 
 from trade_gateway.config._entry import ContainerSpec, Entry, FileDefaults
-from trade_gateway.config._tables import Tables, converted
+from trade_gateway.config._tables import Tables, read_entry
 
 _LEASE_S: Final = 10.0
 _MISSES: Final = 4
@@ -104,7 +104,7 @@ def read_children(
     Raises:
         ConfigurationError: with the file, the line, the key and the remedy.
     """
-    entries = {name: converted(table, Supervised, path, text, ("container", name)) for name, table in tables.items()}
+    entries = {name: read_entry(table, Supervised, path, text, ("container", name)) for name, table in tables.items()}
     parts = _OfGateway(path, text, defaults, entries, certified=certified).parts()
     return tuple(Child(part, entries[part.name], {**defaults.inherited, **part.environment}) for part in parts)
 

@@ -37,41 +37,6 @@ class ObjectSpec(
     """Arguments of its constructor, by position or by name."""
 
 
-class HttpSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """An HTTP gateway: the options of ``trade http``."""
-
-    listen: _Text = "127.0.0.1:7080"
-    tokens: str = ""
-    """The file of tokens: ``trade http token NAME --tokens FILE``."""
-    tls: str = ""
-    """Folder of the server's certificate."""
-    origins: list[_Text] = []
-    """Allowed origins of web pages."""
-    hosts: list[_Text] = []
-    """Further host names of the server."""
-    mcp: bool = False
-    """Whether it serves agents at ``/mcp``."""
-    ask_first: list[_Text] = []
-    """Groups in which agents' calls need approval."""
-    twin: str = ""
-    """The robot file to simulate for agents' dry runs."""
-
-
-class RecordSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """A recorder: the options of ``trade record``."""
-
-    folder: _Text
-    """Each start of the recorder writes a file of its own here; with ``keep_last_s``, each fault does."""
-    groups: list[_Text] = []
-    services: list[_Text] = []
-    """Read-only services to sample, too; ``*`` and ``?`` are wildcards."""
-    hz: float | None = None
-    camera_hz: float | None = None
-    service_hz: float | None = None
-    keep_last_s: float | None = None
-    """Save only the last seconds before each fault."""
-
-
 class HealthSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
     """A command whose exit code 0 is a program's sign of life."""
 
@@ -101,10 +66,11 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_
     """Further classes that others may create in it."""
     rules: str = ""
     """A rules file."""
-    http: HttpSpec | None = None
+    http: dict[str, Any] | None = None
+    """An HTTP gateway; the product checks its table, as that of ``record``."""
     ros: str = ""
     """The file of a ROS bridge."""
-    record: RecordSpec | None = None
+    record: dict[str, Any] | None = None
     program: Annotated[list[_Text], Meta(min_length=1)] | None = None
     """Any program with its arguments. With a ``/`` its path is relative to the file, else it is looked up in PATH."""
     env: dict[str, str] = {}
@@ -151,8 +117,6 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_
 
 INSIDE: Final[Mapping[str, type[Struct]]] = {
     "providers": ObjectSpec,
-    "http": HttpSpec,
-    "record": RecordSpec,
     "health": HealthSpec,
 }
 """The type of the table under a key of an entry."""

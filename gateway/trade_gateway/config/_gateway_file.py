@@ -13,18 +13,16 @@ from trade import Settings
 from trade._transport.endpoints import Endpoint, loopback_interface
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, Certificate, read_policy
+from trade.toml_files import Mismatch, mismatch
 from trade_gateway.config._children import Child, read_children
 from trade_gateway.config._entry import FileDefaults
 from trade_gateway.config._supervised_system import as_gateway
-from trade_gateway.config._tables import read_toml
+from trade_gateway.config._toml_file import read_toml
 from trade_gateway.process._addresses import addresses
 
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
 """Addresses that the transport cannot assign to an interface, so that it would apply no rule."""
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _EXAMPLES: Final = {
     "system": 'system = "lab"',
     "network": '[network.private] and interface = "eth0"',
@@ -283,7 +281,7 @@ def read_gateway_file(path: Path) -> Plan:
     try:
         file = msgspec.convert(raw, GatewayFile)
     except msgspec.ValidationError as bad:
-        raise _explained(str(bad), raw, where) from None
+        raise _explained(mismatch(bad), raw, where) from None
     _check(file, where)
     shares = {
         name: share.settings(path, file.name, file.audit_folder(path), insecure_lan=file.insecure_lan)
@@ -362,18 +360,15 @@ def _check_proof(file: GatewayFile, part: GatewayFile | Share, where: str, words
         raise ConfigurationError(where=f"{where}tls", problem=problem)
 
 
-def _explained(message: str, raw: Mapping[str, Any], where: str) -> ConfigurationError:
-    at = _AT.search(message)
-    path = at.group(1) if at else ""
-    prefix = _named(path, raw)
-    if missing := _MISSING.search(message):
-        key = missing.group(1)
+def _explained(found: Mismatch, raw: Mapping[str, Any], where: str) -> ConfigurationError:
+    prefix = _named(found.place, raw)
+    if key := found.missing:
         return ConfigurationError(where=f"{where}: {prefix}{key}", problem=f"missing; write {_EXAMPLES.get(key, key)}")
-    if unknown := _UNKNOWN.search(message):
+    if found.unknown:
         kind = _KINDS.get(prefix.partition(".")[0], GatewayFile)
         problem = f"unknown key; there is {', '.join(kind.__struct_encode_fields__)}"
-        return ConfigurationError(where=f"{where}: {prefix}{unknown.group(1)}", problem=problem)
-    return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=message[: at.start()] if at else message)
+        return ConfigurationError(where=f"{where}: {prefix}{found.unknown}", problem=problem)
+    return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=found.problem)
 
 
 def _fits(part: object, kind: type[Struct] | None) -> bool:

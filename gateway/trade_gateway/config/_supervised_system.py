@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from trade.errors import ConfigurationError
 from trade_gateway.config._entry import LOCAL
-from trade_gateway.config._tables import at
+from trade_gateway.config._toml_file import at
 
 _OF_GATEWAY = ("tls", "policy", "audit", "connect")
 """Keys of ``[system]`` that its supervisor takes, too."""

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any, Final, NoReturn, TypeVar, cast
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
-from trade.text_files import read_text
-from trade.toml_files import read_toml_text
+from trade.toml_files import mismatch
 from trade_drivers import check, load, without
 from trade_drivers.plugins._ports import SeenPorts, check_ports
 from trade_gateway.config._entry import (
@@ -29,19 +28,14 @@ from trade_gateway.config._entry import (
     ContainerSpec,
     Entry,
     FileDefaults,
-    HttpSpec,
-    RecordSpec,
 )
-
-_HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
-_NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
+from trade_gateway.config._kind import PRODUCTS, ContainerKind, kind_of_product
+from trade_gateway.config._toml_file import at
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _DEFAULTS: Final = Entry()
 _Read = TypeVar("_Read", bound=Struct)
+_Entry = TypeVar("_Entry", bound=Entry)
 
 
 class Tables:
@@ -83,14 +77,14 @@ class Tables:
         environment = {} if entry.gateway else self._environment_of(entry)
         health = self.program_path(entry.health.command[0]) if entry.health else ""
         part = ContainerSpec(name, entry, self._words(name, entry), environment, self.beside(entry.folder), health)
-        with self.about(name, entry):
+        with self.errors_in(name, entry):
             Settings.read(system=self.defaults.system, container=name, environment={})
         if entry.is_local:
             self.check_here(name, entry, environment)
         return part
 
     @contextmanager
-    def about(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
+    def errors_in(self, name: str, entry: Entry, key: str = "") -> Generator[None]:
         """Reports errors inside as errors of a container's table."""
         try:
             yield
@@ -129,7 +123,7 @@ class Tables:
             if words and shutil.which(found := self.program_path(words[0]), path=path) is None:
                 problem = f"there is no program {found}" if "/" in found else f"there is no {found} in PATH"
                 self.refuse(name, key, f"{problem} that this user may run")
-        with self.about(name, entry, "announces"):
+        with self.errors_in(name, entry, "announces"):
             Settings.read(system=self.defaults.system, container=entry.announces or name, environment={})
 
     def program_path(self, named: str) -> str:
@@ -139,15 +133,14 @@ class Tables:
     def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
         """Raises ConfigurationError if something that it needs on this host is missing or wrong."""
         self._check_installed(name, entry)
-        if entry.http:
-            self._check_http(name, entry.http)
+        product, value = _product_of(entry)
+        if product is not None and (problem := product.problem(value, self.beside)):
+            self.refuse(name, entry.kind, problem)
         if entry.program is not None:
             self._check_program_here(name, entry, environment)
-        with self.about(name, entry):
-            if entry.http and entry.http.twin:
-                load(self.beside(entry.http.twin))
-            if entry.ros:
-                importlib.import_module("trade_gateway.ros").read_ros_file(self.beside(entry.ros))
+        with self.errors_in(name, entry):
+            if product is not None:
+                product.check(value, self.beside)
             if entry.robot:
                 robot = without(load(self.beside(entry.robot)), entry.without)[0]
                 check(robot)
@@ -167,20 +160,10 @@ class Tables:
     def _check_installed(self, name: str, entry: Entry) -> None:
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
-        needed = [("http", "http", "uvicorn"), ("ros", "ros", "rosbags"), ("record", "record", "mcap")]
-        if entry.http and entry.http.mcp:
-            needed.append(("http", "mcp", "mcp"))
-        for kind, extra, module in needed:
-            if getattr(entry, kind) and importlib.util.find_spec(module) is None:
-                self.refuse(name, kind, f"needs the extra {extra}; pip install 'trade-gateway[{extra}]'")
-
-    def _check_http(self, name: str, http: HttpSpec) -> None:
-        if not (http.tokens or http.tls):
-            self.refuse(name, "http", "no client could log in; name tokens, or tls and its authority's certificates")
-        if http.tokens and not (tokens := self.beside(http.tokens)).exists():
-            self.refuse(name, "http", f"there is no {tokens}; make it: trade http token NAME --tokens {tokens}")
-        if (http.ask_first or http.twin) and not http.mcp:
-            self.refuse(name, "http", "ask_first and twin are for agents; add mcp = true")
+        product, value = _product_of(entry)
+        for extra, library in () if product is None else product.extras(value):
+            if importlib.util.find_spec(library) is None:
+                self.refuse(name, entry.kind, f"needs the extra {extra}; pip install 'trade-gateway[{extra}]'")
 
     def _words(self, name: str, entry: Entry) -> list[str]:
         if entry.program is not None:
@@ -196,34 +179,12 @@ class Tables:
                 does = ["gateway", file]
             case "rules":
                 does = ["rules", "run", file, "--name", name]
-            case "http":
-                does = ["http", "--name", name, *self._http_words(entry)]
-            case "ros":
-                does = ["ros", file, "--name", name]
-            case "record":
-                does = ["record", "--name", name, *self._record_words(entry)]
+            case kind if kind in PRODUCTS:
+                does = kind_of_product(kind).words(name, getattr(entry, kind), lambda named: self._path(entry, named))
             case _:
                 patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
                 does = ["container", "--name", name, *patterns]
         return ["--system", self.defaults.system, *dialled, *does]
-
-    def _http_words(self, entry: Entry) -> list[str]:
-        spec = entry.http or HttpSpec()
-        options = {"--listen": [spec.listen], "--origin": spec.origins, "--host": spec.hosts}
-        options["--ask-first"] = spec.ask_first
-        for option, named in (("--tokens", spec.tokens), ("--tls", spec.tls), ("--twin", spec.twin)):
-            options[option] = [self._path(entry, named)] if named else []
-        return [*_options(options), "--mcp"] if spec.mcp else _options(options)
-
-    def _record_words(self, entry: Entry) -> list[str]:
-        spec = entry.record or RecordSpec(folder=".")
-        rates = {"--hz": spec.hz, "--camera-hz": spec.camera_hz, "--service-hz": spec.service_hz}
-        options: dict[str, Sequence[str]] = {"--group": spec.groups, "--services": spec.services}
-        options |= {option: [f"{hz:g}"] for option, hz in rates.items() if hz is not None}
-        folder = self._path(entry, spec.folder)
-        if spec.keep_last_s is None:
-            return [f"{folder}/", *_options(options)]
-        return [*_options(options), "--keep-last", f"{spec.keep_last_s:g}", "--at-fault", folder]
 
     def _path(self, entry: Entry, named: str) -> str:
         return str(self.beside(named)) if entry.is_local else named
@@ -266,58 +227,37 @@ class Tables:
         raise ConfigurationError(where=at(self.path, self._text, ("container", name), key), problem=problem) from None
 
 
-def _options(values: Mapping[str, Sequence[str]]) -> list[str]:
-    return [word for option, named in values.items() for value in named for word in (option, value)]
+def _product_of(entry: Entry) -> tuple[ContainerKind | None, Any]:
+    """Returns what a product knows of a container, with the value that is for it; None for other kinds."""
+    kind = entry.kind
+    return (kind_of_product(kind) if kind in PRODUCTS else None), getattr(entry, kind)
 
 
-def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
-    """Reads a TOML file; returns its text and its contents. Raises ConfigurationError."""
-    try:
-        text = read_text(path)
-        return text, read_toml_text(text)
-    except FileNotFoundError:
-        raise ConfigurationError(where=str(path), problem="there is no such file") from None
-    except OSError as bad:
-        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
-    except ValueError as bad:  # no TOML, or no UTF-8
-        raise ConfigurationError(where=str(path), problem=f"not valid TOML: {bad}") from None
+def read_entry(raw: object, kind: type[_Entry], path: Path, text: str, table: tuple[str, ...]) -> _Entry:
+    """Converts the table of a container, with the tables in it that products know. Raises ConfigurationError."""
+    entry = converted(raw, kind, path, text, table)
+    checked: dict[str, Any] = {}
+    for key in PRODUCTS:
+        value, inner = getattr(entry, key), kind_of_product(key).table
+        if inner is not None and value is not None:
+            checked[key] = msgspec.to_builtins(converted(value, inner, path, text, table, key))
+    return structs.replace(entry, **checked)
 
 
-def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...]) -> _Read:
-    """Converts a table to its type. Raises ConfigurationError with the line."""
+def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...], inside: str = "") -> _Read:
+    """Converts a table, or the one inside it under a key, to its type. Raises ConfigurationError with the line."""
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as bad:
-        message = str(bad)
-    place = _AT.search(message)
-    inside = place.group(1) if place else ""
-    key = re.split(r"[.\[]", inside, maxsplit=1)[0]
+        found = mismatch(bad)
+    key = inside or re.split(r"[.\[]", found.place, maxsplit=1)[0]
     fields = INSIDE.get(key, kind).__struct_encode_fields__
-    problem = message[: place.start()] if place else message
-    if unknown := _UNKNOWN.search(message):
-        key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"
-    elif missing := _MISSING.search(message):
-        problem = f"{missing.group(1)} is missing"
+    problem = found.problem
+    if found.unknown:
+        key, problem = key or found.unknown, f"unknown key {found.unknown!r}; there is {', '.join(fields)}"
+    elif found.missing:
+        problem = f"{found.missing} is missing"
     raise ConfigurationError(where=at(path, text, table, key), problem=problem)
-
-
-def at(path: Path, text: str, table: tuple[str, ...], key: str) -> str:
-    """Returns a place in a file, for errors."""
-    return f"{path}:{line_of(text, table, key)}: {'.'.join((*table, key) if key else table)}"
-
-
-def line_of(text: str, table: Sequence[str], key: str = "") -> int:
-    """Returns the line of a key in a table of a TOML text; else of the table's header; else 1."""
-    inside, found = False, 1
-    wanted = re.compile(rf"""\s*["']?{re.escape(key)}["']?\s*=""")
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := _HEADER.match(line):
-            names = [quoted or bare for quoted, bare in _NAME.findall(header.group(1))]
-            inside = names[: len(table)] == list(table)
-            found = number if inside and found == 1 else found
-        elif inside and key and wanted.match(line):
-            return number
-    return found
 
 
 def _some(names: Mapping[str, object]) -> str:

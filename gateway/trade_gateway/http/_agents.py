@@ -81,19 +81,19 @@ class _Agent:
                 ):
                     await self.into.send(message)
 
-    async def answer(self, asked: _Rpc, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, request: _Rpc, scope: Scope, receive: Receive, send: Send) -> None:
         """Answers a request. If its connection ends before, the request ends, and with it the motion (S05)."""
         self.heard_at = time.monotonic()
-        if asked.id is None or not asked.method:
+        if request.id is None or not request.method:
             await self.transport.handle_request(scope, receive, send)
             return
-        self._open[asked.id] = None
+        self._open[request.id] = None
         try:
             await self.transport.handle_request(scope, receive, send)
         finally:
-            self._open.pop(asked.id, None)
+            self._open.pop(request.id, None)
             with anyio.move_on_after(_LOOK_EVERY_S, shield=True):
-                await self._cancel(asked.id)
+                await self._cancel(request.id)
 
     async def _cancel(self, request: int | str) -> None:
         """Ends a request that is not answered yet."""
@@ -199,21 +199,21 @@ class Agents:
             if name is None and (not statuses or statuses[0] >= _REFUSED):
                 agent.scope.cancel()
 
-    def _named(self, name: str, who: str) -> _Agent:
+    def _named(self, name: str, identity: str) -> _Agent:
         """The agent that a request names. Raises NoSuchSession."""
-        agent = self._agents.get(self._api.clients.of(name, who))
+        agent = self._agents.get(self._api.clients.of(name, identity))
         if agent is None:
             raise NoSuchSession(session=name[:8])
         return agent
 
-    async def _begun(self, who: str, asked: _Rpc, scope: Scope) -> _Agent:
+    async def _begun(self, identity: str, request: _Rpc, scope: Scope) -> _Agent:
         """Opens a session for a new agent. Raises TooMany; HttpError: this request begins none."""
-        if asked.method != "initialize" or self._tasks is None:
+        if request.method != "initialize" or self._tasks is None:
             raise HttpError(status=400, problem="name a session (Mcp-Session-Id), or begin one with `initialize`")
-        client = await self._api.in_thread(self._api.clients.open, who)
+        client = await self._api.in_thread(self._api.clients.open, identity)
         agent = self._agents[client] = _Agent(client)
         await self._tasks.start(self._converse, agent)
-        self._leases.begin(client, 0, lambda: self._authenticator.still(scope, who))
+        self._leases.begin(client, 0, lambda: self._authenticator.still(scope, identity))
         return agent
 
     async def _converse(self, agent: _Agent, *, task_status: TaskStatus[None]) -> None:

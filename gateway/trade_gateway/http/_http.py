@@ -273,7 +273,7 @@ class Http:
         self._renewed(request, who)
         return who
 
-    def _renewed(self, request: Request, who: str, *, stops: bool = False) -> Client | None:
+    def _renewed(self, request: Request, identity: str, *, stops: bool = False) -> Client | None:
         """Renews and returns the session that a request names; None if it names none.
 
         Raises NoSuchSession, except for a request that stops something: that needs no session (S07).
@@ -282,7 +282,7 @@ class Http:
         if secret is None:
             return None
         try:
-            client = self._api.clients.of(secret, who)
+            client = self._api.clients.of(secret, identity)
         except NoSuchSession:
             if stops:
                 return None
@@ -290,21 +290,23 @@ class Http:
         self._leases.renew(client)
         return client
 
-    def _lasting(self, request: Request, who: str, what: str) -> Client:
+    def _lasting(self, request: Request, identity: str, what: str) -> Client:
         """The session that a request names. Raises NeedsSession, NoSuchSession."""
-        client = self._renewed(request, who)
+        client = self._renewed(request, identity)
         if client is None:
             raise NeedsSession(what=what)
         return client
 
     @asynccontextmanager
-    async def _client(self, request: Request, who: str, named: Client | None) -> AsyncGenerator[tuple[Client, bool]]:
+    async def _client(
+        self, request: Request, identity: str, named: Client | None
+    ) -> AsyncGenerator[tuple[Client, bool]]:
         """The session that a request names, or a temporary one; and whether it is temporary."""
         if named is not None:
             yield named, False
             return
-        client = await self._api.in_thread(self._api.clients.open_for_one, who, stops=True)
-        self._leases.begin(client, 0, lambda: self._authenticator.still(request.scope, who))
+        client = await self._api.in_thread(self._api.clients.open_for_one, identity, stops=True)
+        self._leases.begin(client, 0, lambda: self._authenticator.still(request.scope, identity))
         try:
             yield client, True
         finally:

@@ -66,7 +66,7 @@ class SocketProtocol(WebSocketsSansIOProtocol):
     """One WebSocket connection."""
 
     def connection_made(self, transport: BaseTransport) -> None:
-        """Likewise."""
+        """Gives the app the certificate of the connection."""
         super().connection_made(transport)
         self.app = _with_certificate(self.app, transport)
 

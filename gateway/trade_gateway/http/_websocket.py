@@ -66,8 +66,8 @@ class Socket:
 class _Ongoing:
     """The operation that a message has begun."""
 
-    def __init__(self, asked: messages.Asked, handle: Handle | None, admitted: int) -> None:
-        self.asked: Final = asked
+    def __init__(self, request: messages.Asked, handle: Handle | None, admitted: int) -> None:
+        self.asked: Final = request
         self.handle: Final = handle
         """The service to call or stream."""
         self.admitted = admitted
@@ -199,14 +199,14 @@ class Conversation:
         self._ongoing[asked.id] = ongoing
         self._tasks.start_soon(self._do, ongoing)
 
-    def _admitted(self, asked: messages.Asked) -> _Ongoing:
+    def _admitted(self, request: messages.Asked) -> _Ongoing:
         """Checks a request. Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot begin."""
-        if asked.id in self._ongoing:
-            raise BadMessage(problem=f"the operation with id {asked.id!r} has not ended yet. Use another id")
+        if request.id in self._ongoing:
+            raise BadMessage(problem=f"the operation with id {request.id!r} has not ended yet. Use another id")
         handle = None
-        if isinstance(asked, messages.Call | messages.Stream):
-            handle = self._api.find(self._client.identity, asked.group, asked.name, asked.container)
-        stop = _stopping(asked, handle)
+        if isinstance(request, messages.Call | messages.Stream):
+            handle = self._api.find(self._client.identity, request.group, request.name, request.container)
+        stop = _stopping(request, handle)
         if len(self._ongoing) >= MOST_UNDER_WAY and stop is None:
             raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
         admitted = 0 if handle is None else self._client.admit(handle)
@@ -214,7 +214,7 @@ class Conversation:
             raise TooMany(
                 what="stops of this connection that wait for their answer (they are executed)", limit=_MOST_ANSWERS
             )
-        return _Ongoing(asked, handle, admitted)
+        return _Ongoing(request, handle, admitted)
 
     async def _do(self, ongoing: _Ongoing) -> None:
         result, name = None, ongoing.asked.id
@@ -268,14 +268,14 @@ class Conversation:
             if line.idle:
                 self._stops.pop(which, None)
 
-    async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
+    async def _call(self, request: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
         self._api.judge.require_unmarked(self._client.identity, handle)
         async with nullcontext() if handle.effect == "stop" else self._beginning:
-            run = await self._api.begin(self._client, handle, asked, ongoing.admitted)
+            run = await self._api.begin(self._client, handle, request, ongoing.admitted)
         ongoing.run = run
         if ongoing.unwanted:
             await self._api.end(self._client, run)
-        run.on_progress(lambda value: self._post({"id": asked.id, "progress": value}))
+        run.on_progress(lambda value: self._post({"id": request.id, "progress": value}))
         await run.settled()
         return run.result(0)
 
@@ -294,8 +294,8 @@ class Conversation:
                 return False
         return True
 
-    async def _stream(self, asked: messages.Stream, handle: Handle) -> None:
-        samples = await self._api.stream(self._client, handle, asked)
+    async def _stream(self, request: messages.Stream, handle: Handle) -> None:
+        samples = await self._api.stream(self._client, handle, request)
         try:
             while True:
                 try:
@@ -304,40 +304,40 @@ class Conversation:
                 except Exception as error:
                     if samples.ended or not self._api.judge.sees(self._client.identity, handle):
                         raise
-                    await self._say({"id": asked.id, "failed": problem_of(error)})  # this sample; others may follow
+                    await self._say({"id": request.id, "failed": problem_of(error)})  # this sample; others may follow
                 else:
-                    await self._say({"id": asked.id, "sample": sample})
+                    await self._say({"id": request.id, "sample": sample})
         finally:
             await self._apart(samples.close)
 
-    async def _watch(self, asked: messages.Watch) -> None:
+    async def _watch(self, request: messages.Watch) -> None:
         def tell(occasion: str, handle: Handle) -> None:
             view = self._api.view(self._client.identity, handle)
-            self._post({"id": asked.id, "event": occasion, "service": view})
+            self._post({"id": request.id, "event": occasion, "service": view})
 
-        standing = await self._api.in_thread(self._api.watch, self._client, asked, tell)
+        standing = await self._api.in_thread(self._api.watch, self._client, request, tell)
         try:
             await anyio.sleep_forever()
         finally:
             for one in standing:
                 await self._apart(one.cancel)
 
-    async def _logs(self, asked: messages.Logs) -> None:
+    async def _logs(self, request: messages.Logs) -> None:
         reader = self._api.overview.log()
         lines = await self._api.overview.log_lines(self._client.identity, reader)
         lines = lines[-_OLD_LINES:]
         while True:
             for line in lines:
-                if line.level >= asked.level:
-                    await self._say({"id": asked.id, "line": line})
+                if line.level >= request.level:
+                    await self._say({"id": request.id, "line": line})
             await anyio.sleep(_LOG_EVERY_S)
             lines = await self._api.overview.log_lines(self._client.identity, reader)
 
-    async def _calls(self, asked: messages.Calls) -> None:
-        reader = self._api.overview.ended(reads=asked.reads)
+    async def _calls(self, request: messages.Calls) -> None:
+        reader = self._api.overview.ended(reads=request.reads)
         while True:
             for span in await self._api.overview.calls(self._client.identity, reader):
-                await self._say({"id": asked.id, "call": messages.call_view(span)})
+                await self._say({"id": request.id, "call": messages.call_view(span)})
             await anyio.sleep(_LOG_EVERY_S)
 
     async def _apart(self, close: Callable[[], object]) -> None:
@@ -348,13 +348,13 @@ class Conversation:
         self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})
 
 
-def _stopping(asked: messages.Asked, handle: Handle | None) -> object:
+def _stopping(request: messages.Asked, handle: Handle | None) -> object:
     """The key of a requested stop; None for other requests."""
-    match asked:
+    match request:
         case messages.Estop():
             return "estop"
         case messages.Cancel():
-            return "cancel", asked.which
+            return "cancel", request.which
         case _:
             return handle.key if handle is not None and handle.effect == "stop" else None
 

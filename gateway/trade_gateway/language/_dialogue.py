@@ -145,8 +145,8 @@ class Talk:
         self._show(_shown(heard))
         return heard, True
 
-    def _found(self, heard: Heard) -> Answer | Plan:
-        phrase, gaps = heard
+    def _found(self, sentence: Heard) -> Answer | Plan:
+        phrase, gaps = sentence
         return self._planned_call(phrase, gaps) if phrase.call else REQUESTS[phrase.ask].ask(self._asker, gaps)
 
     def _planned_call(self, phrase: Phrase, gaps: Gaps) -> Plan:
@@ -163,7 +163,7 @@ class Talk:
         shall, stops = f"call {service.label}({', '.join(shown)})", service.effect == "stop"
         return Plan(shall, do, confirm=service.effect not in _HARMLESS, stops=stops)
 
-    def _repeated(self, heard: Heard) -> Heard:
+    def _repeated(self, sentence: Heard) -> Heard:
         """The last question, with another name. Raises Unknown."""
         if self._last is None:
             raise Unknown("that repeats a question, and none was asked just before. Say the whole sentence")
@@ -171,16 +171,16 @@ class Talk:
         gap = next((gap for gap in _REPEATABLE if gap in gaps), "")
         if not gap:
             raise Unknown(f"that refers to the last question, {phrase.means!r}, which is about no name")
-        name = heard.gaps["name"]
+        name = sentence.gaps["name"]
         words = name.split()
         if words[-1].lower() == "one" and len(words) > 1:
             name = " ".join([*words[:-1], *gaps[gap].split()[-1:]])
         return Heard(phrase, self._lexicon.named({**gaps, gap: name}))
 
-    def _referred(self, heard: Heard) -> Heard:
+    def _referred(self, sentence: Heard) -> Heard:
         """The sentence, with the name of the last sentence in place of "it"."""
-        gaps = {gap: self._gaps.get(gap, text) if text.lower() in _IT else text for gap, text in heard.gaps.items()}
-        return Heard(heard.phrase, gaps)
+        gaps = {gap: self._gaps.get(gap, text) if text.lower() in _IT else text for gap, text in sentence.gaps.items()}
+        return Heard(sentence.phrase, gaps)
 
     # --- doing it
 
@@ -196,28 +196,28 @@ class Talk:
             raise NotUnderstood(where=repr(sentence), problem=problem)
         return self._done(pending.heard, pending.plan)
 
-    def _done(self, heard: Heard, plan: Plan) -> Reply:
+    def _done(self, sentence: Heard, plan: Plan) -> Reply:
         """Executes an order, under the locks of the dialogue. Raises LockLost once for each of them that is lost."""
-        self._last, self._gaps = None, heard.gaps  # a follow-up repeats a question, and never an order
+        self._last, self._gaps = None, sentence.gaps  # a follow-up repeats a question, and never an order
         try:
             with ExitStack() as held:
                 for lock in () if plan.stops else list(self._asker.locks):
                     lock.check()
                     held.enter_context(lock.use())
-                return _reply(heard, plan.do())
+                return _reply(sentence, plan.do())
         except LockLost:
             self._asker.locks[:] = [lock for lock in self._asker.locks if lock.held]
             raise
 
 
-def _reply(heard: Heard, answer: Answer) -> Reply:
-    phrase = heard.phrase
+def _reply(sentence: Heard, answer: Answer) -> Reply:
+    phrase = sentence.phrase
     template = phrase.say
     if answer.count == 0 and phrase.none:
         template = phrase.none
     elif answer.count == 1 and phrase.one:
         template = phrase.one
-    return Reply(template.format(**{**heard.gaps, **answer.fields}).strip(), phrase.means, answer.data)
+    return Reply(template.format(**{**sentence.gaps, **answer.fields}).strip(), phrase.means, answer.data)
 
 
 def _chosen(sentence: str, choice: _Choice) -> Heard | None:
@@ -234,9 +234,9 @@ def _words(text: str) -> list[str]:
     return "".join(letter if letter.isalnum() else " " for letter in text.lower()).split()
 
 
-def _shown(heard: Heard) -> str:
+def _shown(sentence: Heard) -> str:
     """A request as it is shown: ``migrate(group='planner', place='base')``."""
-    return f"{heard.phrase.means}({', '.join(f'{gap}={text!r}' for gap, text in heard.gaps.items())})"
+    return f"{sentence.phrase.means}({', '.join(f'{gap}={text!r}' for gap, text in sentence.gaps.items())})"
 
 
 def _require_question(sentence: str, phrase: Phrase) -> None:

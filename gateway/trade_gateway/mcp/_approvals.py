@@ -14,6 +14,7 @@ from msgspec import Struct
 
 from trade import Container, Handle, current_call, service
 from trade._context.sessions import client_name, client_of
+from trade._protocol.schema_types import publish
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.clients import ClientAuthorizer
 from trade_gateway.clients._errors import NeedsApproval
@@ -38,6 +39,9 @@ class Request(Struct, frozen=True):
     """``time.time()``"""
     until: float
     """The time of its automatic refusal."""
+
+
+publish("trade_gateway.mcp", Request)
 
 
 class _Waiting(Struct):

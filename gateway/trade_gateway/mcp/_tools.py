@@ -130,22 +130,22 @@ class Tools:
         self.record(name, about, began, "ok", "")
         return result
 
-    def record(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
+    def record(self, tool: str, about: str, began: int, outcome: str, reason: str) -> None:
         """Audits the use of a tool that began at this ``time.monotonic_ns()``."""
         took_ns = time.monotonic_ns() - began
         what, who = f"agent's tool {tool}", self._client.identity
-        self._container.note_asked(what, about, who=who, outcome=outcome, why=why, took_ns=took_ns)
+        self._container.note_request(what, about, client=who, outcome=outcome, error=reason, took_ns=took_ns)
 
     # --- queries
 
-    async def services(self, asked: Find, _: Progress) -> Any:
+    async def services(self, request: Find, _: Progress) -> Any:
         """List services: what they do, need, achieve and use, their health, and whether they may be called."""
-        found = self._api.seen(self._client.identity, asked.group, asked.name, asked.needs, asked.achieves)
+        found = self._api.seen(self._client.identity, request.group, request.name, request.needs, request.achieves)
         return [self._api.view(self._client.identity, handle) for handle in found]
 
-    async def describe(self, asked: Named, _: Progress) -> Any:
+    async def describe(self, request: Named, _: Progress) -> Any:
         """Describe one service: JSON Schemas of its arguments and result, and what a call of it needs."""
-        handle = self._find(asked.group, asked.name, asked.container)
+        handle = self._find(request.group, request.name, request.container)
         schema = handle.schema
         return Described(
             self._api.view(self._client.identity, handle),
@@ -155,7 +155,7 @@ class Tools:
             needs_approval=self._approvals.needed(self._client.identity, handle),
         )
 
-    async def ask(self, asked: Sentence, _: Progress) -> Any:
+    async def ask(self, request: Sentence, _: Progress) -> Any:
         """Answer a question about the system in plain English: what runs where, lock owners, failures, changes.
 
         It changes nothing: to stop, use the tools `stop` and `estop`.
@@ -163,7 +163,7 @@ class Tools:
         who = self._client.identity
         if who != self._container.address.identity:  # the answer is all that the container may know
             self._api.judge.require_system(who, "read", "ask")
-        return await self._api.counted(who, partial(self._talk.say, asked.sentence, orders=False))
+        return await self._api.counted(who, partial(self._talk.say, request.sentence, orders=False))
 
     async def locks(self, _asked: NoArgs, _: Progress) -> Any:
         """List all locks, and those of this agent that were lost since it last asked."""
@@ -172,25 +172,25 @@ class Tools:
 
     # --- actions
 
-    async def lock(self, asked: messages.LockBody, _: Progress) -> Any:
+    async def lock(self, request: messages.LockBody, _: Progress) -> Any:
         """Take a lock over all that a group uses: rosie.head. No other client can move it until you release it."""
-        return await self._api.lock(self._client, asked, self._lock_lost)
+        return await self._api.lock(self._client, request, self._lock_lost)
 
-    async def unlock(self, asked: LockArgs, _: Progress) -> Any:
+    async def unlock(self, request: LockArgs, _: Progress) -> Any:
         """Release a lock; motion under it stops."""
-        return {"released": await self._api.in_thread(self._client.unlock, asked.lock)}
+        return {"released": await self._api.in_thread(self._client.unlock, request.lock)}
 
-    async def call(self, asked: ToCall, progress: Progress) -> Any:
+    async def call(self, request: ToCall, progress: Progress) -> Any:
         """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
-        handle = self._find(asked.group, asked.name, asked.container)
+        handle = self._find(request.group, request.name, request.container)
         self._require_lock(handle)
         self._api.judge.require_call(self._client.identity, handle)
         admitted = self._client.admit(handle)
         if self._approvals.needed(self._client.identity, handle):
             progress("waits for a person's approval")
-            await self._approvals.ask(self._client.identity, handle, asked.args, asked.why, _APPROVED_WITHIN_S)
+            await self._approvals.ask(self._client.identity, handle, request.args, request.why, _APPROVED_WITHIN_S)
             self._require_lock(handle)
-        run = await self._api.begin(self._client, handle, asked, admitted)
+        run = await self._api.begin(self._client, handle, request, admitted)
         run.on_progress(progress)
         try:
             await run.settled()
@@ -200,22 +200,22 @@ class Tools:
                     await self._api.end(self._client, run)
         return {"result": run.result(0)}
 
-    async def try_on_twin(self, asked: ToCall, _: Progress) -> Any:
+    async def try_on_twin(self, request: ToCall, _: Progress) -> Any:
         """Try a call on a simulated twin, brought to where the whole robot is. Nothing real moves."""
         if self._twin is None:
             raise NoTwin(reason="this server has no twin")
-        handle = self._find(asked.group, asked.name, asked.container)
+        handle = self._find(request.group, request.name, request.container)
         states = await self._states_of(handle.key.domain.partition(".")[0])
-        trying = partial(self._twin.call, handle, asked.args, min(asked.deadline_s, _TRIED_WITHIN_S), states)
+        trying = partial(self._twin.call, handle, request.args, min(request.deadline_s, _TRIED_WITHIN_S), states)
         tried: Tried = await run_sync(trying, abandon_on_cancel=True, limiter=self._trying)
         return tried  # nothing of the real robot waits for it
 
-    async def stop(self, asked: messages.GroupBody, _: Progress) -> Any:
+    async def stop(self, request: messages.GroupBody, _: Progress) -> Any:
         """Stop all motion in a group, by any client. Needs no lock and no right."""
         who = self._client.identity
-        stops = [one for one in self._api.seen(who, asked.group) if one.effect == "stop"]
+        stops = [one for one in self._api.seen(who, request.group) if one.effect == "stop"]
         if not stops:
-            raise NoSuchService(constraint=f"stop in {asked.group}")
+            raise NoSuchService(constraint=f"stop in {request.group}")
         results: dict[str, str] = {}
 
         async def stop(handle: Handle) -> None:
@@ -233,9 +233,9 @@ class Tools:
                 tasks.start_soon(stop, handle)
         return results
 
-    async def estop(self, asked: messages.EstopBody, _: Progress) -> Any:
+    async def estop(self, request: messages.EstopBody, _: Progress) -> Any:
         """Stop everything in the whole system. A person has to clear it. Not safety-rated."""
-        return await self._api.estop(self._client.identity, asked)
+        return await self._api.estop(self._client.identity, request)
 
     # --- helpers
 
@@ -298,7 +298,7 @@ TOOLS: Final = {
 """By name."""
 
 
-def _about(asked: Struct) -> str:
+def _about(request: Struct) -> str:
     """The target of a request, without its arguments, which may be confidential."""
-    group, name = getattr(asked, "group", ""), getattr(asked, "name", "")
-    return ".".join(filter(None, (group, name))) or getattr(asked, "sentence", "") or getattr(asked, "lock", "")
+    group, name = getattr(request, "group", ""), getattr(request, "name", "")
+    return ".".join(filter(None, (group, name))) or getattr(request, "sentence", "") or getattr(request, "lock", "")

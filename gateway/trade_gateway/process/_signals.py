@@ -30,32 +30,32 @@ class SignalEvent:
     """
 
     def __init__(self) -> None:
-        self._asked = False
-        self._bell = queue.SimpleQueue[None]()
+        self._set = False
+        self._wake_queue = queue.SimpleQueue[None]()
 
     def set(self) -> None:
         """Sets the event; safe in a signal handler."""
-        self._asked = True
-        self._bell.put(None)  # the only queue that is reentrant
+        self._set = True
+        self._wake_queue.put(None)  # the only queue that is reentrant
 
     def clear(self) -> None:
         """Clears the event."""
-        self._asked = False
+        self._set = False
 
     def is_set(self) -> bool:
-        return self._asked
+        return self._set
 
     def wait(self, timeout: float | None = None) -> bool:
         """Waits until the event is set, or for a timeout; returns whether it is set."""
         until = None if timeout is None else time.monotonic() + timeout
-        while not self._asked:
+        while not self._set:
             try:
-                self._bell.get(timeout=None if until is None else max(0.0, until - time.monotonic()))
+                self._wake_queue.get(timeout=None if until is None else max(0.0, until - time.monotonic()))
             except queue.Empty:
                 break
-            if self._asked:
-                self._bell.put(None)  # for other waiting threads
-        return self._asked
+            if self._set:
+                self._wake_queue.put(None)  # for other waiting threads
+        return self._set
 
 
 @contextmanager
@@ -100,11 +100,11 @@ def hangups() -> Generator[SignalEvent]:
     """Turns SIGHUP into an event."""
     event = SignalEvent()
 
-    def heard(_number: int, _frame: FrameType | None) -> None:
+    def on_hangup(_number: int, _frame: FrameType | None) -> None:
         event.set()
 
     number = getattr(signal, "SIGHUP", None)
-    before = None if number is None else signal.signal(number, heard)
+    before = None if number is None else signal.signal(number, on_hangup)
     try:
         yield event
     finally:

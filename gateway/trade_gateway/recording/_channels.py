@@ -31,7 +31,7 @@ class JointStates(Struct, frozen=True, kw_only=True):
     enabled: list[bool]
     """Empty: the device does not report it, as joints of ROS."""
     fault: list[str]
-    """Likewise."""
+    """Empty: the device does not report it, as joints of ROS."""
     stamp_s: list[float]
     """Times of the measurements: seconds since the epoch, on the time of the recording (`Timeline`)."""
 

@@ -75,7 +75,7 @@ def episodes(
     states: Mapping[str, Sequence[JointStates]],
     spans: Sequence[Span],
     fps: int,
-    tell: Callable[[Span, str], None],
+    callback: Callable[[Span, str], None],
 ) -> Iterator[Episode]:
     """Returns the measurements of each span, linearly interpolated.
 
@@ -83,21 +83,21 @@ def episodes(
         states: measurements by group; each frame has all their joints, in this order.
         spans: the parts to return.
         fps: frames per second.
-        tell: called with a span that is cut where a joint moved unmeasured, or skipped for too few measurements,
+        callback: called with a span that is cut where a joint moved unmeasured, or skipped for too few measurements,
             and with the reason.
     """
     for span in spans:
         try:
-            parts = list(_parts(_within(states, span), span, tell))
+            parts = list(_parts(_within(states, span), span, callback))
         except ConfigurationError as problem:
-            tell(span, f"is left out: {problem.problem}")
+            callback(span, f"is left out: {problem.problem}")
             continue
         for part in parts:
             try:
                 found = _episode(_within(states, part), part, fps)
             except ConfigurationError as problem:
                 what = "is left out" if part == span else "is left out in part"
-                tell(span, f"{what}: {problem.problem}")
+                callback(span, f"{what}: {problem.problem}")
             else:
                 yield found
 
@@ -110,14 +110,14 @@ def _within(states: Mapping[str, Sequence[JointStates]], span: Span) -> dict[str
 
 
 def _parts(
-    states: Mapping[str, Sequence[JointStates]], span: Span, tell: Callable[[Span, str], None]
+    states: Mapping[str, Sequence[JointStates]], span: Span, callback: Callable[[Span, str], None]
 ) -> Iterator[Span]:
     """Removes from a span the times at which a joint moved unmeasured."""
     began_s = min((min(one.stamp_s) for measured in states.values() for one in measured), default=0.0)
     from_s = span.from_s
     for gap in sorted(gap for group, measured in states.items() for gap in gaps(group, measured)):
         at = f"from {gap.from_s - began_s:.1f} to {gap.until_s - began_s:.1f} s"
-        tell(span, f"is cut: {gap.joint} moved and was not measured {at}")
+        callback(span, f"is cut: {gap.joint} moved and was not measured {at}")
         if gap.from_s > from_s:
             yield span._replace(from_s=from_s, until_s=gap.from_s)
         from_s = max(from_s, gap.until_s)

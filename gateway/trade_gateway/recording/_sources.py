@@ -80,7 +80,7 @@ class Sources:
             text = f"{type(bad).__name__}: {bad}"
             self._refused.extend(self._noted(handle.label, "unreadable", text, type(bad).__name__))
             return
-        stream.tell(self._wake.set)
+        stream.on_sample(self._wake.set)
         self._open[handle] = _Source(stream, read)
         self._wake.set()
 

@@ -10,6 +10,7 @@ from typing import Final
 from msgspec import Struct
 
 from trade import Container, service
+from trade._protocol.schema_types import publish
 from trade.errors import TradeError
 from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._graph import Graph
@@ -52,6 +53,9 @@ class Bridged(Struct, frozen=True):
     """Nodes of ROS that have a session here now."""
     problems: list[str]
     """Entries that are not mapped, and why."""
+
+
+publish("trade_gateway.ros", Bridged)
 
 
 class Bridge:

@@ -10,12 +10,10 @@ from msgspec import Meta, Struct, structs
 
 from trade.errors import ConfigurationError
 from trade.text_files import read_text
-from trade.toml_files import read_toml_text
+from trade.toml_files import Mismatch, mismatch
+from trade_gateway.config._toml_file import read_toml
 from trade_gateway.ros._urdf import read_urdf
 
-_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
-_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
-_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
 _NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
 _Text = Annotated[str, Meta(min_length=1)]
@@ -306,14 +304,11 @@ def read_ros_file(path: Path) -> RosFile:
     Raises:
         ConfigurationError: the file cannot be read, or an entry is wrong; the error says where, and what is valid.
     """
-    try:
-        raw = read_toml_text(read_text(path))
-    except (OSError, ValueError) as bad:
-        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
+    _, raw = read_toml(path)
     try:
         read = _placed(msgspec.convert(raw, RosFile), path.parent)
     except msgspec.ValidationError as bad:
-        raise _explained(path, str(bad)) from None
+        raise _explained(path, mismatch(bad)) from None
     for entry in read.to_ros.robot:
         _read_description(entry)
     for place, problem in _problems(read):
@@ -334,13 +329,12 @@ def _read_description(entry: RobotEntry) -> None:
         raise ConfigurationError(where=entry.urdf, problem=f"cannot be read: {bad}") from None
 
 
-def _explained(path: Path, message: str) -> ConfigurationError:
-    found = _AT.search(message)
-    place, problem = (found.group(1), message[: found.start()]) if found else ("", message)
-    if missing := _MISSING.search(problem):
-        place, problem = f"{place}.{missing.group(1)}".lstrip("."), "is missing"
-    elif unknown := _UNKNOWN.search(problem):
-        place, problem = f"{place}.{unknown.group(1)}".lstrip("."), "unknown key; docs/ros.md lists the valid ones"
+def _explained(path: Path, found: Mismatch) -> ConfigurationError:
+    place, problem, missing, unknown = found
+    if missing:
+        place, problem = f"{place}.{missing}".lstrip("."), "is missing"
+    elif unknown:
+        place, problem = f"{place}.{unknown}".lstrip("."), "unknown key; docs/ros.md lists the valid ones"
     elif "matching regex" in problem and "msg|srv|action" in problem:
         problem = "a type is written package/msg/NAME, package/srv/NAME or package/action/NAME: std_msgs/msg/Float64"
     elif "matching regex" in problem:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade.errors import InvalidArgument, ToleranceExceeded
-from trade_gateway.ros._joints import JointNames
 from trade_gateway.ros.to_ros._served_goals import Unacceptable
 from trade_gateway.ros_messages._conversion import ros_stamp, seconds
+from trade_gateway.ros_messages._joint_names import JointNames
 from trade_gateway.ros_messages._types import Message
 
 ACTION: Final = "control_msgs/action/FollowJointTrajectory"

@@ -100,7 +100,7 @@ class Goal(Protocol):
         """Sends feedback to the client."""
         ...
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         """Registers a callback for a cancel by its client or a replacement; it runs at once if that has happened."""
         ...
 
@@ -137,7 +137,7 @@ class Graph(Protocol):
         """Publishes a topic; latched: later subscribers receive the last message."""
         ...
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
         """Subscribes to a topic; latched: also receives earlier messages, if the publisher keeps them.
 
         Otherwise earlier messages are dropped: an old command would be taken for a new one.

@@ -20,7 +20,7 @@ class Mailbox(Generic[_T]):
     def __init__(
         self,
         name: str,
-        tell: Callable[[_T], object],
+        callback: Callable[[_T], object],
         *,
         most: int | None = None,
         longest_s: float = float("inf"),
@@ -29,13 +29,13 @@ class Mailbox(Generic[_T]):
     ) -> None:
         """Args:
         name: of the thread.
-        tell: called with each item; its exceptions are logged.
+        callback: called with each item; its exceptions are logged.
         most: how many items wait at most; None: any number.
         longest_s: how long an item waits at most, in seconds.
         drop: called with each dropped item.
         end_s: how long closing waits for running callbacks, in seconds.
         """
-        self._tell = tell
+        self._tell = callback
         self._most = most
         self._end_s = end_s
         self._longest_s = longest_s
@@ -95,15 +95,15 @@ class AtOnce(Generic[_T]):
     An item waits only when all threads are busy, for the first that is free.
     """
 
-    def __init__(self, name: str, tell: Callable[[_T], object], *, most: int, drop: Callable[[_T], object]) -> None:
+    def __init__(self, name: str, callback: Callable[[_T], object], *, most: int, drop: Callable[[_T], object]) -> None:
         """Args:
         name: of the threads.
-        tell: called with each item; its exceptions are logged.
+        callback: called with each item; its exceptions are logged.
         most: how many callbacks run at a time.
         drop: called with each dropped item.
         """
         self._name = name
-        self._tell = tell
+        self._tell = callback
         self._most = most
         self._drop = drop
         self._waiting: deque[_T] = deque()

@@ -199,11 +199,11 @@ class Nodes:
         self._thread = threading.Thread(target=self._look_on, name="trade-ros-nodes", daemon=True)
         self._thread.start()
 
-    def guest(self, who: str, came_at: float, *, stops: bool = False) -> Guest:
+    def guest(self, client: str, came_at: float, *, stops: bool = False) -> Guest:
         """Returns the client that represents a node.
 
         Args:
-            who: its name, from ROS.
+            client: its name, from ROS.
             came_at: arrival of its request, by ``time.monotonic()``.
             stops: whether it wants to stop something, which is always allowed.
 
@@ -214,25 +214,25 @@ class Nodes:
             if self._closing.is_set() and not stops:
                 raise RosUnreachable(what="the bridge", problem="it is shutting down and begins no calls")
             if self._lost and not stops:
-                problem = f"{self._lost}; the end of {who or 'a node'} would be invisible, so its request is refused"
+                problem = f"{self._lost}; the end of {client or 'a node'} would be invisible, so its request is refused"
                 raise RosUnreachable(what="ROS", problem=problem)
-            if self._is_of_the_dead(who, came_at) and not stops:
-                raise RosUnreachable(what=who, problem="it has ended; its pending requests are not executed")
-            guest = self._guests.get(who)
+            if self._is_of_the_dead(client, came_at) and not stops:
+                raise RosUnreachable(what=client, problem="it has ended; its pending requests are not executed")
+            guest = self._guests.get(client)
             if guest is None or guest.client.closed:
-                guest = self._guests[who] = self._opened(who)
+                guest = self._guests[client] = self._opened(client)
             guest.heard_at = time.monotonic()
             return guest
 
-    def _is_of_the_dead(self, who: str, came_at: float) -> bool:
-        gone_at = self._gone.get(who)
+    def _is_of_the_dead(self, client: str, came_at: float) -> bool:
+        gone_at = self._gone.get(client)
         if gone_at is None:
             return False
-        return came_at <= gone_at or (who not in self._there and time.monotonic() - gone_at < _FORGOTTEN_S)
+        return came_at <= gone_at or (client not in self._there and time.monotonic() - gone_at < _FORGOTTEN_S)
 
-    def _opened(self, who: str) -> Guest:
-        session = self._container.open_session(who.strip("/") or "unknown")
-        return Guest(self._container, Client(self._container.address.identity, session, lambda _: None), who)
+    def _opened(self, client: str) -> Guest:
+        session = self._container.open_session(client.strip("/") or "unknown")
+        return Guest(self._container, Client(self._container.address.identity, session, lambda _: None), client)
 
     def names(self) -> list[str]:
         """Names of the nodes that have a session now."""

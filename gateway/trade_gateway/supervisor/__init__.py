@@ -2,8 +2,8 @@
 
 from trade._protocol.schema_types import publish as _publish
 from trade_gateway.config._children import Child, read_children
-from trade_gateway.config._described import ChildTables
 from trade_gateway.supervisor._child_state import ChildInfo, News
+from trade_gateway.supervisor._described import ChildTables
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._services import ChildServices
 from trade_gateway.supervisor._supervisor import Supervisor

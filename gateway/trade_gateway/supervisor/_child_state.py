@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease, uptime_s
-from trade_gateway.supervisor._lease_protocol import Leased
+from trade_gateway.supervisor._lease_protocol import LeaseEnd
 from trade_gateway.supervisor._objects import CreatedObjects
 from trade_gateway.supervisor._process import Process
 from trade_gateway.supervisor._restart_policy import Life, State
@@ -59,7 +59,7 @@ class Unit:
         """The reason for its requested end; empty if none is requested."""
         self.save_at = math.inf
         self.saved_at = 0.0
-        self.lease: Leased | None = None
+        self.lease: LeaseEnd | None = None
         self.sent: TimerLease | None = None
         """The lease that its process has received."""
 
@@ -71,7 +71,7 @@ class Unit:
         return min(self.life.deadline - now, self.save_at - now, leased_s)
 
     @property
-    def gone(self) -> bool:
+    def has_ended(self) -> bool:
         return bool(self.leaving) and not self.life.alive
 
     @property
@@ -94,13 +94,13 @@ class Unit:
         if self.lease is None:
             return True
         wanted = self.life.alive or not (self.leaving or self.given_up)
-        return self.lease.look(alive=self.life.alive, wanted=wanted)
+        return self.lease.update(alive=self.life.alive, wanted=wanted)
 
-    def stay(self) -> None:
+    def send_lease(self) -> None:
         """Sends its process a changed lease."""
         term = None if self.lease is None else self.lease.term
         if self.process is not None and term is not None and term != self.sent:
-            self.process.stay(term)
+            self.process.send_lease(term)
             self.sent = term
 
     def info(self) -> ChildInfo:

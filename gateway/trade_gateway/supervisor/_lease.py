@@ -107,9 +107,9 @@ class Holder:
         self.turn, self.why, self._every_s = lease.turn, "", lease.lease_s / _ASKS
         self.term = TimerLease(until - lease.lease_s / _LEAVES, until)
 
-    def unanswered(self, why: str) -> None:
+    def unanswered(self, reason: str) -> None:
         """Handles a request that was lost or could not be sent."""
-        self.why = why
+        self.why = reason
 
 
 class Arbiter:
@@ -161,7 +161,7 @@ class Arbiter:
             return f"it is for {self.moves_to or self._askers} again"
         return f"{self.holder} has it" if self.turn else f"{self.holder or self._askers} may have it"
 
-    def asked(self, now: float, asker: str, turn: str, lease_s: float) -> bool:
+    def request(self, now: float, asker: str, turn: str, lease_s: float) -> bool:
         """Handles a request; returns whether the gateway ``asker`` gets the lease, then `turn` is its turn."""
         self.asked_at[asker] = now
         if self.mine or (self.moves_to is not None and asker != self.moves_to):
@@ -181,7 +181,7 @@ class Arbiter:
         self.moves_to = to
         self.handing = self.handing or (self.mine and bool(to))
 
-    def looked(self, now: float) -> bool:
+    def take_if_free(self, now: float) -> bool:
         """Takes the container if the last lease has expired; returns whether it just did."""
         if self.mine or now < self.due:
             return False

@@ -35,7 +35,7 @@ Keep = Callable[[Mapping[str, Any]], bool]
 """Saves states; returns whether they are on disk."""
 
 
-class Leased(Protocol):
+class LeaseEnd(Protocol):
     """The supervisor's view of a lease; used only on its thread, except the results of `load` and `keep`."""
 
     lock: Path
@@ -61,7 +61,7 @@ class Leased(Protocol):
         """Whether the container's states can be saved now."""
         ...
 
-    def look(self, *, alive: bool, wanted: bool) -> bool:
+    def update(self, *, alive: bool, wanted: bool) -> bool:
         """Does what is due; returns whether the container may run here.
 
         Args:
@@ -84,29 +84,29 @@ class LeaseHolder:
 
     Args:
         child: the container.
-        member: returns the container that requests; it may change.
-        post: runs a function on the supervisor's thread.
-        tell: called with a problem of saving, and with its end.
+        container: returns the container that requests; it may change.
+        run_on_supervisor: runs a function on the supervisor's thread.
+        report: called with a problem of saving, and with its end.
         lock: see `Leased`.
     """
 
     def __init__(
         self,
         child: Child,
-        member: Callable[[], Container],
-        post: Callable[[Callable[[], None]], None],
-        tell: Callable[[str], None],
+        container: Callable[[], Container],
+        run_on_supervisor: Callable[[Callable[[], None]], None],
+        report: Callable[[str], None],
         lock: Path,
     ) -> None:
         self.lock = lock
         self._name = child.name
         self._from = child.terms.lease_from
-        self._member = member
-        self._post = post
-        self._tell = tell
+        self._container = container
+        self._run_on_supervisor = run_on_supervisor
+        self._report = report
         self._holder = Holder(uptime_s(), self._from)
         self._states: dict[str, Any] = {}
-        self._begun = ""
+        self._states_turn = ""
         """The turn in which these states were received."""
         self._number = 0
         self._trouble = ""
@@ -127,15 +127,15 @@ class LeaseHolder:
     def keeps(self) -> bool:
         return self._holder.keeps(uptime_s())
 
-    def look(self, *, alive: bool, wanted: bool) -> bool:
+    def update(self, *, alive: bool, wanted: bool) -> bool:
         now, holder = uptime_s(), self._holder
         if holder.asks(now) and wanted:
             self._ask(now, holder.turn)
         if not holder.held(now):
-            self._begun = ""
+            self._states_turn = ""
             return False
-        if not self._begun:
-            self._begun, self._states = holder.turn, _decoded(holder.states)
+        if not self._states_turn:
+            self._states_turn, self._states = holder.turn, _decoded(holder.states)
         return alive or is_free(self.lock)
 
     def load(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ class LeaseHolder:
             if len(data) > _MOST_BYTES:
                 raise ConfigurationError(where=self._name, problem=f"its states take more than {_MOST_BYTES} bytes")
             keep = self._function("keep_child").with_(deadline_s=_KEEP_S)
-            kept = bool(turn) and keep(self._name, self._member().name, turn, number, data)
+            kept = bool(turn) and keep(self._name, self._container().name, turn, number, data)
         except Exception as error:  # noqa: BLE001 - the container continues after any error
             self._say(str(error))
             return False
@@ -164,18 +164,18 @@ class LeaseHolder:
             what = (
                 f"is not saved: {trouble}; the container continues" if trouble else f"is saved again, by {self._from}"
             )
-            self._tell(f"the state of {self._name} {what}")
+            self._report(f"the state of {self._name} {what}")
         self._trouble = trouble
 
     def _ask(self, now: float, turn: str) -> None:
         try:
             ask = self._function("lease_child").with_(deadline_s=self._holder.within_s)
-            run = ask.start(self._name, self._member().name, turn)
+            run = ask.start(self._name, self._container().name, turn)
         except TradeError as error:
             seen = not isinstance(error, NoSuchService)
             self._holder.unanswered(str(error) if seen else f"{self._from} is not visible")
             return
-        run.add_done_callback(lambda run: self._post(partial(self._answered, now, turn, run)))
+        run.add_done_callback(lambda run: self._run_on_supervisor(partial(self._answered, now, turn, run)))
 
     def _answered(self, now: float, turn: str, run: Run) -> None:
         error = run.exception(0)
@@ -185,9 +185,9 @@ class LeaseHolder:
             self._holder.answered(now, turn, run.result(0))
 
     def _function(self, name: str) -> Handle:
-        member = self._member()
-        for found in member.services(where(name=name, group=GROUP, container=self._from)):
-            if member.settings.tls is None or found.key.address.identity == self._from:
+        container = self._container()
+        for found in container.services(where(name=name, group=GROUP, container=self._from)):
+            if container.settings.tls is None or found.key.address.identity == self._from:
                 return found
         raise NoSuchService(constraint=f"{name} of {self._from}")
 
@@ -197,8 +197,8 @@ class Standby:
 
     Args:
         child: the container.
-        member: returns the gateway's container.
-        post: runs a function on the supervisor's thread.
+        container: returns the gateway's container.
+        run_on_supervisor: runs a function on the supervisor's thread.
         store: the store of states.
         lock: see `Leased`.
     """
@@ -206,18 +206,18 @@ class Standby:
     def __init__(
         self,
         child: Child,
-        member: Callable[[], Container],
-        post: Callable[[Callable[[], None]], None],
+        container: Callable[[], Container],
+        run_on_supervisor: Callable[[Callable[[], None]], None],
         store: StateStore,
         lock: Path,
     ) -> None:
         self.lock = lock
         self._name = child.name
-        self._askers = child.terms.askers
-        self._member = member
-        self._post = post
+        self._other_gateways = child.terms.askers
+        self._container = container
+        self._run_on_supervisor = run_on_supervisor
         self._store = store
-        self._above: float | None = None
+        self._move_above: float | None = None
         self._loads = HostLoads()
         self._measure_at = math.inf
         self._lease_s = 0.0
@@ -226,7 +226,9 @@ class Standby:
         self._guard = threading.Lock()
         """Guards the arbiter and the number of the last save."""
         known = store.load(self._own).get("holder", "")
-        self._arbiter = Arbiter(self._askers, secrets.token_hex(4), known if known in self._askers else "")
+        self._arbiter = Arbiter(
+            self._other_gateways, secrets.token_hex(4), known if known in self._other_gateways else ""
+        )
         self._saved = 0
         self._look_at = 0.0
         self.set_children(child)
@@ -235,8 +237,8 @@ class Standby:
 
     def set_children(self, child: Child) -> None:
         """Applies the lease time and the load of the container's table from now on."""
-        lease_s, self._above = child.terms.lease_s, child.terms.move_above
-        self._measure_at = math.inf if self._above is None else min(self._measure_at, uptime_s())
+        lease_s, self._move_above = child.terms.lease_s, child.terms.move_above
+        self._measure_at = math.inf if self._move_above is None else min(self._measure_at, uptime_s())
         known_s = max(self._longest_s, self._store.load(self._own).get("longest_s", 0.0))
         if lease_s > known_s:
             self._store.save(self._own, {"longest_s": lease_s})
@@ -263,18 +265,18 @@ class Standby:
     def keeps(self) -> bool:
         return True
 
-    def look(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - one given up here runs nowhere
+    def update(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - one given up here runs nowhere
         ended, now = not alive and is_free(self.lock), uptime_s()
         with self._guard:
             if ended:
                 self._arbiter.ended(now, self._longest_s)
-            self._arbiter.looked(now)
+            self._arbiter.take_if_free(now)
             mine, handing = self._arbiter.mine, self._arbiter.handing
         self._look_at = now + _LOOK_EVERY_S if mine and not alive and not ended else math.inf
-        if self._above is not None and now >= self._measure_at:
+        if self._move_above is not None and now >= self._measure_at:
             self._measure_at = now + _MEASURE_EVERY_S
             self._measure(now)
-            self._balance(now, self._above)
+            self._balance(now, self._move_above)
         return mine and not handing and (alive or ended)
 
     def load(self) -> dict[str, Any]:
@@ -285,21 +287,21 @@ class Standby:
 
     def _measure(self, now: float) -> None:
         """Asks the other gateways for the load of their hosts, and notes this one's."""
-        member = self._member()
-        self._noted(_HERE, now, member.system.load())
-        for handle in member.services(where(name="load", group=GROUP)):
-            address, certified = handle.key.address, member.settings.tls is not None
+        container = self._container()
+        self._note_load(_HERE, now, container.system.load())
+        for handle in container.services(where(name="load", group=GROUP)):
+            address, certified = handle.key.address, container.settings.tls is not None
             gateway = address.container
-            if gateway in self._askers and (not certified or address.identity == gateway):
+            if gateway in self._other_gateways and (not certified or address.identity == gateway):
                 with suppress(TradeError):
                     run = handle.with_(deadline_s=_MEASURE_EVERY_S).start()
                     run.add_done_callback(partial(self._answered, gateway, now))
 
     def _answered(self, gateway: str, now: float, run: Run) -> None:
         if run.exception(0) is None:
-            self._post(partial(self._noted, gateway, now, run.result(0)))
+            self._run_on_supervisor(partial(self._note_load, gateway, now, run.result(0)))
 
-    def _noted(self, host: str, now: float, load: LoadInfo) -> None:
+    def _note_load(self, host: str, now: float, load: LoadInfo) -> None:
         if load.host_cpu_percent is not None:
             self._loads.note(host, load.host_cpu_percent / 100, now)
 
@@ -322,18 +324,18 @@ class Standby:
         self._check(caller, gateway)
         with self._guard:
             arbiter, before = self._arbiter, self._arbiter.holder
-            given = arbiter.asked(uptime_s(), gateway, turn, self._lease_s)
-            its, moves_to, leave = arbiter.turn, arbiter.moves_to, before == gateway and bool(turn)
-            if given and its != turn:
+            given = arbiter.request(uptime_s(), gateway, turn, self._lease_s)
+            new_turn, moves_to, leave = arbiter.turn, arbiter.moves_to, before == gateway and bool(turn)
+            if given and new_turn != turn:
                 self._saved = 0
         if not given and moves_to is not None:
             return Lease("", why=f"it moves to {moves_to or 'the standby'}", leave=leave)
         if not given:
             return Lease("", why="the standby has it" if arbiter.mine else f"{before} may have it")
-        if before != gateway and len(self._askers) > 1 and not self._store.save(self._own, {"holder": gateway}):
+        if before != gateway and len(self._other_gateways) > 1 and not self._store.save(self._own, {"holder": gateway}):
             return Lease("", why="the standby cannot write down who has it")
-        states = b"" if its == turn else msgspec.msgpack.encode(self.load())
-        return Lease(its, self._lease_s, states=states)
+        states = b"" if new_turn == turn else msgspec.msgpack.encode(self.load())
+        return Lease(new_turn, self._lease_s, states=states)
 
     def keep_for(self, caller: str | None, gateway: str, turn: str, number: int, states: bytes) -> bool:
         """Saves the states of the other gateway's container, unless they are late; returns whether they are on disk.
@@ -358,14 +360,14 @@ class Standby:
             if not self._arbiter.mine:
                 problem = f"it does not run here: {self._arbiter.why}"
             elif uptime_s() - max(self._arbiter.asked_at.values(), default=-math.inf) > self._lease_s:
-                names = " and ".join(self._askers)
+                names = " and ".join(self._other_gateways)
                 problem = f"{names} has not requested it for {self._lease_s:g} s; is it up and connected?"
             else:
                 self._arbiter.hand_back()
                 problem = ""
         if problem:
             raise ConfigurationError(where=f"container {self._name}", problem=problem)
-        self._post(lambda: None)
+        self._run_on_supervisor(lambda: None)
 
     def _is_newest(self, turn: str, number: int) -> bool:
         with self._guard:
@@ -376,8 +378,8 @@ class Standby:
 
     def _check(self, caller: str | None, gateway: str) -> None:
         asks = gateway if caller is None else caller
-        if asks != gateway or asks not in self._askers:
-            rule = f"only {' and '.join(self._askers)} may request it"
+        if asks != gateway or asks not in self._other_gateways:
+            rule = f"only {' and '.join(self._other_gateways)} may request it"
             raise AccessDenied(who=asks, verb="call", what=f"the lease of {self._name}", rule=rule)
 
 

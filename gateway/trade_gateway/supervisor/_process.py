@@ -44,7 +44,7 @@ class Process:
     def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: TimerLease | None = None) -> None:
         self._log = logs / f"{child.name}.log"
         self._is_program = child.part.entry.program is not None
-        self._said = b""
+        self._output = b""
         self._mark = secrets.token_hex(8)
         self.absent = False
         """Whether it ended since a device of its robot file did not answer."""
@@ -68,7 +68,7 @@ class Process:
         try:
             os.set_blocking(self._input, False)
             if term is not None:
-                self.stay(term)
+                self.send_lease(term)
             os.set_blocking(self.output, False)
             self.end = os.pidfd_open(self._process.pid)
         except OSError:
@@ -102,22 +102,22 @@ class Process:
             data = os.read(self.output, 65536)
         except BlockingIOError:
             return None, True
-        if not data or self._said.endswith(b"\n"):
+        if not data or self._output.endswith(b"\n"):
             return None, bool(data)
-        line, ended, _ = (self._said + data).partition(b"\n")
-        self._said = line + ended
+        line, ended, _ = (self._output + data).partition(b"\n")
+        self._output = line + ended
         if not ended:
             return None, True
         started = msgspec.json.decode(line, type=Started)
         self._pid = started.pid if self._is_program else 0
         return started, True
 
-    def stay(self, term: TimerLease) -> None:
+    def send_lease(self, term: TimerLease) -> None:
         """Sends a lease; a process that does not read keeps the earlier one."""
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._input, f"{term.line()}\n".encode())
 
-    def leave(self) -> None:
+    def terminate(self) -> None:
         """Sends SIGTERM."""
         self._process.send_signal(signal.SIGTERM)
 

@@ -107,10 +107,10 @@ class Life:
             return self._launch(now)
         return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
-    def stop(self, now: float, why: str, *, save: bool = True) -> Transition | None:
+    def stop(self, now: float, reason: str, *, save: bool = True) -> Transition | None:
         """Ends it, with or without saving its state."""
         if self.alive:
-            return self._end(now, why, _After.STOPPED, save=save and self._was_up)
+            return self._end(now, reason, _After.STOPPED, save=save and self._was_up)
         self._rest(State.STOPPED)
         return None
 
@@ -138,10 +138,10 @@ class Life:
         self.deadline = max(now, self._asked + self.terms.question_s)
         return None
 
-    def fail(self, now: float, why: str) -> Transition | None:
+    def fail(self, now: float, reason: str) -> Transition | None:
         """Ends it after a serious error; it is restarted as after a crash."""
         if self.state in (State.STARTING, State.UP, State.SILENT):
-            return self._end(now, why, _After.FAILED, save=self._was_up)
+            return self._end(now, reason, _After.FAILED, save=self._was_up)
         return None
 
     def saved(self, now: float) -> Transition | None:
@@ -194,9 +194,9 @@ class Life:
         self.state, self.deadline = State.STARTING, now + START_S
         return Transition.LAUNCH
 
-    def _end(self, now: float, why: str, after: _After, *, save: bool = False) -> Transition | None:
+    def _end(self, now: float, reason: str, after: _After, *, save: bool = False) -> Transition | None:
         """Begins to end it; the last request decides what follows."""
-        self.why, self._after = why, after
+        self.why, self._after = reason, after
         if self.state is State.STOPPING:
             return None
         self.state = State.STOPPING

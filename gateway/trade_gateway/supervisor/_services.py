@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from trade import current_call, service
 from trade.errors import ConfigurationError
-from trade_gateway.config._described import ChildTables
 from trade_gateway.supervisor._child_state import ChildInfo
+from trade_gateway.supervisor._described import ChildTables
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._supervisor import Supervisor
 
@@ -50,17 +50,17 @@ class ChildServices:
     @service
     def lease_child(self, name: str, gateway: str, turn: str) -> Lease:
         """Lease a container to the gateway that this one is the standby for, or renew the lease."""
-        return self._supervisor.stand_in(name).lease(self._caller(), gateway, turn)
+        return self._supervisor.standby_of(name).lease(self._caller(), gateway, turn)
 
     @service
     def keep_child(self, name: str, gateway: str, turn: str, number: int, states: bytes) -> bool:
         """Save the states of a container of the gateway that this one is the standby for."""
-        return self._supervisor.stand_in(name).keep_for(self._caller(), gateway, turn, number, states)
+        return self._supervisor.standby_of(name).keep_for(self._caller(), gateway, turn, number, states)
 
     @service
     def hand_back_child(self, name: str) -> None:
         """End a container that runs here as standby, and hand it back to its gateway with its state."""
-        self._supervisor.stand_in(name).hand_back()
+        self._supervisor.standby_of(name).hand_back()
 
     def _caller(self) -> str | None:
         """Returns the caller's identity; None without certificates."""

@@ -25,11 +25,11 @@ class StateStore(Database):
 
     Args:
         path: the file; its folder is created.
-        tell: called with a problem, and with its end.
+        callback: called with a problem, and with its end.
     """
 
-    def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
-        super().__init__(path, _TABLE, "state", tell)
+    def __init__(self, path: Path, callback: Callable[[str], None]) -> None:
+        super().__init__(path, _TABLE, "state", callback)
 
     def save(self, container: str, states: Mapping[str, Any], wanted: Callable[[], bool] = lambda: True) -> bool:
         """Saves the states of a container's objects, all or none; returns whether they are on disk.

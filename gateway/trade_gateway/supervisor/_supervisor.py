@@ -23,7 +23,7 @@ from trade.starting import Started
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._child_state import ChildInfo, News, Unit
-from trade_gateway.supervisor._lease_protocol import Leased, LeaseHolder, Standby
+from trade_gateway.supervisor._lease_protocol import LeaseEnd, LeaseHolder, Standby
 from trade_gateway.supervisor._objects import CreatedObjects, furnish, save
 from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._program_health import await_program, epochs_of, health_problem
@@ -39,8 +39,8 @@ class Supervisor:
     """Supervises the children that `set_children` names, until `close` ends them in reverse order.
 
     Args:
-        member: returns the container that calls them; it may change.
-        tell: called with reports about them, on the supervisor's thread.
+        container: returns the container that calls them; it may change.
+        report: called with reports about them, on the supervisor's thread.
         folder: the folder for ``logs`` and for the states of providers.
         grace_s: how long a shutdown may take before SIGKILL, in seconds.
         clock: ``time.monotonic``; a test has its own clock and fake processes.
@@ -50,8 +50,8 @@ class Supervisor:
 
     def __init__(
         self,
-        member: Callable[[], Container],
-        tell: Callable[[News], None],
+        container: Callable[[], Container],
+        report: Callable[[News], None],
         folder: Path,
         *,
         grace_s: float = GRACE_S,
@@ -61,12 +61,12 @@ class Supervisor:
     ) -> None:
         self._clock = clock or time.monotonic
         self._new_process = launch
-        self._furnishes = furnish
-        self._member = member
-        self._tell = tell
+        self._create_objects = furnish
+        self._container = container
+        self._report_to = report
         self._folder = folder
         self._grace_s = grace_s
-        self._store = StateStore(folder / f"{member().name}.state.sqlite", self._complain)
+        self._store = StateStore(folder / f"{container().name}.state.sqlite", self._complain)
         self._units: dict[str, Unit] = {}
         self._shown: tuple[ChildInfo, ...] = ()
         self._inbox: deque[Callable[[], None]] = deque()
@@ -76,7 +76,7 @@ class Supervisor:
         os.set_blocking(self._wake_read, False)
         os.set_blocking(self._wake_write, False)
         self._selector = selectors.DefaultSelector()
-        self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
+        self._selector.register(self._wake_read, selectors.EVENT_READ, self._drain_wake_pipe)
         self._thread = threading.Thread(target=self._run, name="trade-supervisor", daemon=True)
         self._thread.start()
 
@@ -84,7 +84,7 @@ class Supervisor:
 
     def set_children(self, children: Sequence[Child]) -> None:
         """Sets the children, in start order; only those with a changed start are restarted."""
-        self._post(partial(self._go_by, {child.name: child for child in children}))
+        self._post(partial(self._set_children, {child.name: child for child in children}))
 
     @property
     def alive(self) -> bool:
@@ -94,27 +94,27 @@ class Supervisor:
     @property
     def certified(self) -> bool:
         """Whether links have certificates."""
-        return self._member().settings.tls is not None
+        return self._container().settings.tls is not None
 
     def children(self) -> list[ChildInfo]:
         """Returns their states."""
         return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]
 
-    def restart(self, name: str, who: str) -> bool:
+    def restart(self, name: str, requester: str) -> bool:
         """Restarts a child, also if it was given up; returns whether the name is known."""
         if all(info.name != name for info in self._shown):
             return False
-        self._post(partial(self._restart, name, who))
+        self._post(partial(self._restart, name, requester))
         return True
 
-    def stop(self, name: str, who: str) -> bool:
+    def stop(self, name: str, requester: str) -> bool:
         """Ends a child until it is restarted by request; returns whether the name is known."""
         if all(info.name != name for info in self._shown):
             return False
-        self._post(partial(self._stop, name, who))
+        self._post(partial(self._stop, name, requester))
         return True
 
-    def stand_in(self, name: str) -> Standby:
+    def standby_of(self, name: str) -> Standby:
         """Returns the standby's end of a child's lease. Raises ConfigurationError if it has none."""
         unit = self._units.get(name)
         if unit is None or not isinstance(unit.lease, Standby):
@@ -139,15 +139,15 @@ class Supervisor:
         os.close(self._wake_read)
         os.close(self._wake_write)
 
-    def _post(self, what: Callable[[], None]) -> None:
-        self._inbox.append(what)
+    def _post(self, function: Callable[[], None]) -> None:
+        self._inbox.append(function)
         with contextlib.suppress(BlockingIOError, OSError):  # woken already, or closed
             os.write(self._wake_write, b"!")
 
     # --- the thread
 
     def _run(self) -> None:
-        while not (self._closing and all(unit.gone for unit in self._units.values())):
+        while not (self._closing and all(unit.has_ended for unit in self._units.values())):
             due_s = min((unit.due_s for unit in self._units.values()), default=math.inf)
             ready = self._selector.select(None if due_s == math.inf else max(0.0, due_s))
             for unit in list(self._units.values()):  # a child without a lease is not restarted
@@ -160,14 +160,14 @@ class Supervisor:
                 self._look(unit, self._clock())
             self._shown = tuple(unit.info() for unit in self._units.values())
 
-    def _woken(self) -> None:
+    def _drain_wake_pipe(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake_read, 4096)
 
     def _by_lease(self, unit: Unit) -> bool:
         """Ends a child that may no longer run here; returns whether it may."""
         if unit.may_be_up():
-            unit.stay()
+            unit.send_lease()
             return True
         lease, now = unit.lease, self._clock()
         if lease is not None and unit.begun and not unit.given_up:
@@ -180,7 +180,7 @@ class Supervisor:
         if unit.leaving:
             if not unit.life.alive or not self._needed(unit):
                 self._do(unit, unit.life.stop(now, unit.leaving))
-            if unit.gone and not self._closing:
+            if unit.has_ended and not self._closing:
                 del self._units[unit.child.name]
         elif unit.to_begin and may_be_up and all(self._has_been_up(name) for name in unit.child.terms.after):
             unit.begun = True
@@ -202,7 +202,7 @@ class Supervisor:
         others = (other for other in self._units.values() if unit.child.name in other.child.terms.after)
         return any(other.leaving and other.life.alive for other in others)
 
-    def _go_by(self, children: Mapping[str, Child]) -> None:
+    def _set_children(self, children: Mapping[str, Child]) -> None:
         for name, unit in self._units.items():
             if name not in children:
                 unit.leaving = "the file no longer names it"
@@ -210,42 +210,42 @@ class Supervisor:
             unit = self._units.get(name)
             if unit is None:
                 unit = self._units[name] = Unit(child, self._grace_s, self._clock)
-                unit.lease = self._leased(child)
+                unit.lease = self._new_lease_end(child)
                 continue
             same, was_leaving = unit.child.starts_like(child), bool(unit.leaving)
             if unit.child.lease != child.lease:
-                unit.lease = self._leased(child)
+                unit.lease = self._new_lease_end(child)
             elif isinstance(unit.lease, Standby):
                 unit.lease.set_children(child)
             unit.child, unit.life.terms, unit.leaving = child, child.terms, ""
             if unit.begun and (was_leaving or not same):
                 self._do(unit, unit.life.start(self._clock()))
 
-    def _leased(self, child: Child) -> Leased | None:
-        lock = lock_of(self._folder, self._member().name, child.name)
+    def _new_lease_end(self, child: Child) -> LeaseEnd | None:
+        lock = lock_of(self._folder, self._container().name, child.name)
         if child.terms.lease_from:
-            return LeaseHolder(child, self._member, self._post, self._complain, lock)
+            return LeaseHolder(child, self._container, self._post, self._complain, lock)
         if child.terms.stands_in_for:
-            return Standby(child, self._member, self._post, self._store, lock)
+            return Standby(child, self._container, self._post, self._store, lock)
         return None
 
-    def _restart(self, name: str, who: str) -> None:
+    def _restart(self, name: str, requester: str) -> None:
         unit = self._units.get(name)
         if unit is None or unit.leaving:
             return
         if unit.lease is not None and not unit.may_be_up():
             self._do(unit, unit.life.stop(self._clock(), unit.lease.why))  # also if given up: it asks for its lease
         else:
-            self._report(unit, f"{name} is restarted at the request of {who}")
+            self._report(unit, f"{name} is restarted at the request of {requester}")
             unit.begun = True
             self._do(unit, unit.life.start(self._clock()))
 
-    def _stop(self, name: str, who: str) -> None:
+    def _stop(self, name: str, requester: str) -> None:
         unit = self._units.get(name)
         if unit is not None and not unit.leaving:
-            self._report(unit, f"{name} is stopped at the request of {who}")
+            self._report(unit, f"{name} is stopped at the request of {requester}")
             unit.begun = True
-            self._do(unit, unit.life.stop(self._clock(), f"{who} stops it"))
+            self._do(unit, unit.life.stop(self._clock(), f"{requester} stops it"))
 
     def _close(self) -> None:
         self._closing = True
@@ -265,7 +265,7 @@ class Supervisor:
             case Transition.LEAVE if unit.process is not None:
                 if not unit.leaving:
                     self._report(unit, f"{unit.child.name} is asked to shut down: {unit.life.why}")
-                unit.process.leave()
+                unit.process.terminate()
             case Transition.KILL if unit.process is not None:
                 self._report(unit, f"{unit.child.name} does not shut down and is killed", bad=True)
                 unit.process.kill()
@@ -275,16 +275,16 @@ class Supervisor:
     def _launch(self, unit: Unit) -> None:
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         try:
-            unit.before = epochs_of(self._member(), unit.child)
+            unit.before = epochs_of(self._container(), unit.child)
             lock, unit.sent = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
             unit.process = self._new_process(unit.child, self._folder / "logs", lock, unit.sent)
         except (OSError, ConfigurationError) as none:
             self._ended(unit, f"its process could not be started: {none}")
             return
         self._selector.register(unit.process.end, selectors.EVENT_READ, partial(self._died, unit))
-        self._selector.register(unit.process.output, selectors.EVENT_READ, partial(self._heard, unit))
+        self._selector.register(unit.process.output, selectors.EVENT_READ, partial(self._read_output, unit))
 
-    def _heard(self, unit: Unit) -> None:
+    def _read_output(self, unit: Unit) -> None:
         process = unit.process
         if process is None:  # it ended in the same round
             return
@@ -343,7 +343,7 @@ class Supervisor:
             self._job(unit, "health", partial(self._check_program, unit, unit.child))
             return
         try:
-            run = _again(self._member(), furnished.clock).with_(deadline_s=terms.question_s).start()
+            run = _again(self._container(), furnished.clock).with_(deadline_s=terms.question_s).start()
         except TradeError:
             self._do(unit, unit.life.missed(now))
             return
@@ -384,9 +384,9 @@ class Supervisor:
     ) -> Callable[[], None]:
         try:
             if child.part.entry.program is None:
-                furnished = self._furnishes(self._member, child, started, load())
+                furnished = self._create_objects(self._container, child, started, load())
             else:
-                furnished = await_program(self._member, child, unit.before, lambda: unit.boot != boot)
+                furnished = await_program(self._container, child, unit.before, lambda: unit.boot != boot)
         except Exception as wrong:  # noqa: BLE001 - an object may raise its own types
             why = f"it came up, but: {wrong}"
             return lambda: self._do(unit, unit.life.fail(self._clock(), why))
@@ -413,7 +413,7 @@ class Supervisor:
 
         def work() -> Callable[[], None]:
             began = time.time()
-            states = save(self._member(), furnished)
+            states = save(self._container(), furnished)
             kept = bool(states) and keep(states)
             whole = kept and states.keys() == furnished.made.keys()
             return partial(self._saved, unit, began if whole else 0.0)
@@ -428,12 +428,12 @@ class Supervisor:
             unit.save_at = now + unit.child.terms.save_every_s
 
     def _complain(self, text: str) -> None:
-        self._tell(News(child="", state="", text=text, bad=True))
+        self._report_to(News(child="", state="", text=text, bad=True))
 
     def _report(self, unit: Unit, text: str, *, bad: bool = False) -> None:
-        self._tell(News(child=unit.child.name, state=unit.life.state.value, text=text, bad=bad))
+        self._report_to(News(child=unit.child.name, state=unit.life.state.value, text=text, bad=bad))
 
 
-def _again(member: Container, handle: Handle) -> Handle:
+def _again(container: Container, handle: Handle) -> Handle:
     """Returns the same service's handle of another container."""
-    return member.handle(handle.key)
+    return container.handle(handle.key)

@@ -13,16 +13,16 @@ class Client(Protocol):
     overrun: int
     """Frames lost in a row because it does not read."""
 
-    def tell_frame(self, frame: Frame, wall_s: float) -> bool:
+    def queue_frame(self, frame: Frame, wall_s: float) -> bool:
         """Deliver a frame that was on the bus at `wall_s` seconds since the epoch; False if it is lost."""
         ...
 
-    def tell_error(self, bits: int, wall_s: float) -> bool:
+    def queue_error(self, bits: int, wall_s: float) -> bool:
         """Deliver an error of these classes (linux/can/error.h)."""
         ...
 
 
-class Tenant(Protocol):
+class AdapterObserver(Protocol):
     """Receives what clients do. Called from the thread that calls `Adapter.serve`."""
 
     def joined(self, client: Client) -> None:

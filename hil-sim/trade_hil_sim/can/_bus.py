@@ -199,7 +199,7 @@ class CanBus(BusThread):
         for client, station in self._clients.items():
             station.off, station.errors = off, 0
             station.fall_silent()
-            client.tell_error(BUS_OFF if off else RESTARTED, t + self._wall_offset_s)
+            client.queue_error(BUS_OFF if off else RESTARTED, t + self._wall_offset_s)
         self._note("bus_off" if off else "restarted", t, source="adapter")
 
     def _heal(self, t: float) -> None:
@@ -255,41 +255,41 @@ class CanBus(BusThread):
         """Log a destroyed frame, and report it to all clients."""
         self._frame("destroyed", sender, frame, t)
         for client in self._clients:
-            client.tell_error(BUS_ERROR, t + self._wall_offset_s)
+            client.queue_error(BUS_ERROR, t + self._wall_offset_s)
         if sender.off and sender.device_id is None:
             self._switch_adapter(True, t)
         elif sender.off:
             self._note("bus_off", t, source=sender.name, device_id=sender.device_id)
 
     def lost(self, sender: Station, frame: Frame, t: float) -> None:
-        """Log it."""
+        """Logs a frame that was dropped from the queue of its sender."""
         self._frame("lost", sender, frame, t)
 
-    # the adapter's tenant
+    # the adapter's observer
 
     def joined(self, client: Client) -> None:
-        """It is a station of its own."""
-        station = Station(client.name, lambda frame, t: self._tell(client, frame, t))
+        """Attaches the client to the wire as a station of its own."""
+        station = Station(client.name, lambda frame, t: self._deliver(client, frame, t))
         station.off = self._adapter_off
         self._clients[client] = station
         self._wire.attach(station)
         self._note("joined", time.monotonic(), source=client.name)
 
     def left(self, client: Client) -> None:
-        """It takes what it had not sent with it."""
+        """Detaches the client from the wire, with the frames that it had not sent."""
         self._wire.detach(self._clients.pop(client))
         self._note("left", time.monotonic(), source=client.name)
 
     def submitted(self, client: Client, frame: Frame, t: float) -> None:
-        """It sends a frame."""
+        """Queues a frame of the client."""
         self._post(self._clients[client], frame, t)
 
     def misunderstood(self, client: Client, text: str) -> None:
-        """Log it."""
+        """Logs text of the client that is not a valid command."""
         self._note("misunderstood", time.monotonic(), source=client.name, detail=text)
 
-    def _tell(self, client: Client, frame: Frame, t: float) -> None:
-        if not client.tell_frame(frame, t + self._wall_offset_s) and client.overrun == 1:
+    def _deliver(self, client: Client, frame: Frame, t: float) -> None:
+        if not client.queue_frame(frame, t + self._wall_offset_s) and client.overrun == 1:
             self._note("overrun", t, source=client.name, detail="the client does not read; frames for it are lost")
 
     def _note(self, name: str, t: float, *, source: str = "", device_id: int | None = None, detail: str = "") -> None:

@@ -9,7 +9,7 @@ from typing import Final
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.robot._bus_thread import ready
 
-from ._adapter import Tenant
+from ._adapter import AdapterObserver
 from ._frame import Frame
 from ._text import GREETING, OK, Reader, error_text, frame_text, parse_send, refusal
 
@@ -40,7 +40,7 @@ class HubClient:
         """For select."""
         return self.connection.fileno()
 
-    def tell(self, text: bytes) -> bool:
+    def queue(self, text: bytes) -> bool:
         """Queue text; False if it is lost."""
         if len(self.unsent) > MOST_UNSENT:
             self.overrun += 1
@@ -49,13 +49,13 @@ class HubClient:
         self.unsent += text
         return True
 
-    def tell_frame(self, frame: Frame, wall_s: float) -> bool:
+    def queue_frame(self, frame: Frame, wall_s: float) -> bool:
         """Queue a frame for the client; False if it is lost."""
-        return self.tell(frame_text(frame, wall_s))
+        return self.queue(frame_text(frame, wall_s))
 
-    def tell_error(self, bits: int, wall_s: float) -> bool:
+    def queue_error(self, bits: int, wall_s: float) -> bool:
         """Queue an error for the client."""
-        return self.tell(error_text(bits, wall_s))
+        return self.queue(error_text(bits, wall_s))
 
     def flush(self) -> None:
         """Write what can be written without waiting; raises OSError when it is gone."""
@@ -63,7 +63,7 @@ class HubClient:
             with suppress(BlockingIOError):
                 del self.unsent[: self.connection.send(self.unsent)]
 
-    def say(self, text: bytes) -> None:
+    def send_greeting(self, text: bytes) -> None:
         """Write a word of the greeting, in a segment of its own."""
         with suppress(BlockingIOError):
             self.connection.send(text)
@@ -74,12 +74,12 @@ class Hub:
 
     Args:
         channel: the one interface clients can open.
-        tenant: hears what they do.
+        observer: receives what they do.
     """
 
-    def __init__(self, channel: str, tenant: Tenant) -> None:
+    def __init__(self, channel: str, observer: AdapterObserver) -> None:
         self.channel = channel
-        self._tenant = tenant
+        self._observer = observer
         self._holder: socket.socket | None = None
         self._listener: socket.socket | None = None
         self._clients: list[HubClient] = []
@@ -169,7 +169,7 @@ class Hub:
             self._count += 1
             client = HubClient(connection, self._count)
             self._clients.append(client)
-            client.say(GREETING)
+            client.send_greeting(GREETING)
 
     def _read(self, client: HubClient, t: float) -> None:
         if client not in self._clients:
@@ -191,31 +191,31 @@ class Hub:
         match words:
             case ["open", channel] if not client.opened:
                 client.opened = channel == self.channel
-                client.say(OK if client.opened else refusal(f"could not open bus {channel}"))
+                client.send_greeting(OK if client.opened else refusal(f"could not open bus {channel}"))
             case ["rawmode"] if client.opened and not client.raw:
                 client.raw, client.quiet_until = True, t + SETTLE_S
-                client.say(OK)
-                self._tenant.joined(client)
+                client.send_greeting(OK)
+                self._observer.joined(client)
             case ["send", *rest] if client.raw:
                 self._send(client, rest, t)
             case _:
-                self._tenant.misunderstood(client, " ".join(words))
-                client.tell(refusal("unknown command"))
+                self._observer.misunderstood(client, " ".join(words))
+                client.queue(refusal("unknown command"))
 
     def _send(self, client: HubClient, words: list[str], t: float) -> None:
         try:
             frame = parse_send(words)
         except SimulationError as problem:
-            self._tenant.misunderstood(client, str(problem))
+            self._observer.misunderstood(client, str(problem))
         else:
-            self._tenant.submitted(client, frame, t)
+            self._observer.submitted(client, frame, t)
 
     def _drop(self, client: HubClient) -> None:
         if client in self._clients:
             self._clients.remove(client)
             client.connection.close()
             if client.raw:
-                self._tenant.left(client)
+                self._observer.left(client)
 
 
 def _bound(number: int) -> socket.socket:

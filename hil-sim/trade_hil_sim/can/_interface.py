@@ -12,7 +12,7 @@ from typing import Final
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.robot._bus_thread import ready
 
-from ._adapter import Tenant
+from ._adapter import AdapterObserver
 from ._frame import Frame
 
 LAYOUT: Final = struct.Struct("=IB3x8s")
@@ -31,13 +31,13 @@ class Interface:
 
     Args:
         channel: the interface's name.
-        tenant: receives what is sent on it.
+        observer: receives what is sent on it.
     """
 
-    def __init__(self, channel: str, tenant: Tenant) -> None:
+    def __init__(self, channel: str, observer: AdapterObserver) -> None:
         self.channel = self.name = channel
         self.overrun = 0
-        self._tenant = tenant
+        self._observer = observer
         self._socket: socket.socket | None = None
 
     @property
@@ -63,14 +63,14 @@ class Interface:
         """Join it again; raises SimulationError if it is gone."""
         if self._socket is None:
             self._socket = _joined(self.channel)
-            self._tenant.joined(self)
+            self._observer.joined(self)
 
     def unplug(self) -> None:
         """Disconnect the devices; programs that have the interface open receive nothing more."""
         gone, self._socket = self._socket, None
         if gone is not None:
             gone.close()
-            self._tenant.left(self)
+            self._observer.left(self)
 
     def close(self) -> None:
         """Disconnect the devices."""
@@ -99,14 +99,14 @@ class Interface:
                 return
             head, length, payload = LAYOUT.unpack(data)
             if not head & ERROR:
-                self._tenant.submitted(self, _frame(head, length, payload), t)
+                self._observer.submitted(self, _frame(head, length, payload), t)
 
-    def tell_frame(self, frame: Frame, wall_s: float) -> bool:  # noqa: ARG002 - the system notes the time
+    def queue_frame(self, frame: Frame, wall_s: float) -> bool:  # noqa: ARG002 - the system notes the time
         """Put a frame on it; False if it is lost."""
         head = frame.can_id | (EXTENDED if frame.extended else 0) | (REMOTE if frame.remote else 0)
         return self._send(head, frame.length if frame.remote else len(frame.data), frame.data)
 
-    def tell_error(self, bits: int, wall_s: float) -> bool:  # noqa: ARG002
+    def queue_error(self, bits: int, wall_s: float) -> bool:  # noqa: ARG002
         """Put an error frame on it."""
         return self._send(ERROR | bits, 8, b"")
 

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
+from trade_robotfile import Bus, Joint
+from trade_robotfile import CanBus as CanRecord
 
 from ._bus import CanBus
 from ._device import Device
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-    from trade_drivers.robotfile import Bus, Joint
-    from trade_drivers.robotfile import CanBus as CanRecord
 
 
 class JointBus(CanBus):
@@ -27,14 +26,14 @@ class JointBus(CanBus):
 
     @classmethod
     @abstractmethod
-    def device_for(cls, joint: "Joint", record: "CanRecord", t: float) -> Device:
+    def device_for(cls, joint: Joint, record: CanRecord, t: float) -> Device:
         """The device of a joint, as near to its zero as its limits allow; raises SimulationError if it is invalid."""
 
     @classmethod
     def from_robot(
         cls,
-        bus: "Bus",
-        joints: "Sequence[Joint]",
+        bus: Bus,
+        joints: Sequence[Joint],
         port: Path,  # noqa: ARG003 - a CAN bus is no path; its port is known when it is open
         *,
         log: ByteLog | None = None,
@@ -54,8 +53,6 @@ class JointBus(CanBus):
         Raises:
             SimulationError: an id or a model that is not possible, or a missing key.
         """
-        from trade_drivers.robotfile import CanBus as CanRecord  # noqa: PLC0415 - a robot file has been read
-
         if not isinstance(bus, CanRecord):
             raise SimulationError(f"bus.{bus.name}: {cls.kind} are on CAN; write interface and channel, not port")
         return cls(

@@ -1,16 +1,14 @@
 """A simulated CAN bus with CiA 402 drives."""
 
 from math import tau
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.mechanics._device import start_rad
+from trade_robotfile import CanBus, Joint
 
 from ._drive import FIRMWARE, Drive
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus, Joint
 
 NODES: Final = 0x80
 FUNCTIONS: Final = {
@@ -52,7 +50,7 @@ class Cia402Bus(JointBus):
                 return "", None
 
     @classmethod
-    def device_for(cls, joint: "Joint", record: "CanBus", t: float) -> Drive:  # noqa: ARG003 - all is in the joint
+    def device_for(cls, joint: Joint, record: CanBus, t: float) -> Drive:  # noqa: ARG003 - all is in the joint
         if not 1 <= joint.id <= 127:
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no node id; there is 1 to 127')
         if joint.counts_per_rev is None:

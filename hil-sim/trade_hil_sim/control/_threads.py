@@ -11,6 +11,8 @@ from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.control._server import Answer, ControlServer, State
 from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.robot._robot import buses_of
+from trade_robotfile import load
 
 
 class _DirectControl(SimControl):
@@ -40,13 +42,11 @@ class SimThreads:
         paced: take the time of the real wires.
 
     Raises:
-        ConfigurationError: the file is wrong.
+        RobotFileError: the file is wrong.
         SimulationError: the devices cannot be simulated.
     """
 
     def __init__(self, robot_file: Path | str, *, log: Path | None = None, paced: bool = False) -> None:
-        from trade_hil_sim.robot._robot import buses_of, read_robot  # noqa: PLC0415 - robot files are of trade-drivers
-
         self.running = True
         """Whether it is still running."""
         with ExitStack() as undo:
@@ -54,7 +54,7 @@ class SimThreads:
             undo.callback(shutil.rmtree, folder, ignore_errors=True)
             self._log, self._file = ByteLog(), log
             undo.callback(self._write)
-            buses = buses_of(read_robot(Path(robot_file)), folder, log=self._log, paced=paced)
+            buses = buses_of(load(robot_file), folder, log=self._log, paced=paced)
             for bus in buses:
                 undo.callback(bus.close)
                 bus.open()

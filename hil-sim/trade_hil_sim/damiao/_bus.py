@@ -1,17 +1,13 @@
 """A simulated CAN bus with Damiao motors."""
 
-from typing import TYPE_CHECKING
-
 from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.mechanics._device import start_rad
+from trade_robotfile import CanBus, Joint
 
 from . import _table as table
 from ._motor import SOFTWARE, Motor
 from ._table import MASTER, MODELS
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus, Joint
 
 
 class DamiaoBus(JointBus):
@@ -41,7 +37,7 @@ class DamiaoBus(JointBus):
         return ("register" if about else "feedback"), motor - table.MASTER
 
     @classmethod
-    def device_for(cls, joint: "Joint", record: "CanBus", t: float) -> Motor:  # noqa: ARG003 - all is in the joint
+    def device_for(cls, joint: Joint, record: CanBus, t: float) -> Motor:  # noqa: ARG003 - all is in the joint
         if not 1 <= joint.id < MASTER:
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no identifier; there is 1 to 15')
         if joint.model not in MODELS:
@@ -59,7 +55,7 @@ class DamiaoBus(JointBus):
         )
 
 
-def _software(joint: "Joint") -> int:
+def _software(joint: Joint) -> int:
     if joint.firmware is None:
         return SOFTWARE
     if not joint.firmware.isdecimal():

@@ -1,11 +1,11 @@
 """A simulated Dynamixel bus: servos behind one serial line, with a log and scripted faults."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.serial._packets import BROADCAST, Writing
 from trade_hil_sim.serial._servo_bus import ServoBus
+from trade_robotfile import Joint
 
 from ._dispatch import Dispatch
 from ._memory import MOTION
@@ -13,9 +13,6 @@ from ._models import MODELS
 from ._protocol import Instruction, Packet, PacketReader
 from ._servo import Servo
 from ._table import BAUDS
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Joint
 
 
 class DynamixelBus(ServoBus[Servo, Packet]):
@@ -37,7 +34,7 @@ class DynamixelBus(ServoBus[Servo, Packet]):
         return Dispatch(self._faults.silences)
 
     @classmethod
-    def _new_servo(cls, joint: "Joint", baud: int, position_counts: int, t: float) -> Servo:
+    def _new_servo(cls, joint: Joint, baud: int, position_counts: int, t: float) -> Servo:
         return Servo(
             joint.id,
             MODELS[joint.model],

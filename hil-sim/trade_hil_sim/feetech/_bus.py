@@ -1,18 +1,16 @@
 """A simulated Feetech bus: servos behind one serial line, with a log and scripted faults."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_hil_sim.serial._device_bus import interleaved
 from trade_hil_sim.serial._packets import BROADCAST, Writing
 from trade_hil_sim.serial._servo_bus import ServoBus
+from trade_robotfile import Joint
 
 from ._protocol import Instruction, Packet, PacketReader, status
 from ._servo import MOTION, Servo
 from ._table import BAUDS, MODELS
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Joint
 
 ALWAYS_ANSWERED: Final = frozenset({Instruction.PING, Instruction.READ, Instruction.SYNC_READ})
 
@@ -32,7 +30,7 @@ class FeetechBus(ServoBus[Servo, Packet]):
     models, bauds, motion = MODELS, BAUDS, MOTION
 
     @classmethod
-    def _new_servo(cls, joint: "Joint", baud: int, position_counts: int, t: float) -> Servo:
+    def _new_servo(cls, joint: Joint, baud: int, position_counts: int, t: float) -> Servo:
         return Servo(
             joint.id,
             MODELS[joint.model],

@@ -5,14 +5,12 @@ Time is an argument everywhere, in seconds on the clock of the bus; everything h
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._truth import DeviceState, GripperTruth
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 Emit = Callable[[Entry], None]
 """Adds a line to the log; a bus fills in its name."""
@@ -22,13 +20,13 @@ def unheard(entry: Entry) -> None:
     """Discard a line: the device is on no bus."""
 
 
-def start_rad(joint: "Joint") -> float:
+def start_rad(joint: Joint) -> float:
     """The initial position of a joint's shaft, from its offset: at zero, or as near as the joint's limits allow."""
     angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
     return (-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad)
 
 
-def version_of(joint: "Joint", count: int) -> tuple[int, ...]:
+def version_of(joint: Joint, count: int) -> tuple[int, ...]:
     """The numbers of the firmware version that the robot file names for a joint.
 
     Raises:

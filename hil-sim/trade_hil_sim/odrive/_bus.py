@@ -1,17 +1,15 @@
 """A simulated CAN bus with ODrives; their watchdogs are on, and set to the watchdog_s of the bus."""
 
 from math import tau
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.mechanics._device import start_rad, version_of
+from trade_robotfile import CanBus, Joint
 
 from ._axis import FIRMWARE, Axis
 from ._table import ANSWERS, Command
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus, Joint
 
 LINES: Final = {"ODrive Pro": 4, "ODrive S1": 5, "ODrive Micro": 6}
 """Product lines by model."""
@@ -35,7 +33,7 @@ class OdriveBus(JointBus):
         return f"ask_{command.name.lower()}" if asks else command.name.lower(), node
 
     @classmethod
-    def device_for(cls, joint: "Joint", record: "CanBus", t: float) -> Axis:
+    def device_for(cls, joint: Joint, record: CanBus, t: float) -> Axis:
         if not 0 <= joint.id < 63:
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no node; there is 0 to 62')
         if joint.model not in LINES:

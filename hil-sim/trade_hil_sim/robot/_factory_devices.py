@@ -4,10 +4,10 @@ from math import pi
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from trade_drivers.robotfile import Gripper, Joint, SerialBus
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.robot._robot import SimulatedBus, bus_class
+from trade_robotfile import Gripper, Joint, SerialBus
 
 
 class _Factory(NamedTuple):

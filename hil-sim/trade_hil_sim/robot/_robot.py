@@ -5,10 +5,10 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
-from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse, read_text
 from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.mechanics._truth import BusState
+from trade_robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor
 
 GROUP: Final = "trade.sims"
 """Entry points of this group are `SimulatedBusClass`es, or for cameras and sensors `SimulatedSenseClass`es; their names
@@ -82,18 +82,13 @@ class SimulatedSenseClass(Protocol):
         ...
 
 
-def read_robot(path: Path) -> Robot:
-    """Read a robot file; raises what `trade_drivers.robotfile.parse` raises, `OSError`, and `UnicodeDecodeError`."""
-    return parse(read_text(path), str(path))
-
-
 def buses_of(
     robot: Robot, directory: Path, *, names: Sequence[str] = (), log: ByteLog | None = None, paced: bool = True
 ) -> list[SimulatedBus]:
     """Simulate the buses, cameras and sensors of a robot, not yet open; each gets the port ``directory / name``.
 
     Args:
-        robot: from `read_robot`.
+        robot: from `trade_robotfile.load`.
         directory: of the ports.
         names: of those to simulate; default: all.
         log: where all record.

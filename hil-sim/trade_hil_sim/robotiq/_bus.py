@@ -4,11 +4,13 @@ import time
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.serial._device_bus import DeviceLine
+from trade_robotfile import Gripper as GripperRecord
+from trade_robotfile import Joint, SerialBus
 
 from . import _table as table
 from ._gripper import Gripper
@@ -23,10 +25,6 @@ from ._protocol import (
     read_answer,
     write_answer,
 )
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Gripper as GripperRecord
-    from trade_drivers.robotfile import Joint, SerialBus
 
 MODEL: Final = "2F-85"
 _BAUDS: Final = (9600, 19_200, 38_400, 57_600, 115_200)
@@ -55,7 +53,7 @@ class RobotiqBus(DeviceLine[Gripper]):
     @classmethod
     def from_robot(
         cls,
-        bus: "SerialBus",
+        bus: SerialBus,
         devices: "Sequence[Joint | GripperRecord]",
         port: Path,
         *,

@@ -289,10 +289,10 @@ class Gripper(LineDevice):
         self._contact = Contact.MOVING
         self._rest(t, "halted")
 
-    def _rest(self, t: float, why: str) -> None:
+    def _rest(self, t: float, reason: str) -> None:
         if self._moving:
             self._moving = False
-            self.note("at_rest", t, why)
+            self.note("at_rest", t, reason)
 
     # --- the world
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.faults._answer_faults import ActiveFaults
@@ -14,11 +14,9 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
 from trade_hil_sim.robot._bus_thread import BusThread, listener, ready
+from trade_robotfile import Camera, Sensor
 
 from ._drawing import draw, png
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Camera, Sensor
 
 _SIZE_PX: Final = (320, 240)
 _ANSWER_S: Final = 5.0
@@ -61,7 +59,7 @@ class SceneCamera(BusThread):
     @classmethod
     def from_record(
         cls,
-        device: "Camera | Sensor",
+        device: Camera | Sensor,
         port: Path,  # noqa: ARG003 - it is reached over the network
         *,
         truth: Callable[[], Sequence[BusState]],

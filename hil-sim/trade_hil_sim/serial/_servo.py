@@ -3,16 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from math import copysign, tau
-from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
+from typing import ClassVar, Final, Generic, TypeVar
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.mechanics._device import Emit, JointModel, version_of
 from trade_hil_sim.mechanics._profile import Course, to_speed
 from trade_hil_sim.serial._device_bus import LineDevice
 from trade_hil_sim.serial._registers import Memory, Register
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 COUNTS_PER_TURN: Final = 4096
 CENTRE: Final = 2048
@@ -129,7 +127,7 @@ class ServoModel(JointModel, LineDevice, Generic[_Memory_co, _Shaft_co]):
         self._boots_at: float | None = None
         self._strains_since: float | None = None
 
-    def resemble(self, joint: "Joint", t: float) -> None:
+    def resemble(self, joint: Joint, t: float) -> None:
         """Become the device of a robot file: its homing offset, and its firmware if the file names one.
 
         Raises:

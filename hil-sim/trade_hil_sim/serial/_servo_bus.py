@@ -14,11 +14,10 @@ from trade_hil_sim.serial._device_bus import DeviceLine
 from trade_hil_sim.serial._packets import BROADCAST, Packet, PacketReader, Writing
 from trade_hil_sim.serial._registers import Memory, Register
 from trade_hil_sim.serial._servo import CENTRE, RAD_PER_COUNT, ServoModel, ServoShaft
+from trade_robotfile import Joint, SerialBus
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-    from trade_drivers.robotfile import Joint, SerialBus
 
 PAUSE_S: Final = 0.1
 """A packet whose next byte has not come after this long is discarded."""
@@ -39,7 +38,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
 
     @classmethod
     def from_robot(
-        cls, bus: "SerialBus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
+        cls, bus: SerialBus, joints: Sequence[Joint], port: Path, *, log: ByteLog | None = None, paced: bool = True
     ) -> "Self":
         """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
 
@@ -56,7 +55,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
         return cls([cls._servo_for(bus, joint) for joint in joints], port, name=bus.name, log=log, paced=paced)
 
     @classmethod
-    def _servo_for(cls, bus: "SerialBus", joint: "Joint") -> _Servo:
+    def _servo_for(cls, bus: SerialBus, joint: Joint) -> _Servo:
         if joint.model not in cls.models:
             known = ", ".join(sorted(cls.models))
             raise SimulationError(f'joint."{joint.name}".model: {joint.model!r} is not simulated; there is {known}')
@@ -70,7 +69,7 @@ class ServoBus(DeviceLine[_Servo], Generic[_Servo, _Packet]):
 
     @classmethod
     @abstractmethod
-    def _new_servo(cls, joint: "Joint", baud: int, position_counts: int, t: float) -> _Servo:
+    def _new_servo(cls, joint: Joint, baud: int, position_counts: int, t: float) -> _Servo:
         """The servo of a joint."""
 
     @abstractmethod

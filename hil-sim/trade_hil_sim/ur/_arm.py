@@ -235,16 +235,16 @@ class Arm:
             self._modes.append((after + _POWER_S, RobotMode.RUNNING))
         return True
 
-    def protective_stop(self, why: str) -> None:
+    def protective_stop(self, reason: str) -> None:
         """Stop, and do not move until it is unlocked."""
-        self.safety(SafetyMode.PROTECTIVE_STOP, why)
+        self.safety(SafetyMode.PROTECTIVE_STOP, reason)
 
-    def safety(self, mode: SafetyMode, why: str = "") -> None:
+    def safety(self, mode: SafetyMode, reason: str = "") -> None:
         """Enter a safety mode. One that it may not move in ends its program; a safeguard stop only holds it up."""
         if mode is self.safety_mode:
             return
         was, self.safety_mode, self._locked_at = self.safety_mode, mode, self.t
-        self.note(mode.name.lower(), detail=why)
+        self.note(mode.name.lower(), detail=reason)
         if SafetyMode.SAFEGUARD_STOP in {was, mode}:
             self.paused(mode is SafetyMode.SAFEGUARD_STOP)
         if mode.cuts_power:

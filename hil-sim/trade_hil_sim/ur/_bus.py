@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
@@ -16,6 +16,8 @@ from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState
 from trade_hil_sim.robot._bus_thread import BusThread, ready
+from trade_robotfile import Arm as ArmRecord
+from trade_robotfile import Bus
 
 from ._arm import HOME, Arm
 from ._dashboard import GREETING, Dashboard, lines_in
@@ -24,10 +26,6 @@ from ._protocol import Packet
 from ._rtde import Rtde, RtdeSession, measured
 from ._table import SafetyMode
 from ._tcp import MOST_HELD, Client, listeners
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Arm as ArmRecord
-    from trade_drivers.robotfile import Bus
 
 ANSWER_S: Final = 10.0
 _ARM: Final = 0
@@ -86,8 +84,8 @@ class UrBus(BusThread):
     @classmethod
     def from_robot(
         cls,
-        bus: "Bus",
-        devices: "Sequence[ArmRecord]",
+        bus: Bus,
+        devices: Sequence[ArmRecord],
         port: Path,  # noqa: ARG003 - a controller is no path; its address is known when it is open
         *,
         log: ByteLog | None = None,

@@ -41,4 +41,4 @@ def the_dashboard_answers_for_the_controller(patch: pytest.MonkeyPatch) -> None:
 
 
 def a_scan_asks_the_dashboard_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.ur._identify.probe", lambda *_: None)
+    patch.setattr("trade_drivers.vendors.ur._driver.probe", lambda *_: None)

@@ -4,18 +4,18 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade_drivers.vendors.cia402 import _inspect as inspect
 from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402 import _verify as verify
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._net import Answer, Net
 from trade_drivers.vendors.cia402._units import Scale
+from trade_drivers.vendors.cia402._wire import Answer, Net
 
 
 def all_speeds_are_counts(patch: pytest.MonkeyPatch) -> None:
     def counts(axis: DriveAxis, *_: object) -> float:
         return axis.resolution.rad
 
-    patch.setattr("trade_drivers.vendors.cia402._units._converted", counts)
+    patch.setattr("trade_drivers.vendors.cia402._units._unit_in_rad", counts)
 
 
 def the_file_alone_has_the_scale(patch: pytest.MonkeyPatch) -> None:
@@ -28,9 +28,9 @@ def the_file_alone_has_the_scale(patch: pytest.MonkeyPatch) -> None:
 
 def a_drive_is_mapped_in_any_state(patch: pytest.MonkeyPatch) -> None:
     def at_once(net: Net, axis: DriveAxis) -> Iterator[None]:
-        yield from inspect._map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
+        yield from verify._map(net, axis.id, table.STATUS, 1, table.NO_REMOTE)
 
-    patch.setattr(inspect, "_map_first", at_once)
+    patch.setattr(verify, "_map_first", at_once)
 
 
 def a_full_queue_is_a_lost_port(patch: pytest.MonkeyPatch) -> None:

@@ -7,15 +7,17 @@ import pytest
 
 from trade._estop.deadman import Deadman
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.joints import Axis, Exchange, Ramp
+from trade_drivers.joints import Axis, Exchange, Motion, Ramp
 from trade_drivers.joints._jobs import Enable
-from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._zero import Zero
-from trade_drivers.joints.serial import ServoAxis, written
-from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+from trade_drivers.joints.serial import ServoAxis
+from trade_drivers.vendors.cia402._exchange import DriveExchange
+from trade_drivers.vendors.damiao._exchange import DamiaoExchange
 from trade_drivers.vendors.dynamixel import _table as dynamixel
+from trade_drivers.vendors.dynamixel._exchange import DynamixelExchange
 from trade_drivers.vendors.feetech import _table as feetech
+from trade_drivers.vendors.feetech._exchange import FeetechExchange
 
 
 def a_driver_that_leaves_relaxes(patch: pytest.MonkeyPatch) -> None:
@@ -29,7 +31,7 @@ def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
     def strict(self: Enable) -> Iterator[None]:
         for axis in self.devices:
             if axis.fault:
-                raise axis.faulty()
+                raise axis.fault_error()
         yield from steps(self)
 
     patch.setattr(Enable, "steps", strict)
@@ -40,11 +42,11 @@ def enabling_restarts_no_servo(patch: pytest.MonkeyPatch) -> None:
         yield
         return axis.health
 
-    patch.setattr("trade_drivers.vendors.dynamixel._jobs._restarted", as_it_is)
+    patch.setattr(DynamixelExchange, "_restart", as_it_is)
 
 
 def enabling_resets_no_fault_of_a_drive(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.cia402._jobs._reset", lambda *_: iter(()))
+    patch.setattr(DriveExchange, "_reset", lambda *_: iter(()))
 
 
 def the_end_of_a_session_stops_nothing(patch: pytest.MonkeyPatch) -> None:
@@ -57,18 +59,18 @@ def the_last_speed_holds_without_end(patch: pytest.MonkeyPatch) -> None:
 
 def _torque_alone(register: Any) -> Callable[..., Iterator[None]]:
     def enabling(bus: Any, job: Any, axis: Any) -> Iterator[None]:
-        yield from written(bus, job, axis, register, 1)
+        yield from bus.write_register(job, axis, register, 1)
         axis.fault, axis.ready = "", True
 
     return enabling
 
 
 def enabling_a_dynamixel_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE))
+    patch.setattr(DynamixelExchange, "enabling", _torque_alone(dynamixel.TORQUE_ENABLE))
 
 
 def enabling_a_feetech_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.feetech._jobs.enabling", _torque_alone(feetech.TORQUE))
+    patch.setattr(FeetechExchange, "enabling", _torque_alone(feetech.TORQUE))
 
 
 def a_course_begins_at_zero(patch: pytest.MonkeyPatch) -> None:

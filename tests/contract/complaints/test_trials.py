@@ -17,12 +17,12 @@ from tests.unit.ros.arms import FakeJoints
 from trade import HookEvent, service, where
 from trade.testing import MemorySystem, memory_system
 from trade_drivers import Motor
-from trade_gateway.cli._output import say_error
 from trade_gateway.cli.services._call import parse_arguments
 from trade_gateway.cli.services._services import describe
 from trade_gateway.clients._schemas import service_view
 from trade_gateway.recording._channels import LOCKS
 from trade_gateway.recording._reader import entries
+from trade_gateway.terminal._output import say_error
 
 pytestmark = pytest.mark.virtual_time
 

@@ -50,7 +50,7 @@ def every_word_is_json(patch: pytest.MonkeyPatch) -> None:
 
 
 def an_error_has_all_its_lines(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_gateway.cli._output._place", lambda traceback, _: traceback.splitlines())
+    patch.setattr("trade_gateway.terminal._output._place", lambda traceback, _: traceback.splitlines())
 
 
 def a_description_has_what_a_caller_types(patch: pytest.MonkeyPatch) -> None:

@@ -13,11 +13,11 @@ from trade.errors import DeviceError
 from trade_drivers.bus._serial_port import SerialWire
 from trade_drivers.joints import BusMotor, Gate
 from trade_drivers.joints.serial import Answer, ServoExchange
-from trade_drivers.vendors.cia402 import _sdo as sdo
 from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402 import _wire as wire
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._net import Net
 from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.cia402._wire import Net
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Feedback
 from trade_drivers.vendors.dynamixel import _table as dynamixel
@@ -57,7 +57,7 @@ def no_driver_compares_the_model(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_driver_compares_the_serial_number(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.cia402._inspect._check_fingerprint", lambda *_: iter(()))
+    patch.setattr("trade_drivers.vendors.cia402._verify._check_fingerprint", lambda *_: iter(()))
 
 
 def the_bare_dynamixel_sdk_takes_any_device_that_obeys(patch: pytest.MonkeyPatch) -> None:
@@ -85,7 +85,7 @@ def a_feetech_that_is_silent_reads_zero(patch: pytest.MonkeyPatch) -> None:
 def a_write_is_done_when_it_is_sent(patch: pytest.MonkeyPatch) -> None:
     def write(self: Net, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Iterator[None]:
         gate()
-        self._port.send(table.SDO_REQUEST + node, next(sdo.download(entry.index, entry.sub, entry.encode(value))).data)
+        self._port.send(table.SDO_REQUEST + node, next(wire.download(entry.index, entry.sub, entry.encode(value))).data)
         yield
 
     patch.setattr(Net, "write", write)

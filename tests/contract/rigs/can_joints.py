@@ -51,7 +51,7 @@ class Cia402Rig(CanJointRig):
 
     vendor, column = "cia402", "CiA 402"
     library = "canopen", "canopen"
-    importing = tuple(f"vendors.cia402.{name}" for name in ("_cycle", "_inspect", "_net"))
+    importing = tuple(f"vendors.cia402.{name}" for name in ("_exchange", "_verify", "_wire"))
     bus, joint, group = "legs", "leg.hip", "leg"
     within_rad, exactly_rad = 0.01, 1e-5
     patience = (PATIENT,)

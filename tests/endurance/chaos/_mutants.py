@@ -38,7 +38,7 @@ def _no_drain() -> None:
 def _no_expiry() -> None:
     """Leases never end."""
     LockTable.expire = lambda self: math.inf  # type: ignore[method-assign]
-    LockTable.over = lambda self, number: "" if number in self._grants else "it ended"  # type: ignore[method-assign]
+    LockTable.why_ended = lambda self, number: "" if number in self._grants else "it ended"  # type: ignore[method-assign]
 
 
 def _zombie_epoch() -> None:

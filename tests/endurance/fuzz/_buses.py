@@ -10,13 +10,13 @@ from pymodbus.framer import FramerRTU
 
 from tests.endurance.fuzz._target import Target
 from trade.errors import DeviceError
+from trade_drivers import parse
 from trade_drivers.bus.can._netlink import parse_link
-from trade_drivers.robotfile import parse
-from trade_drivers.vendors.cia402 import _sdo as sdo
+from trade_drivers.vendors.cia402 import _wire as wire
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
-from trade_drivers.vendors.dynamixel import _frames as dynamixel
-from trade_drivers.vendors.feetech import _frames as feetech
+from trade_drivers.vendors.dynamixel import _wire as dynamixel
+from trade_drivers.vendors.feetech import _wire as feetech
 from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.robotiq._wire import _QuietClient as ModbusClient
 from trade_drivers.vendors.snapshot._picture import picture
@@ -88,7 +88,7 @@ _WRIST: Final = replace(_TAIL, model="DM4310")
 def _sdo_answers(data: bytes) -> bytes:
     """A drive that says these eight bytes again and again, one after the other, while it is asked."""
     frames = [data[at : at + 8] for at in range(0, len(data), 8)] or [b""]
-    transfer = sdo.upload(0x1008, 0)
+    transfer = wire.upload(0x1008, 0)
     request = next(transfer)
     try:
         for turn in range(10_000):
@@ -284,7 +284,7 @@ TARGETS: Final = [
         "feetech-status", _until_empty(lambda held: feetech.take_status(held, range(1, 9), 2, b""), feetech.Corrupt)
     ),
     Target("modbus-answer", _modbus),
-    Target("cia402-sdo", _sdo_answers, (sdo.Aborted,)),
+    Target("cia402-sdo", _sdo_answers, (wire.Aborted,)),
     Target("cia402-axis", _cia402_axis),
     Target("odrive-axis", _odrive_axis, (DeviceError,)),
     Target("damiao-axis", _damiao_axis, (DeviceError,)),

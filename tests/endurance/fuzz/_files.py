@@ -12,18 +12,18 @@ from trade._estop.store import _read as read_open_estop
 from trade._security.policy_file import read_policy
 from trade.errors import ConfigurationError
 from trade.rules._file import read_rules
-from trade_drivers.robotfile import parse as parse_robot
+from trade_drivers import parse as parse_robot
 from trade_gateway.cli.operation._archive import read_archive
 from trade_gateway.cli.operation._file_closure import named_files
 from trade_gateway.cli.watching._audit import _noted as read_notes
 from trade_gateway.cli.watching._audit import _verified as verified
 from trade_gateway.config._gateway_file import read_gateway_file
-from trade_gateway.config._system import read_system_file
 from trade_gateway.http._authentication import Tokens
 from trade_gateway.language import read_lexicon
 from trade_gateway.language._memory import _read as read_memory
 from trade_gateway.pki._authority import Authority
 from trade_gateway.ros._file import read_ros_file
+from trade_gateway.supervisor._system_file import read_system_file
 
 _FOLDER: Final = tempfile.TemporaryDirectory(prefix="trade-fuzz-")
 

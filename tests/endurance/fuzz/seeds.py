@@ -30,8 +30,8 @@ from trade._protocol.remote_errors import pack_error
 from trade._protocol.samples import StreamSample
 from trade._transport.scouting import hello
 from trade.errors import LimitExceeded, LockedByOther
-from trade_drivers.vendors.dynamixel._frames import crc16 as dynamixel_crc
-from trade_drivers.vendors.feetech._frames import packet as feetech_packet
+from trade_drivers.vendors.dynamixel._wire import crc16 as dynamixel_crc
+from trade_drivers.vendors.feetech._wire import packet as feetech_packet
 from trade_gateway.cli.operation._archive import _MANIFEST as MANIFEST
 from trade_gateway.cli.operation._archive import Entry, Manifest
 from trade_gateway.mcp._tools import TOOLS

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from trade_gateway.conformance import CHECKS
+from trade_checks.conformance import CHECKS
 
 PEER = Path(__file__).with_name("peer.py")
 NOTICED_BY = {

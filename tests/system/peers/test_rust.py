@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.rust_peer import built_peer, cargo
-from trade_gateway.conformance import CHECKS
+from trade_checks.conformance import CHECKS
 
 LEFT_OUT = {"streams"}
 """What this small container does not do; nothing about safety."""

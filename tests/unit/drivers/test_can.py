@@ -14,9 +14,8 @@ import pytest
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import CanPort, ErrorState, Frame, LoadMeter, error_state, frame_bits, split_port
 from trade_drivers.joints import PortLost
-from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._machine import State, command_towards_enabled, state_of
+from trade_drivers.vendors.cia402._table import State, command_towards_enabled, state_of
 from trade_hil_sim import BusOff, CanBus, Replug, Unplug, frames
 
 _numbers = itertools.count()
@@ -231,7 +230,7 @@ def test_the_enabling_sequence_ends_halted_and_never_passes_a_fault() -> None:
     assert (way[State.SWITCH_ON_DISABLED], way[State.READY]) == (0x06, 0x07)
     assert {way[State.SWITCHED_ON], way[State.QUICK_STOP], way[State.ENABLED]} == {0x10F}
     assert all(way[state] is None for state in (State.NOT_READY, State.FAULT, State.FAULT_REACTION, None))
-    assert machine.GO & machine.HALT == 0
+    assert table.GO & table.HALT == 0
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from tests.unit.drivers.fault_table import TABLE, Sick
 from tests.unit.drivers.legs import HALT, HIP, KNEE, Leg, leg, rig
 from trade.errors import DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.vendors.cia402._cycle import DriveExchange
+from trade_drivers.vendors.cia402._exchange import DriveExchange
 from trade_hil_sim import (
     Command,
     Duplicate,

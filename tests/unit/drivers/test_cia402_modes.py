@@ -28,8 +28,9 @@ from trade_drivers import JointGroup, Tolerances
 from trade_drivers.joints import Sample
 from trade_drivers.motion._plan import Course
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._motor import Drive
-from trade_drivers.vendors.cia402._stream import Following, Turning, interpolation_period
+from trade_drivers.vendors.cia402._axis import Following, Turning
+from trade_drivers.vendors.cia402._homing import Drive
+from trade_drivers.vendors.cia402._verify import interpolation_period
 from trade_hil_sim import Entry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 

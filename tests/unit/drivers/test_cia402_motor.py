@@ -10,7 +10,7 @@ from tests.unit.drivers.conftest import Outcome, written_now
 from tests.unit.drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, HOMING, KNEE, PROFILE_POSITION, Leg, leg, only, rig
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, LimitExceeded, MotionStopped
 from trade_drivers import JointGroup, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.vendors.cia402._motor import Drive
+from trade_drivers.vendors.cia402._homing import Drive
 
 pytestmark = pytest.mark.virtual_time
 

@@ -4,7 +4,7 @@ import canopen
 import pytest
 from canopen import objectdictionary as od
 
-from trade_drivers.vendors.cia402._sdo import Aborted, Request, Transfer, abort, download, upload
+from trade_drivers.vendors.cia402._wire import Aborted, Request, Transfer, abort, download, upload
 
 NODE = 5
 NAME = "a name that is longer than seven letters"

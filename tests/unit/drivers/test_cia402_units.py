@@ -25,7 +25,7 @@ from tests.unit.drivers.legs import (
 from tests.unit.drivers.test_cia402_motor import through
 from trade.errors import ConfigurationError, DeviceFault, TradeError
 from trade_drivers import Tolerances
-from trade_drivers.vendors.cia402._motor import Drive
+from trade_drivers.vendors.cia402._homing import Drive
 from trade_hil_sim import Absent, BrownOut, Entry, Place, Replug, Unplug
 from trade_hil_sim.cia402 import Object, factor_objects, unit_objects
 

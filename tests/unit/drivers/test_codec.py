@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 import trade_drivers
 from trade_drivers.joints._axis import Scale
 from trade_drivers.joints._profile import Leg, together
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, RESOLUTION, SLOW, DynamixelAxis
-from trade_drivers.vendors.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
+from trade_drivers.vendors.dynamixel._wire import Corrupt, crc16, take_status, unstuffed
 from trade_hil_sim.dynamixel import status
+from trade_robotfile import Joint
 
 pytestmark = pytest.mark.virtual_time
 

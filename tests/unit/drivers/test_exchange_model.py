@@ -39,10 +39,10 @@ class Joint:
     def age_ns(self, now_ns: int) -> int:
         return now_ns - self.heard_ns
 
-    def deaf(self, now_ns: int) -> DeviceSilent:
+    def silent_error(self, now_ns: int) -> DeviceSilent:
         return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault)
 
 
@@ -80,7 +80,7 @@ class Job(Work[Joint]):
         for left in reversed(range(self._exchanges)):
             self._model.exchanged()
             if self._fails and not left:
-                raise self.devices[0].deaf(self._model.now)
+                raise self.devices[0].silent_error(self._model.now)
             yield
 
 

@@ -143,5 +143,5 @@ def _one_of(wanted: str, text: str) -> bool:
 
 
 def _latched(subject: Subject) -> str:
-    [device] = getattr(subject.provider, "_axes", None) or [subject.provider._hand]
+    [device] = getattr(subject.provider, "_axes", None) or [subject.provider._device]
     return str(device.fault)

@@ -10,6 +10,7 @@ from tests.unit.drivers.conftest import written_now
 from tests.unit.drivers.tail_rig import TailRig, rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
+from trade_hil_sim.feetech import MODELS
 
 pytestmark = pytest.mark.virtual_time
 
@@ -91,7 +92,7 @@ def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig
     assert max(arrived) - min(arrived) < 0.3 * (max(arrived) - min(started))
 
 
-@pytest.mark.parametrize(("model", "other"), [("STS3215", "STS3250"), ("STS3250", "STS3095"), ("STS3095", "STS3215")])
+@pytest.mark.parametrize(("model", "other"), [*zip(MODELS, [*MODELS][1:] + [*MODELS][:1], strict=True)])
 def test_each_model_is_taken_for_itself_and_for_no_other(rig: TailRig, model: str, other: str) -> None:
     rig.configure(('model = "STS3215"', f'model = "{model}"'))
     rig.plug()

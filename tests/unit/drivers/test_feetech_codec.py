@@ -11,12 +11,12 @@ import rustypot
 from hypothesis import strategies as st
 
 from trade_drivers.joints import Goal, Sample
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, SLOW, FeetechAxis
-from trade_drivers.vendors.feetech._frames import Corrupt, Status, checksum, packet, take_status
-from trade_drivers.vendors.feetech._jobs import GOAL_BLOCK, goal_block
+from trade_drivers.vendors.feetech._exchange import GOAL_BLOCK, goal_block
+from trade_drivers.vendors.feetech._wire import Corrupt, Status, checksum, packet, take_status
 from trade_hil_sim.feetech import STS3215, PacketReader, encode, status
+from trade_robotfile import Joint
 
 pytestmark = pytest.mark.virtual_time
 

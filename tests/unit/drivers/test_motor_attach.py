@@ -13,7 +13,8 @@ from tests.unit.drivers.motor_rig import KINDS, ROOT, TIP, MotorRig, motor_rig, 
 from trade.errors import ConfigurationError, DeviceFault
 from trade_drivers import load
 from trade_drivers.vendors.odrive import _frames as frames
-from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
+from trade_drivers.vendors.odrive._frames import frame_id
+from trade_drivers.vendors.odrive._table import Command, Control, Input, State
 
 pytestmark = pytest.mark.virtual_time
 

@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade_drivers.vendors.damiao import _frames as damiao
+from trade_drivers.vendors.damiao import _table as table
 from trade_drivers.vendors.odrive import _frames as odrive
-from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
+from trade_drivers.vendors.odrive._frames import frame_id
+from trade_drivers.vendors.odrive._table import Command, Control, Errors, Input, State
 from trade_hil_sim.damiao import MODELS, Ranges, decode_mit, encode_feedback
 from trade_hil_sim.damiao import Register as SimRegister
 from trade_hil_sim.damiao import Status as SimStatus
@@ -76,7 +78,7 @@ def test_driver_and_simulator_agree_on_the_numbers_of_commands() -> None:
     [(0x1000000, "watchdog"), (0x300, "over voltage, under voltage"), (0x80000000, "80000000h"), (0, "")],
 )
 def test_errors_are_explained_in_words(errors: int, text: str) -> None:
-    assert odrive.Errors(errors).text == text
+    assert Errors(errors).text == text
 
 
 @given(data=st.binary(max_size=8))
@@ -89,9 +91,9 @@ def test_no_bytes_confuse_an_odrives_decoders(data: bytes) -> None:
 
 
 def test_driver_and_simulator_agree_on_models_registers_and_status() -> None:
-    assert {name: tuple(ranges) for name, ranges in damiao.MODELS.items()} == {n: tuple(r) for n, r in MODELS.items()}
-    assert {(r.name, r.value) for r in damiao.Register} <= {(r.name, r.value) for r in SimRegister}
-    assert {(s.name, s.value) for s in damiao.Status} == {(s.name, s.value) for s in SimStatus}
+    assert {name: tuple(ranges) for name, ranges in table.MODELS.items()} == {n: tuple(r) for n, r in MODELS.items()}
+    assert {(r.name, r.value) for r in table.Register} <= {(r.name, r.value) for r in SimRegister}
+    assert {(s.name, s.value) for s in table.Status} == {(s.name, s.value) for s in SimStatus}
 
 
 def test_the_known_vector_of_a_mit_command() -> None:
@@ -111,7 +113,7 @@ def test_feedback_is_read_as_it_was_written(
 ) -> None:
     ranges = MODELS["DM4310"]
     data = encode_feedback(status, number, (position, velocity, torque), ranges, (30, 41))
-    reported = damiao.Feedback.decode(data, damiao.MODELS["DM4310"])
+    reported = damiao.Feedback.decode(data, table.MODELS["DM4310"])
     assert (reported.status, reported.nibble, reported.temperature_c) == (status, number, 41)
     assert reported.position_rad == pytest.approx(position, abs=25 / 65535)
     assert reported.velocity_rad_s == pytest.approx(velocity, abs=60 / 4095)
@@ -120,10 +122,10 @@ def test_feedback_is_read_as_it_was_written(
 
 @given(data=st.binary(max_size=8))
 def test_no_bytes_confuse_a_damiaos_decoders(data: bytes) -> None:
-    for register in damiao.Register:
+    for register in table.Register:
         damiao.answer(data, 1, register)
     try:
-        damiao.Feedback.decode(data, damiao.MODELS["DM4310"])
+        damiao.Feedback.decode(data, table.MODELS["DM4310"])
     except struct.error:
         assert len(data) != 8
 

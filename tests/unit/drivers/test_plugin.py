@@ -17,7 +17,7 @@ from trade.errors import ConfigurationError, DeviceSilent
 from trade_drivers import AttachedRobot, Sensor, attach, drivers, load
 from trade_drivers.testing import SensorContract
 from trade_hil_sim import ByteLog, Heal, Late, Mute, Replug, SimProcess, SimulationError, Supply, Truncate, Unplug
-from trade_hil_sim.robot._robot import buses_of, read_robot
+from trade_hil_sim.robot._robot import buses_of
 
 pytestmark = pytest.mark.realtime
 
@@ -47,7 +47,7 @@ class Oven:
 
     def __init__(self, folder: Path, undo: ExitStack) -> None:
         self.log = ByteLog()
-        [self.sim] = buses_of(read_robot(OVEN), folder, log=self.log)
+        [self.sim] = buses_of(load(OVEN), folder, log=self.log)
         undo.callback(self.sim.close)
         self.sim.open()
         self._undo = undo
@@ -138,7 +138,7 @@ def test_a_file_that_says_another_number_of_probes_is_refused(oven: Oven, tmp_pa
         attach(load(file), ports={oven.sim.name: str(oven.sim.port)})
     file.write_text(OVEN.read_text().replace("probes = 2", "probes = 5"))
     with pytest.raises(SimulationError, match="a TC-4 has 1 to 4, not 5"):
-        buses_of(read_robot(file), tmp_path)
+        buses_of(load(file), tmp_path)
 
 
 def test_the_contract_runs_on_it_as_on_hardware_and_prompts_nothing(installed: None, system: str) -> None:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from tests.support.simulated_robots import HAND, HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import CanBus, Robot, SerialBus, load, parse, without
-from trade_drivers.robotfile import Drill
+from trade_robotfile import Drill
 
 
 def test_a_robot_file_becomes_records() -> None:

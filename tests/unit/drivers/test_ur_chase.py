@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
+from trade_drivers.vendors.ur._path import SetpointFilter
 
 SPEED, ACCEL, STEP_S = 1.0, 2.5, 0.002
 

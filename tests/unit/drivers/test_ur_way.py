@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trade_drivers.vendors.ur._clock_offset import Age
-from trade_drivers.vendors.ur._line_path import poses_on
+from trade_drivers.vendors.ur._path import poses_on
+from trade_drivers.vendors.ur._states_child import Age
 from trade_hil_sim.ur._kinematics import pose_between, way_of
 
 POSES = st.tuples(*(st.floats(-0.5, 0.5) for _ in range(3)), *(st.floats(-1.5, 1.5) for _ in range(3)))

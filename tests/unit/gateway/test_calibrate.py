@@ -14,8 +14,8 @@ from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, WireError, parse
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
+from trade_gateway.terminal._output import Output
 from trade_hil_sim import DynamixelBus, writes
 
 pytestmark = pytest.mark.virtual_time

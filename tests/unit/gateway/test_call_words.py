@@ -10,8 +10,8 @@ from trade import service
 from trade._protocol.messages import ServiceInfo
 from trade.testing import memory_system
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.services._call import parse_arguments
+from trade_gateway.terminal._output import Output
 
 pytestmark = pytest.mark.virtual_time
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from trade_checks._cases import chosen
+from trade_checks.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
+from trade_checks.drill._runner import DrillFailed
+from trade_checks.drill._scenes import ALLOWANCE_S, limit_s
+from trade_checks.drill._testbed import Judge
 from trade_drivers import load
-from trade_drivers.robotfile import Drill
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import chosen
-from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
-from trade_gateway.drill._runner import DrillFailed
-from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
-from trade_gateway.drill._testbed import Judge
+from trade_robotfile import Drill
 
 pytestmark = pytest.mark.virtual_time
 

@@ -8,8 +8,8 @@ import pytest
 from tests.support.simulated_robots import HAND, HEAD
 from trade_drivers import FaultLog, parse
 from trade_drivers.faults._trouble import Found
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.robots._up import FaultWatch
+from trade_gateway.terminal._output import Output
 
 OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
 BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")

@@ -22,14 +22,14 @@ from trade._security.certificates import Certificate
 from trade._transport.endpoints import loopback_interface
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.robots import _gateway
+from trade_gateway.cli.robots._file_changes import Named, digest, named_by
 from trade_gateway.config import _gateway_file
-from trade_gateway.config._changes import Named, digest, named_by
 from trade_gateway.config._children import Child
 from trade_gateway.config._gateway_file import read_gateway_file
 from trade_gateway.pki._authority import Authority
 from trade_gateway.process._addresses import addresses, forwarding
+from trade_gateway.terminal._output import Output
 
 pytestmark = pytest.mark.virtual_time
 

@@ -305,7 +305,7 @@ def test_S09_an_http_gateway_names_unreached_containers_and_calls_the_e_stop_inc
     anna = served.client()
     assert anna.ask("GET", "/sight").body["apart"] == {}
     apart = {"tls/10.0.0.7:7450": "nothing accepts connections there"}
-    monkeypatch.setattr(served.robot.me, "reachability", lambda **_: Reachability(("tester/a",), apart=apart))
+    monkeypatch.setattr(served.robot.me, "reachability", lambda **_: Reachability(("tester/a",), unreached=apart))
     reported = anna.ask("POST", "/estop").body
     assert (reported["complete"], reported["apart"]) == (False, apart)
     assert set(reported["confirmed"]) >= {"tester/a", "tester/b"}

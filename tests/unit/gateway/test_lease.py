@@ -28,7 +28,7 @@ def free(now: float = 0.0) -> Arbiter:
 
 
 def granted(arbiter: Arbiter, now: float, turn: str = "") -> Lease:
-    assert arbiter.asked(now, "rover", turn, LEASE_S)
+    assert arbiter.request(now, "rover", turn, LEASE_S)
     return Lease(arbiter.turn, LEASE_S, states=b"" if arbiter.turn == turn else b"saved")
 
 
@@ -86,31 +86,31 @@ def test_a_standby_serves_once_the_last_lease_is_certainly_over() -> None:
     arbiter = free(0.0)
     assert arbiter.due == waits_s(LEASE_S)
     granted(arbiter, 5.0)
-    assert not arbiter.looked(arbiter.due - 0.1)
+    assert not arbiter.take_if_free(arbiter.due - 0.1)
     assert arbiter.due == 5.0 + waits_s(LEASE_S) > 5.0 + LEASE_S * 1.01 / 0.99 + KILL_S
-    assert arbiter.looked(arbiter.due)
+    assert arbiter.take_if_free(arbiter.due)
     assert arbiter.mine
-    assert not arbiter.asked(100.0, "rover", "", LEASE_S)
+    assert not arbiter.request(100.0, "rover", "", LEASE_S)
 
 
 def test_a_standby_grants_nothing_until_leases_of_an_earlier_boot_have_ended() -> None:
     arbiter = Arbiter(["rover"], "boot")
-    assert not arbiter.asked(0.0, "rover", "", LEASE_S)
-    assert not arbiter.looked(1e6)
+    assert not arbiter.request(0.0, "rover", "", LEASE_S)
+    assert not arbiter.take_if_free(1e6)
     arbiter.ended(7.0, LEASE_S)
-    assert arbiter.asked(7.0, "rover", "", LEASE_S)
+    assert arbiter.request(7.0, "rover", "", LEASE_S)
 
 
 def test_a_child_handed_back_returns_here_if_no_other_gateway_takes_it() -> None:
     arbiter = free(0.0)
-    arbiter.looked(50.0)
+    arbiter.take_if_free(50.0)
     arbiter.ended(51.0, LEASE_S)  # a crash is no reason to give it away
     assert arbiter.mine
     arbiter.hand_back()
-    assert not arbiter.asked(52.0, "rover", "", LEASE_S)  # it has not ended yet
+    assert not arbiter.request(52.0, "rover", "", LEASE_S)  # it has not ended yet
     arbiter.ended(53.0, LEASE_S)
     assert arbiter.due == 53.0 + waits_s(LEASE_S)
-    assert arbiter.asked(54.0, "rover", "", LEASE_S)
+    assert arbiter.request(54.0, "rover", "", LEASE_S)
 
 
 def test_a_gateway_keeps_its_turn_and_gets_a_new_one_when_it_names_another() -> None:
@@ -118,33 +118,33 @@ def test_a_gateway_keeps_its_turn_and_gets_a_new_one_when_it_names_another() -> 
     first = granted(arbiter, 1.0).turn
     assert granted(arbiter, 2.0, first).turn == first
     assert granted(arbiter, 3.0).turn not in ("", first)
-    arbiter.looked(100.0)
+    arbiter.take_if_free(100.0)
     assert arbiter.turn == ""
 
 
 def test_another_gateway_gets_a_lease_only_when_the_holders_is_certainly_over() -> None:
     arbiter = Arbiter(["rover", "cart"], "boot")
     arbiter.ended(0.0, LEASE_S)
-    assert not arbiter.asked(1.0, "cart", "", LEASE_S)  # rover may have one of an earlier boot
-    assert arbiter.asked(waits_s(LEASE_S), "rover", "", LEASE_S)
+    assert not arbiter.request(1.0, "cart", "", LEASE_S)  # rover may have one of an earlier boot
+    assert arbiter.request(waits_s(LEASE_S), "rover", "", LEASE_S)
     first = arbiter.turn
-    assert not arbiter.asked(2 * waits_s(LEASE_S) - 0.1, "cart", first, LEASE_S)
-    assert arbiter.asked(2 * waits_s(LEASE_S), "cart", first, LEASE_S)
+    assert not arbiter.request(2 * waits_s(LEASE_S) - 0.1, "cart", first, LEASE_S)
+    assert arbiter.request(2 * waits_s(LEASE_S), "cart", first, LEASE_S)
     assert arbiter.turn != first
 
 
 def test_if_the_last_holder_is_unknown_the_others_may_ask_before_the_standby_takes_the_container() -> None:
     arbiter = Arbiter(["rover", "cart"], "boot")
     arbiter.ended(0.0, LEASE_S)
-    assert not arbiter.looked(waits_s(LEASE_S) + 1.0)
-    assert arbiter.looked(arbiter.due)
+    assert not arbiter.take_if_free(waits_s(LEASE_S) + 1.0)
+    assert arbiter.take_if_free(arbiter.due)
 
 
 def test_after_a_restart_the_last_holder_has_its_lease_renewed_at_once() -> None:
     arbiter = Arbiter(["rover", "cart"], "boot", "cart")
     arbiter.ended(0.0, LEASE_S)
-    assert not arbiter.asked(0.0, "rover", "", LEASE_S)
-    assert arbiter.asked(0.0, "cart", "", LEASE_S)
+    assert not arbiter.request(0.0, "rover", "", LEASE_S)
+    assert arbiter.request(0.0, "cart", "", LEASE_S)
 
 
 def test_a_move_ends_the_holders_lease_and_waits_for_the_other_gateway() -> None:
@@ -152,18 +152,18 @@ def test_a_move_ends_the_holders_lease_and_waits_for_the_other_gateway() -> None
     arbiter.ended(0.0, LEASE_S)
     turn = granted(arbiter, 0.0).turn
     arbiter.move("cart")
-    assert not arbiter.asked(1.0, "rover", turn, LEASE_S)
-    assert not arbiter.asked(1.0, "cart", "", LEASE_S)
-    assert not arbiter.looked(waits_s(LEASE_S))
-    assert arbiter.asked(waits_s(LEASE_S), "cart", "", LEASE_S)
+    assert not arbiter.request(1.0, "rover", turn, LEASE_S)
+    assert not arbiter.request(1.0, "cart", "", LEASE_S)
+    assert not arbiter.take_if_free(waits_s(LEASE_S))
+    assert arbiter.request(waits_s(LEASE_S), "cart", "", LEASE_S)
     arbiter.move("rover")
-    assert arbiter.looked(arbiter.due)  # rover does not ask
+    assert arbiter.take_if_free(arbiter.due)  # rover does not ask
     assert arbiter.due == math.inf
     arbiter.move("cart")
     assert arbiter.handing
     arbiter.ended(100.0, LEASE_S)
-    assert not arbiter.asked(100.0, "rover", "", LEASE_S)
-    assert arbiter.asked(100.0, "cart", "", LEASE_S)  # it has certainly ended here
+    assert not arbiter.request(100.0, "rover", "", LEASE_S)
+    assert arbiter.request(100.0, "cart", "", LEASE_S)  # it has certainly ended here
 
 
 def test_a_holder_that_is_to_leave_ends_while_its_states_are_still_saved() -> None:
@@ -262,7 +262,7 @@ class ThreeHosts(RuleBasedStateMachine):
         if not self.base_frozen:
             if not self.on_base:
                 self.arbiter.ended(self.at_base, LEASE_S)
-            self.arbiter.looked(self.at_base)
+            self.arbiter.take_if_free(self.at_base)
             if self.arbiter.mine and not self.arbiter.handing:
                 self.on_base = True
         for name, host in self.hosts.items():
@@ -273,10 +273,10 @@ class ThreeHosts(RuleBasedStateMachine):
                 if host.holder.held(here):  # started, or allowed to stay
                     host.lives_until = max(host.lives_until, host.holder.term.until)
 
-    def asked(self, message: Message) -> Lease:
+    def request(self, message: Message) -> Lease:
         """What base answers."""
         arbiter = self.arbiter
-        if not arbiter.asked(self.at_base, message.host, message.turn, LEASE_S):
+        if not arbiter.request(self.at_base, message.host, message.turn, LEASE_S):
             return Lease("", why="base has it", leave=arbiter.holder == message.host)
         self.written = message.host
         return Lease(arbiter.turn, LEASE_S, states=b"" if arbiter.turn == message.turn else b"saved")
@@ -307,7 +307,7 @@ class ThreeHosts(RuleBasedStateMachine):
         message = data.draw(st.sampled_from(self.questions))
         if not again:
             self.questions.remove(message)
-        answer = self.asked(message)
+        answer = self.request(message)
         if not lost:
             self.answers.append(Message(message.host, message.asked_at, message.turn, message.boot, answer))
 
@@ -331,7 +331,7 @@ class ThreeHosts(RuleBasedStateMachine):
             return
         self.settle()
         asked = Message(name, self.now * host.rate, host.holder.turn, self.boots)
-        host.holder.answered(asked.asked_at, asked.turn, self.asked(asked))
+        host.holder.answered(asked.asked_at, asked.turn, self.request(asked))
         self.settle()
 
     @rule(name=names)

@@ -22,8 +22,8 @@ from trade.errors import (
 )
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import say_error
 from trade_gateway.cli.motion._lock import _wanted
+from trade_gateway.terminal._output import say_error
 
 
 def test_the_usage_says_where_the_command_goes() -> None:

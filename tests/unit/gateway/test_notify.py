@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from trade_gateway.cli._sd_notify import Notifier
+from trade_gateway.terminal._sd_notify import Notifier
 
 
 @pytest.fixture(params=["a path", "an abstract name"])

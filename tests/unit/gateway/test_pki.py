@@ -18,9 +18,9 @@ from trade import atomic_files
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway.cli import build
-from trade_gateway.cli.rights._pki import app
 from trade_gateway.pki import _authority
 from trade_gateway.pki._authority import Authority, Issued, NameRevoked, NameTaken, NoAuthority
+from trade_gateway.pki._command import app
 
 pytestmark = pytest.mark.virtual_time
 

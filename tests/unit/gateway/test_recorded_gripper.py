@@ -15,12 +15,12 @@ from trade.testing import memory_system
 from trade_drivers.testing import FakeGripper
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli.recordings._replay_run import chosen
 from trade_gateway.recording._channels import JointStates, Message, encoded, joints_channel
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._motion import motions
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording.commands._replay_run import chosen
 
 pytestmark = pytest.mark.virtual_time
 HAND, ARM = "rosie.left.hand", "rosie.left.arm"

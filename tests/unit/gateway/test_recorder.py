@@ -21,11 +21,11 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Container, Resource, Secret, service, where
 from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli.recordings import _progress
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder
 from trade_gateway.recording._sources import Wanted
+from trade_gateway.recording.commands import _progress
 
 pytestmark = pytest.mark.virtual_time
 

@@ -57,7 +57,7 @@ class Body:
             raise ValueError(said)
         return (Started(self.name, "epoch", self.pid) if said else None), bool(said)
 
-    def leave(self) -> None:
+    def terminate(self) -> None:
         self.reported.append("leave")
 
     def kill(self) -> None:

@@ -10,8 +10,8 @@ from tests.support.certificates import Papers
 from tests.support.simulated_robots import HEAD as SERVO_HEAD
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
-from trade_gateway.config._system import read_system_file
-from trade_gateway.config._tables import line_of
+from trade_gateway.config._toml_file import line_of
+from trade_gateway.supervisor._system_file import read_system_file
 
 pytestmark = pytest.mark.virtual_time
 

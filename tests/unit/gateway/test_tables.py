@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from trade_gateway.cli._output import Output, table_lines
+from trade_gateway.terminal._output import Output, table_lines
 
 COLUMNS = ("SERVICE", "CALLED AS", "EFFECT", "HOST")
 ROWS = [

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import trade_robotfile
 from tests.support.certificates import Papers
 from tests.support.simulated_robots import HEAD
 from trade._chosen_system import chosen_settings
@@ -20,13 +21,13 @@ from trade.text_files import as_before, as_text
 from trade_drivers import load
 from trade_gateway.cli.watching._profile import read as read_profile
 from trade_gateway.config._gateway_file import read_gateway_file
-from trade_gateway.config._system import read_system_file
 from trade_gateway.config.document import Document
 from trade_gateway.http._authentication import Tokens, add_token
 from trade_gateway.language._lexicon import read_lexicon
 from trade_gateway.ros._file import read_ros_file
 from trade_gateway.ros_messages._types import Types
-from trade_hil_sim.robot._robot import read_robot
+from trade_gateway.supervisor._system_file import read_system_file
+from trade_robotfile import RobotFileError
 
 _EXAMPLES = Path(__file__).parents[3] / "examples"
 _ROS = "[ros]\nversion = 2\n"
@@ -70,7 +71,7 @@ def _robot_of_ros(path: Path) -> object:
 
 KINDS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "robot": (HEAD, load),
-    "simulated robot": (HEAD, read_robot),
+    "simulated robot": (HEAD, trade_robotfile.load),
     "gateway": ((_EXAMPLES / "gateway.toml").read_text(encoding="utf-8"), _gateway),
     "system": ('[system]\nname = "lab"\nsupervisor = "keeper"\n[container.a]\nprogram = ["true"]\n', read_system_file),
     "policy": ((_EXAMPLES / "policy.toml").read_text(encoding="utf-8"), read_policy),
@@ -104,7 +105,8 @@ def test_the_byte_order_mark_of_another_encoding_is_named(tmp_path: Path, kind: 
     for encoding in ("utf-16", "utf-32"):
         file.write_bytes(text.encode(encoding))
         with pytest.raises(
-            (ConfigurationError, UnicodeDecodeError), match=f"byte-order mark of {encoding.upper()}; save it as UTF-8"
+            (ConfigurationError, RobotFileError, UnicodeDecodeError),
+            match=f"byte-order mark of {encoding.upper()}; save it as UTF-8",
         ):
             read(file)
 

@@ -15,7 +15,7 @@ import trade_hil_sim as sim
 from tests.support.simulated_robots import HAND
 from tests.support.waiting import wait_until
 from tests.unit.hil_sim.conftest import FakeClock
-from trade_drivers.robotfile import parse
+from trade_drivers import parse
 from trade_hil_sim import Gripper, RobotiqBus, SimulationError
 from trade_hil_sim.robot._robot import buses_of, find_simulator
 from trade_hil_sim.robotiq import frame

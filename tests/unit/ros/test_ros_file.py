@@ -33,7 +33,7 @@ def test_the_example_is_right_and_says_what_it_maps() -> None:
         ("[ros]\n", "ros.version: is missing"),
         ("[ros]\nversion = 3\n", "Invalid enum value 3"),
         (HEAD + "colour = 1\n", "ros.colour: unknown key"),
-        ("[ros\n", "cannot be read"),
+        ("[ros\n", "not valid TOML"),
         (HEAD + SERVICE, r"to_ros.service\[0\]: needs either group"),
         (HEAD + SERVICE + 'group = "a"\nservice = "a.b"\n', "needs either group"),
         (HEAD + SERVICE + 'group = "a"\nname = "/x"\n', "names one service"),

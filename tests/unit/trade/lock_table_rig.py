@@ -8,6 +8,7 @@ from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource, admit
+from trade._threads.scheduler import Scheduler
 from trade._transport.wait_clock import WaitClock
 
 EPOCH = "epoch"
@@ -38,8 +39,9 @@ class Table:
 
     def __init__(self, clock: Callable[[], float] | None = None) -> None:
         self.now = 0.0
-        self.table = LockTable(EPOCH, "home", Now(clock or (lambda: self.now)))
-        self.table._leases.by = lambda _: None  # type: ignore[method-assign]  # leases end by `advance`, on no other thread
+        timers = Scheduler("closed", Now(clock or (lambda: self.now)))
+        timers.close()  # leases end by `advance`, on no other thread
+        self.table = LockTable(EPOCH, "home", timers)
         self.resources = {name: self.table.adopt(Resource(name, coupled=COUPLED.get(name, ()))) for name in NAMES}
         self.stopping: list[tuple[Resource, Callable[[Resource, str], None]]] = []
         self.table.stop_with(self._stop)

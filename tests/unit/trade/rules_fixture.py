@@ -66,7 +66,7 @@ class Engine:
 
     def __call__(self, text: str, *, dry_run: bool = False) -> Rules:
         self.file.write_text(text)
-        self.running = Rules(self._container, self.file, audit=self.audit, dry_run=dry_run, tell=self._reported.put)
+        self.running = Rules(self._container, self.file, audit=self.audit, dry_run=dry_run, callback=self._reported.put)
         return self.running
 
     def next(self) -> Firing:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from trade._discovery.grace_period import GracePeriods
+from trade._threads.scheduler import Scheduler
 
 pytestmark = pytest.mark.virtual_time
 
@@ -17,8 +18,15 @@ def reported() -> "queue.SimpleQueue[str]":
 
 
 @pytest.fixture
-def absences(reported: "queue.SimpleQueue[str]") -> Iterator[GracePeriods]:
-    made = GracePeriods(reported.put, lambda: True, grace_s=0.2)
+def timers() -> Iterator[Scheduler]:
+    made = Scheduler("trade-timers")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def absences(reported: "queue.SimpleQueue[str]", timers: Scheduler) -> Iterator[GracePeriods]:
+    made = GracePeriods(reported.put, lambda: True, timers, grace_s=0.2)
     yield made
     made.close()
 
@@ -34,8 +42,10 @@ def test_S12_a_container_that_does_not_come_back_is_reported_gone_once(
     assert reported.empty()
 
 
-def test_S12_a_container_that_is_back_in_time_is_never_reported_gone(reported: "queue.SimpleQueue[str]") -> None:
-    patient = GracePeriods(reported.put, lambda: True, grace_s=3600.0)
+def test_S12_a_container_that_is_back_in_time_is_never_reported_gone(
+    reported: "queue.SimpleQueue[str]", timers: Scheduler
+) -> None:
+    patient = GracePeriods(reported.put, lambda: True, timers, grace_s=3600.0)
     patient.begin("me/arm/1")
     assert patient.end("me/arm/1")
     assert not patient.end("me/arm/1")
@@ -44,24 +54,27 @@ def test_S12_a_container_that_is_back_in_time_is_never_reported_gone(reported: "
 
 
 def test_a_container_lost_without_any_bridge_is_gone_as_soon_as_that_is_certain(
-    reported: "queue.SimpleQueue[str]",
+    reported: "queue.SimpleQueue[str]", timers: Scheduler
 ) -> None:
-    absences = GracePeriods(reported.put, lambda: False, grace_s=3600.0)
+    absences = GracePeriods(reported.put, lambda: False, timers, grace_s=3600.0)
     absences.begin("me/arm/1")
     assert reported.get(timeout=60) == "me/arm/1"
     absences.close()
 
 
-def test_closed_grace_periods_report_no_absence(reported: "queue.SimpleQueue[str]") -> None:
-    absences = GracePeriods(reported.put, lambda: True, grace_s=3600.0)
+def test_closed_grace_periods_report_no_absence(
+    absences: GracePeriods, reported: "queue.SimpleQueue[str]", timers: Scheduler
+) -> None:
     absences.begin("me/arm/1")
     absences.close()
     absences.begin("me/leg/1")
+    later = threading.Event()
+    timers.begin(later.set, timers.clock.now_ns() + 1_000_000_000)
+    assert later.wait(60)
     assert reported.empty()
-    assert not [thread for thread in threading.enumerate() if thread.name == "trade-absence"]
 
 
-def test_a_return_during_the_absence_report_is_handled_after_the_report() -> None:
+def test_a_return_during_the_absence_report_is_handled_after_the_report(timers: Scheduler) -> None:
     """The last report says that the container is present; else it would be forgotten while it lives."""
     reporting, reported = threading.Event(), threading.Event()
     order: list[str] = []
@@ -71,7 +84,7 @@ def test_a_return_during_the_absence_report_is_handled_after_the_report() -> Non
         assert reported.wait(60)
         order.append(f"{session} is gone")
 
-    absences = GracePeriods(gone, lambda: False)
+    absences = GracePeriods(gone, lambda: False, timers)
     absences.begin("me/arm/1")
     assert reporting.wait(60)
 

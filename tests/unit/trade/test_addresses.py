@@ -8,6 +8,7 @@ from typing import cast
 import pytest
 
 from trade._discovery.dialer import Dialer
+from trade._threads.scheduler import Scheduler
 from trade._transport.addresses import Attempts
 from trade._transport.endpoints import Endpoint
 from trade._transport.zenoh_links import Joined, Links
@@ -142,11 +143,18 @@ class Cable:
         return endpoint in self.to
 
 
-def test_a_configured_name_is_dialled_at_the_addresses_that_it_has_now() -> None:
+@pytest.fixture
+def timers() -> Iterator[Scheduler]:
+    made = Scheduler("trade-timers")
+    yield made
+    made.close()
+
+
+def test_a_configured_name_is_dialled_at_the_addresses_that_it_has_now(timers: Scheduler) -> None:
     known: list[str] = []
     wire = Wire(**{"10_9_0_5": (0.01, ""), "10_9_0_6": (0.01, "")})
     cable, tried = Cable(), Attempts(resolve=lambda _: list(known), knocks=wire.knock)
-    dialer = Dialer(cast("Links", cable), lambda _: None, ["tcp/rosie.local:7450"], tried)
+    dialer = Dialer(cast("Links", cable), lambda _: None, timers, ["tcp/rosie.local:7450"], tried)
     try:
         threading.Event().wait(5.0)
         assert cable.to == set()
@@ -162,9 +170,10 @@ def test_a_configured_name_is_dialled_at_the_addresses_that_it_has_now() -> None
         dialer.close()
 
 
-def test_a_configured_address_is_left_to_the_transport() -> None:
+def test_a_configured_address_is_left_to_the_transport(timers: Scheduler) -> None:
     wire, cable = Wire(), Cable()
-    dialer = Dialer(cast("Links", cable), lambda _: None, [VPN[0]], Attempts(resolve=as_written, knocks=wire.knock))
+    tried = Attempts(resolve=as_written, knocks=wire.knock)
+    dialer = Dialer(cast("Links", cable), lambda _: None, timers, [VPN[0]], tried)
     try:
         threading.Event().wait(2.0)
         assert wire.tried == []

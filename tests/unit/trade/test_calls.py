@@ -12,6 +12,7 @@ from trade._calls.caller import Caller
 from trade._calls.peer import Peer, Route
 from trade._protocol.keys import Address
 from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_call, encode_message
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 
 pytestmark = pytest.mark.virtual_time
@@ -89,10 +90,12 @@ def transport() -> PaperTransport:
 
 @pytest.fixture
 def caller(transport: PaperTransport) -> Iterator[Caller]:
-    caller = Caller(transport, OWN)
+    timers = Scheduler("trade-timers")
+    caller = Caller(transport, OWN, timers)
     caller.lost(OTHER, back=True)
     yield caller
     caller.close()
+    timers.close()
 
 
 def ask(caller: Caller, *, deadline_s: float = 60, to: Address = OTHER) -> Reply:

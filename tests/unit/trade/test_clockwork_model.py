@@ -124,6 +124,18 @@ class Model(RuleBasedStateMachine):
         act.real.at(when)
 
     @precondition(lambda self: self.acts)
+    @rule(data=st.data(), hours=hours)
+    def by(self, data: st.DataObject, hours: int) -> None:
+        """The same, if that is sooner."""
+        act, when = self._drawn(data, self.acts), self.now + hours * HOUR_NS
+        if act.running:
+            act.asked = when if act.asked is None else min(act.asked, when)
+        elif act.due is None or when < act.due[0]:
+            self._put(act, when)
+        self._settle()
+        act.real.by(when)
+
+    @precondition(lambda self: self.acts)
     @rule(data=st.data())
     def cancel(self, data: st.DataObject) -> None:
         act = self._drawn(data, self.acts)
@@ -157,6 +169,54 @@ class Model(RuleBasedStateMachine):
         assert [act.began for act in self.acts] == [act.begins for act in self.acts]
         assert [act.inside for act in self.acts] == [int(act.running) for act in self.acts]
         assert not any(act.twice_at_once for act in self.acts)
+
+
+def test_a_task_that_is_alone_needs_one_thread_however_often_it_runs() -> None:
+    scheduler, runs = Scheduler("model-clock"), list[str]()
+
+    def act() -> int | None:
+        runs.append(threading.current_thread().name)
+        return 0 if len(runs) < 10 else None
+
+    scheduler.begin(act, 0)
+    wait_until(lambda: len(runs) == 10)
+    assert [thread.name for thread in scheduler._threads] == ["model-clock-0"]
+    scheduler.close()
+
+
+def test_a_task_wanted_by_two_times_while_it_runs_runs_by_the_sooner_one() -> None:
+    scheduler, began, may_end = Scheduler("model-clock"), threading.Event(), threading.Event()
+
+    def act() -> None:
+        began.set()
+        may_end.wait(PATIENCE_S)
+
+    task = scheduler.begin(act, 0)
+    assert began.wait(PATIENCE_S)
+    for when in (2**61, 2**60, 2**62):
+        task.by(when)
+    may_end.set()
+    wait_until(lambda: task.next_ns == 2**60)
+    scheduler.close()
+
+
+def test_a_cancelled_task_is_waited_for_only_as_long_as_was_said_and_not_by_itself() -> None:
+    scheduler, began, may_end = Scheduler("model-clock"), threading.Event(), threading.Event()
+
+    def act() -> None:
+        began.set()
+        may_end.wait(PATIENCE_S)
+        task.cancel(PATIENCE_S)
+
+    task = scheduler.begin(act, 0)
+    assert began.wait(PATIENCE_S)
+    task.cancel(0.01)
+    assert task._running
+    scheduler.close()  # does not wait for it once more
+    assert task._running
+    may_end.set()
+    task.cancel(PATIENCE_S)
+    assert not task._running
 
 
 TestModel = Model.TestCase

@@ -35,6 +35,7 @@ from tests.unit.trade.test_costs import blocks, functions_run, traced
 from trade import Container, Handle, HookEvent, Settings, service, where
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
+from trade._threads import scheduler
 from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.sharing import Border
 from trade.testing import Kind, MemorySystem, memory_system
@@ -360,11 +361,14 @@ def test_a_container_takes_no_more_threads_however_many_others_there_are(system:
         return sum(one.name.startswith("trade-") for one in threading.enumerate())
 
     system.container("c0")
+    threading.Event().wait(2 * scheduler._IDLE_S)
     each = threads()
     for number in range(1, 8):
         system.container(f"c{number}")
     system.settle()
-    assert threads() == 8 * each <= 8 * 9
+    assert threads() <= 8 * 9
+    threading.Event().wait(2 * scheduler._IDLE_S)  # until idle threads have ended
+    assert threads() == 8 * each
 
 
 def test_an_audit_record_sends_nothing_and_is_written_many_rows_at_a_time(

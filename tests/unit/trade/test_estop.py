@@ -468,13 +468,13 @@ def test_S09_each_container_that_had_it_open_confirms_the_clearing(
 
     report = caller.estop(limit_s=GENEROUS_S)
     assert eventually(lambda: reporting() == having)
-    put = controller._line._orders.put
+    put = controller._broadcast._orders.put
 
     def put_slowly(order: bytes) -> None:
         put(order)
         assert eventually(lambda: reporting() <= {"tester/caller"})
 
-    monkeypatch.setattr(controller._line, "_orders", Mock(put=put_slowly))
+    monkeypatch.setattr(controller._broadcast, "_orders", Mock(put=put_slowly))
     assert set(caller.estop_clear([report.id], limit_s=GENEROUS_S).confirmed) == having
 
 

@@ -309,7 +309,7 @@ def test_S12_if_the_hub_is_killed_motion_ends_and_a_lock_has_never_two_owners(
     assert arm._parts.locks.infos() == []
     assert owner.heard() == "lost False"
     assert "lost the hub of this host" in caplog.text
-    assert other.reachability(limit_s=0).apart.keys() == {endpoint}
+    assert other.reachability(limit_s=0).unreached.keys() == {endpoint}
 
     again = start_program(HUB)
     assert again.heard() == "up"

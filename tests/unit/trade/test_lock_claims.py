@@ -175,8 +175,8 @@ def test_locks_in_several_systems_share_the_time_that_the_request_may_wait() -> 
     resources = [SharedResource(f"arm{number}", address, "arm", Lender()) for number in range(3)]  # type: ignore[arg-type]
     table = Table()
     try:
-        with RemoteLocks(table.table, "1").behind(Mock(), resources, LockRequest(wait_s=3.0), Mock()) as loan:
-            assert loan.waited_s == pytest.approx(6.0, abs=0.1)
+        with RemoteLocks(table.table, "1").acquire(Mock(), resources, LockRequest(wait_s=3.0), Mock()) as remote_lock:
+            assert remote_lock.waited_s == pytest.approx(6.0, abs=0.1)
     finally:
         table.close()
     assert patience == pytest.approx([3.0, 1.0, 0.0], abs=0.1)

@@ -40,7 +40,7 @@ def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot,
 
 def test_S14_a_dead_owner_is_noticed_and_what_it_moved_stops(robot: Robot) -> None:
     robot.me.lock(WHOLE, lease_s=60).acquire()
-    with robot.me.lock_api.lease_client._changed:
+    with robot.me.lock_api.lease_client._guard:
         locks = list(robot.me.lock_api.lease_client._locks)
     with locks[0].use():
         robot.find("a", "go_on")(0.1)

@@ -9,12 +9,15 @@ from collections.abc import Iterator
 import pytest
 
 from tests.support.waiting import wait_until
+from tests.unit.trade.lamp_provider import Lamp, found
 from tests.unit.trade.lock_table_rig import EPOCH, Table
 from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import _STOPPING, LockTable
 from trade._resources.resource import Holder, Permit, Resource
+from trade._threads.scheduler import MOST_THREADS, Callback, ScheduledTask, Scheduler
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
+from trade.testing import memory_system
 
 
 @pytest.fixture
@@ -115,16 +118,65 @@ def test_S12_a_renewed_lease_restarts_and_a_lost_one_never_does(table: Table) ->
     assert table.table.infos() == []
 
 
-def test_a_lease_ends_on_its_own_thread_too() -> None:
-    real = LockTable(EPOCH, "home")
+@pytest.fixture
+def real() -> Iterator[LockTable]:
+    """A lock table whose leases end on the clock of this computer."""
+    timers = Scheduler("trade-timers")
+    table = LockTable(EPOCH, "home", timers)
+    yield table
+    table.close()
+    timers.close()
+
+
+def test_S12_a_lease_ends_in_its_time_although_other_timers_block() -> None:
+    timers, may_end = Scheduler("trade-timers"), threading.Event()
+
+    def wait() -> None:
+        assert may_end.wait(60)
+
+    table = LockTable(EPOCH, "home", timers)
+    table.adopt("a")
+    for _ in range(10):
+        timers.begin(wait, 0)
+    table.acquire(["a"], Holder("tester", "one", "one", "", 0.0), LockRequest(lease_s=0.1))
+    wait_until(lambda: table.infos() == [])
+    assert not may_end.is_set()
+    may_end.set()
+    table.close()
+    timers.close()
+
+
+def test_S12_a_container_has_a_fixed_number_of_timers_so_that_none_waits_for_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each that blocks has a thread of its own: there are fewer of them than a scheduler may have threads."""
+    timers, due = list[Callback](), Scheduler.due
+
+    def count(scheduler: Scheduler, act: Callback) -> ScheduledTask:
+        if scheduler._name == "trade-timers":
+            timers.append(act)
+        return due(scheduler, act)
+
+    monkeypatch.setattr(Scheduler, "due", count)
+    with memory_system() as system:
+        here, there = system.container("here"), system.container("there")
+        begun = len(timers)
+        for group in ("one", "two", "three"):
+            there.register(Lamp(), group)
+            dim = found(here, group)
+            with here.lock([dim]):
+                dim.start(0.5).result(60)
+    assert len(timers) == begun
+    assert begun < MOST_THREADS
+
+
+def test_a_lease_ends_without_a_question(real: LockTable) -> None:
     real.adopt("a")
     real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), LockRequest(lease_s=0.1))
     wait_until(lambda: real.infos() == [])
-    real.close()
 
 
-def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends() -> None:
-    real = LockTable(EPOCH, "home")
+def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends(real: LockTable) -> None:
     for name in "ab":
         real.adopt(name)
     holder = Holder("tester", "one", "one", "", 0.0)
@@ -132,7 +184,6 @@ def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longe
     wait_until(lambda: real._leases.next_ns < math.inf)
     real.acquire(["b"], holder, LockRequest(lease_s=0.1))
     wait_until(lambda: [info.resources for info in real.infos()] == [("a",)])
-    real.close()
 
 
 def test_leases_continue_to_end_after_a_stop_that_raised(table: Table) -> None:
@@ -295,8 +346,8 @@ def test_why_grants_ended_is_known_of_the_last_few_and_never_of_more(table: Tabl
     for _ in range(300):
         numbers.append(table.take("a").number)
         table.table.release(numbers[-1], "tester")
-    assert table.table.over(numbers[-1]) == "it was given back"
-    assert table.table.over(numbers[0]) == "it ended long ago"
+    assert table.table.why_ended(numbers[-1]) == "it was given back"
+    assert table.table.why_ended(numbers[0]) == "it ended long ago"
 
 
 def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(table: Table) -> None:

@@ -316,8 +316,7 @@ def held(container: Container) -> Iterator[None]:
     """While this lasts a container sends no query: whatever it misses comes together."""
     asker, unlocked = container._parts.watch._asker, threading.Event()
     asker._beat, asker._next_beat = lambda: unlocked.wait(20), 0.0
-    with asker._changed:
-        asker._changed.notify_all()
+    asker._remind()
     try:
         yield
     finally:

@@ -26,14 +26,14 @@ def offered(scene: Scene) -> list[str]:
 
 def in_between(scene: Scene, fault: object) -> None:
     """Do something when it has been withdrawn and is not offered yet."""
-    take_off = scene.old._parts.withdrawn.take_off
+    take_off = scene.old._parts.withdrawn_providers.take_off
 
     def and_then(*args: str, **options: str) -> str:
         name = take_off(*args, **options)
         fault()
         return name
 
-    scene.old._parts.withdrawn.take_off = and_then
+    scene.old._parts.withdrawn_providers.take_off = and_then
 
 
 def cut_calls(scene: Scene, *, source: str) -> None:

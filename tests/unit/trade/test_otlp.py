@@ -63,7 +63,7 @@ def walk(start_container: Start) -> Callable[[float], list[ReadableSpan]]:
     mind.register(Mind(mind), "rosie.mind")
     for container in (user, mind, leg):
         export = Export(SimpleSpanProcessor(exporter), {"service.name": container.name})
-        container._parts.spans._tell = export.tell
+        container._parts.spans._on_span = export.tell
 
     def walked(far_m: float) -> list[ReadableSpan]:
         call = user.find(where(name="walk"), wait_s=30)
@@ -207,7 +207,7 @@ def test_calls_continue_and_containers_end_without_a_collector(
 def test_without_a_url_nothing_is_loaded_and_nothing_is_sent(start_container: Start) -> None:
     container = start_container("quiet")
     container.set_tracing(True, container="quiet")
-    assert container._parts.spans._tell is None
+    assert container._parts.spans._on_span is None
 
 
 def test_what_is_not_installed_is_named_with_how_to(system: str, monkeypatch: pytest.MonkeyPatch) -> None:

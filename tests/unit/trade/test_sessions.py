@@ -97,8 +97,8 @@ def test_S03_a_client_that_could_not_be_reached_moves_again_when_it_can_and_one_
     with one.use():
         go(2.0)
     home = robot.system.container("a")._parts.locks
-    assert home.gone([one.name]) is None
-    assert home.gone([two.name]) is not None
+    assert home.session_error([one.name]) is None
+    assert home.session_error([two.name]) is not None
 
 
 def test_S03_of_two_clients_of_one_program_one_stops_the_other_only_for_a_reason(robot: Robot) -> None:
@@ -233,7 +233,7 @@ def test_S05_a_call_that_is_being_admitted_is_not_of_the_session_that_moved_last
         during.extend(joint.sessions for joint in joints if joint.busy)
 
     for joint in joints:
-        joint.gone = look
+        joint.session_error = look
     admit(joints, 2, "tester", (), ("new",), None)
     assert during
     assert set().union(*during) == {"new"}

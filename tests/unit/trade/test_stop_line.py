@@ -21,7 +21,7 @@ from trade._protocol.messages import Malformed
 from trade._transport.endpoints import Endpoint
 from trade._transport.host_socket import listen_on_host
 from trade.stop_line import StopLines, StopReport
-from trade.stop_line.group_stop import together
+from trade.stop_line.group_stop import merge_reports
 from trade.stop_line.listener import MOST_STRANGERS
 from trade.stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
 from trade.stop_line.places import Place, line_port, places
@@ -316,7 +316,7 @@ def test_a_container_that_failed_for_one_has_not_confirmed() -> None:
 
 def test_what_one_container_stopped_counts_as_stopped() -> None:
     reports = [StopReport("a", ("a.stop",)), StopReport("a", (), {"a.stop": "ServiceGone", "b.stop": "stuck"})]
-    assert together("a", reports) == StopReport("a", ("a.stop",), {"b.stop": "stuck"})
+    assert merge_reports("a", reports) == StopReport("a", ("a.stop",), {"b.stop": "stuck"})
 
 
 # --- strangers
@@ -420,7 +420,7 @@ def test_a_place_that_accepts_and_does_not_answer_is_waited_for(
         asked = lines(driver).estop("abc", "", 1.5)
         assert asked.wait_enough().complete  # what is confirmed, is confirmed
         assert not asked.is_enough()
-        assert asked.over() or asked.wait().complete
+        assert asked.is_done() or asked.wait().complete
         assert dead.name not in asked.unreached()
 
 

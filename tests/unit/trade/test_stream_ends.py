@@ -313,9 +313,9 @@ def test_a_listener_that_does_not_renew_is_dropped(here: Container) -> None:
     local = here._parts.providers.service(count.key)
     source = Source(count.key, lambda _: local, here._parts.transport, itertools.count(1).__next__)
     now = time.monotonic_ns()
-    source.wish(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now + 10**12))
+    source.request(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now + 10**12))
     assert source.tick() is not None
-    source.wish(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now))
+    source.request(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now))
     assert source.tick() is None
     assert battery.asked == 1
 

@@ -202,10 +202,10 @@ def test_the_number_of_rates_of_a_source_is_limited(apart: Two) -> None:
         apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__
     )
     for rate in range(64):
-        source.wish(("session", f"{rate}"), RateRequest("tester", rate + 1, on_change=False))
+        source.request(("session", f"{rate}"), RateRequest("tester", rate + 1, on_change=False))
     with pytest.raises(ConfigurationError, match="64 different rates"):
-        source.wish(("session", "another"), RateRequest("tester", 0.5, on_change=False))
-    source.wish(("session", "the same"), RateRequest("tester", 1, on_change=False))
+        source.request(("session", "another"), RateRequest("tester", 0.5, on_change=False))
+    source.request(("session", "the same"), RateRequest("tester", 1, on_change=False))
 
 
 def test_on_change_only_what_differs_is_given_and_the_first_at_once(two: Two) -> None:

@@ -22,8 +22,9 @@ from tests.support.certificates import Papers
 from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container, Settings, service, where
-from trade._security import certificates
+from trade._container import certificate_end
 from trade._security.certificates import Certificate
+from trade._threads.scheduler import Scheduler
 from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import AccessDenied, CannotConnect, ConfigurationError, ContainerLost, NoSuchService
@@ -271,7 +272,7 @@ def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it listens with the one it was started with, a renewed one in its folder does not help."""
-    monkeypatch.setattr(certificates, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificate_end, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
     with caplog.at_level(logging.WARNING, "trade"):
         for name, hours in (("arm", 22), ("leg", 23)):
             start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
@@ -284,13 +285,14 @@ def test_a_running_container_is_warned_in_time_before_its_certificate_ends(
 def test_the_end_of_a_certificate_is_reported_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certificates, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificate_end, "_WARN_AHEAD", (timedelta(hours=22), timedelta(hours=21)))
     until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
     with caplog.at_level(logging.WARNING, "trade"):
-        ending = certificates.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until))
+        timers = Scheduler("trade-timers")
+        certificate_end.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until), timers)
         assert said_of_the_end(caplog, "arm") == 1
         wait_until(lambda: said_of_the_end(caplog, "arm") == 2, "once more")
-        ending.close()
+        timers.close()
 
 
 def said_of_the_end(caplog: pytest.LogCaptureFixture, name: str) -> int:

@@ -9,12 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from trade._transport.base import Answer, ChannelClosed, Message
+from trade._transport.base import Answer, ChannelClosed, Message, Question
 from trade._transport.memory.clock import Clock
 from trade._transport.memory.keys import meet
 from trade._transport.memory.links import Delay, Kind, Link, Way
-from trade._transport.memory.node import Node
-from trade._transport.memory.questions import MemoryQuestion
+from trade._transport.memory.node import MemoryQuestions, Node
 from trade._transport.memory.traffic import Arrive, Traffic
 from trade._transport.memory.wait_clock import MovedWaitClock
 
@@ -199,7 +198,7 @@ class Network:
         with self.lock:
             _check_open(source)
             questions = [
-                MemoryQuestion(self, source, target, pattern, asked)
+                _Query(self, source, target, pattern, asked)
                 for target in self._others(source)
                 for asked in target.asked
                 if meet(pattern, asked.pattern)
@@ -239,7 +238,7 @@ class Network:
 
         arrived() if at_once else link.ways[source].send(kind, arrived)
 
-    def tap(self, hear: Tap) -> Callable[[], None]:
+    def tap(self, callback: Tap) -> Callable[[], None]:
         """Show a function every message between two transports, before it is sent and after it has arrived.
 
         The function runs under the network's lock, on the thread that sends or moves the time: it may kill, partition
@@ -248,8 +247,8 @@ class Network:
         Returns:
             A function that removes the tap.
         """
-        self._taps.append(hear)
-        return lambda: self._taps.remove(hear)
+        self._taps.append(callback)
+        return lambda: self._taps.remove(callback)
 
     def lose(self, which: Callable[[InFlightMessage], bool]) -> Callable[[], None]:
         """Drop selected messages in flight; both ends stay linked.
@@ -329,6 +328,51 @@ class Network:
             target = link.far_end(source)
             for token, key in list(source.tokens.items()):
                 self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+
+
+class _Query(Question):
+    """One query to one node."""
+
+    def __init__(self, network: Network, source: Node, target: Node, pattern: str, queryable: MemoryQuestions) -> None:
+        self.collected = Answer(f"{target.name}-{network.next_number()}", [])
+        self._network = network
+        self._source = source
+        self._target = target
+        self._pattern = pattern
+        self._queryable = queryable
+        self._closed = False
+
+    def send(self) -> None:
+        """Send the query. Used under the network's lock."""
+        message = Message(self._pattern, None)
+        self._network.pass_on(
+            Kind.ASK, self._source, self._target, message, lambda: self._queryable.take(self), at_once=True
+        )
+
+    @property
+    def ended(self) -> bool:
+        """Whether no more replies will come; used under the network's lock."""
+        return self._closed or not self._network.linked(self._source, self._target)
+
+    def answer(self, key: str, payload: bytes) -> None:
+        with self._network.lock:
+            if self.ended:
+                raise ChannelClosed
+            if meet(self._pattern, key):
+                message = Message(key, payload)
+                self._network.pass_on(
+                    Kind.ANSWER,
+                    self._target,
+                    self._source,
+                    message,
+                    lambda: self.collected.messages.append(message),
+                    at_once=True,
+                )
+
+    def close(self) -> None:
+        with self._network.lock:
+            self._closed = True
+            self._network.changed.notify_all()
 
 
 def _check_open(node: Node) -> None:

@@ -28,6 +28,7 @@ from trade.testing.virtual._scheduler import Scheduler, VirtualTimeError
 
 PACKAGES: Final = (
     "trade",
+    "trade_checks",
     "trade_drivers",
     "trade_gateway",
     "trade_hil_sim",

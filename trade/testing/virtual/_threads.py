@@ -37,6 +37,7 @@ class Lock:
 
     def release(self) -> None:
         if self._owner is None:
+            self._scheduler.current()  # this ends a thread that lost the lock because virtual time is over
             raise RuntimeError("release unlocked lock")
         self._owner = None
         if self._waiting:

@@ -22,7 +22,7 @@ from trade_drivers.bus.can._sniffer import Talk
 from trade_drivers.bus.can._socketcand import ServerBus
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus
 
 _log = logging.getLogger("trade")
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of each split frame
@@ -147,7 +147,7 @@ class CanPort:
         if self.state is not ErrorState.BUS_OFF:  # only a frame or the system shows the end of bus-off
             self.state = ErrorState.ACTIVE
         if self._interface == "socketcan":
-            self._look_over()
+            self._verify_interface()
         with losing(*_TROUBLE):
             try:
                 if self._interface == "socketcand":
@@ -170,7 +170,7 @@ class CanPort:
             problem = f"{self.path}: another driver commands the devices of this bus (it sends {ids}); stop it first"
             raise self._wrong("channel", problem)
 
-    def _look_over(self) -> None:
+    def _verify_interface(self) -> None:
         """Checks the state of the interface in the system.
 
         Raises:

@@ -5,7 +5,7 @@ from math import isfinite, tau
 from typing import Final
 
 from trade_drivers.joints import Axis, Resolution, Sample, Unfit
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 STILL_RAD_S: Final = 0.01
 """The maximum speed at rest."""
@@ -38,7 +38,19 @@ class Another(Unfit):
         self.expected, self.found = expected, found
 
 
-def check_zero_known(axis: "MotorAxis") -> None:
+def check_keys(axis: "MotorAxis", kind: str, unit: str) -> None:
+    """Raises ``Unfit`` for keys that such motors do not have, and for a zero that is not known."""
+    joint = axis.joint
+    if joint.counts_per_rev is not None:
+        raise Unfit(f"{kind} reports {unit}, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
+    if joint.serial_number is not None:
+        raise Unfit(f"{kind} reports no serial number here; leave this key out", ".serial_number")
+    _check_zero_known(axis)
+
+
+def _check_zero_known(axis: "MotorAxis") -> None:
     """Raises ``Unfit`` for a range wider than a turn of the motor, if the file does not say how the zero is known."""
     joint, turn_rad = axis.joint, tau / axis.joint.gear
     wide_rad = joint.max_rad - joint.min_rad
@@ -65,9 +77,9 @@ class MotorAxis(Axis):
     """When the open request for a measurement was sent; 0 if there is none."""
     since_ns = 0
     """When the motor was accepted."""
-    stranger = False
-    """True directly after it was accepted, when it may be moving."""
-    hushed = False
+    unowned = False
+    """True directly after it was accepted, when it may be moving by no client's order."""
+    unfed = False
     """True while the driver sends it nothing, to test its watchdog."""
 
     @property
@@ -85,7 +97,7 @@ class MotorAxis(Axis):
         Its time is that of the request, not of the arrival, as a frozen process would take old values for new.
         """
         asked_ns, self.asked_ns = self.asked_ns, 0
-        at_ns = now_ns if self.hushed else asked_ns
+        at_ns = now_ns if self.unfed else asked_ns
         values = (position, velocity, effort)
         if not all(isfinite(value) and abs(value) <= _LARGEST for value in values):
             given = ", ".join(f"{value:.6g}" for value in values)
@@ -109,7 +121,7 @@ class MotorAxis(Axis):
         self.tell_moving()
         if not self.silent:
             self.silent, self.silent_since_ns = True, now_ns
-        self.asked_ns, self.hushed = 0, False
+        self.asked_ns, self.unfed = 0, False
 
     def welcome(self, now_ns: int) -> None:
         """Accepts a motor that answers and has passed its checks."""
@@ -117,5 +129,5 @@ class MotorAxis(Axis):
             self.latch("it was away")
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
         self.beat_ns = self.since_ns = now_ns
-        self.asked_ns, self.stranger = 0, True
+        self.asked_ns, self.unowned = 0, True
         self.zero.interrupted()

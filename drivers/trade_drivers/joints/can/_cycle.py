@@ -2,17 +2,18 @@
 
 import logging
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
-from trade_drivers.joints import Exchange, Steps, Unfit
+from trade_drivers.joints import Exchange, Steps, Unfit, next_measurement
 from trade_drivers.joints.can._axis import MotorAxis
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
-    from trade_drivers.robotfile import CanBus
+    from trade_robotfile import CanBus, Joint
 
 _log = logging.getLogger("trade")
 _ANSWER_S: Final = 0.25
@@ -25,24 +26,12 @@ _FIRST: Final = 3
 _Axis = TypeVar("_Axis", bound=MotorAxis)
 
 
-def asked(bus: "MotorExchange[Any]", axis: MotorAxis, frames: Sequence[Frame], there: Callable[[], bool]) -> Steps:
-    """Sends a request and waits for the answer.
-
-    Raises:
-        NoAnswer: no answer arrived in time.
-    """
-    bus.port.send_all(frames)
-    began = time.monotonic()
-    while not there():
-        if bus.net.heard_until(began + _ANSWER_S):
-            raise NoAnswer(axis.id, _ANSWER_S)
-        yield
-
-
 class MotorExchange(Exchange[_Axis]):
     """The exchange with the motors of one CAN bus."""
 
-    deaf_ns: int
+    axis_type: ClassVar[Callable[[str, str, "Joint", float, Sequence[str]], Any]]
+    """Makes the state of a motor: its name, port, table in the robot file, cycles per second, and coupled joints."""
+    silent_after_ns: int
     """A motor without any frame for this time is left out."""
     again_ns: ClassVar[int] = _AGAIN_NS
     """The pause before an offline motor is tried again."""
@@ -55,20 +44,29 @@ class MotorExchange(Exchange[_Axis]):
         self.net = Listeners(port, between=self.serve_stops, meanwhile=self.admit)
         self.problems: dict[_Axis, Exception] = {}
         """Why motors were not accepted at their last check."""
-        self._looks: dict[_Axis, Generator[None, None, None]] = {}
+        self._verifying: dict[_Axis, Generator[None, None, None]] = {}
         self._began_ns = self._listening_ns = self.clock()
         """The start of the last cycle, and the time since which cycles have been on time."""
         for axis in axes:
             axis.forget(self.clock())
             axis.probe_at_ns = self.clock()
 
-    # --- requests, which depend on the kind of motor
+    # --- checks and requests, which depend on the kind of motor
+
+    @staticmethod
+    @abstractmethod
+    def check_bus(bus: "CanBus", axes: Sequence[Any], where: str) -> None:
+        """Checks the robot file: keys, limits, and whether a cycle is long enough for its frames.
+
+        Raises:
+            ConfigurationError: a check failed; names the key and the right value.
+        """
 
     def question(self, axis: _Axis) -> Frame:
         """Returns the request for a measurement, which also feeds the watchdog."""
         raise NotImplementedError
 
-    def look_over(self, axis: _Axis) -> Steps:
+    def verify(self, axis: _Axis) -> Steps:
         """Checks identity and settings of a motor; yields while it waits for answers. Enables and moves nothing.
 
         Raises:
@@ -77,10 +75,28 @@ class MotorExchange(Exchange[_Axis]):
         """
         raise NotImplementedError
 
+    def looking(self, axis: _Axis) -> Steps:
+        """Waits for a measurement that is requested after this call."""
+        self.require_answering(axis)
+        yield from next_measurement(self, axis)
+
+    def request(self, axis: _Axis, frames: Sequence[Frame], answered: Callable[[], bool]) -> Steps:
+        """Sends a request and waits for the answer.
+
+        Raises:
+            NoAnswer: no answer arrived in time.
+        """
+        self.port.send_all(frames)
+        began = time.monotonic()
+        while not answered():
+            if self.net.heard_until(began + _ANSWER_S):
+                raise NoAnswer(axis.id, _ANSWER_S)
+            yield
+
     def look_after(self, axis: _Axis) -> None:
         """Runs further requests and checks of a motor once per cycle."""
 
-    def opened(self) -> None:
+    def on_open(self) -> None:
         """Called after the port was first opened and had listened for other drivers."""
 
     # --- from the bus thread
@@ -112,7 +128,7 @@ class MotorExchange(Exchange[_Axis]):
 
     def measure(self, began_ns: int) -> None:
         """Requests a measurement from each motor, and processes the answers."""
-        here = [axis for axis in self.devices if not axis.silent and not axis.hushed]
+        here = [axis for axis in self.devices if not axis.silent and not axis.unfed]
         for axis in here:
             axis.asked_ns = began_ns
         if here:
@@ -127,8 +143,8 @@ class MotorExchange(Exchange[_Axis]):
         if now_ns - self._listening_ns <= self.stale_after_ns:
             return  # on a busy host, this thread itself was late
         for axis in self.devices:
-            old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
-            if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
+            old = not axis.unfed and axis.age_ns(now_ns) > self.stale_after_ns
+            if not axis.silent and (old or now_ns - axis.beat_ns > self.silent_after_ns):
                 axis.why_silent = self.why_silent() or axis.why_silent
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + self.again_ns
@@ -139,8 +155,8 @@ class MotorExchange(Exchange[_Axis]):
         A subclass that detects such motion elsewhere may override this method for other work, once per cycle.
         """
         for axis in self.devices:
-            if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
-                axis.stranger = False
+            if axis.unowned and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
+                axis.unowned = False
                 if axis.motion is None and axis.still == 0 and axis.may_hold_torque:
                     self.hold([axis], now_ns)
 
@@ -150,12 +166,12 @@ class MotorExchange(Exchange[_Axis]):
             return
         for axis in self.devices:
             if axis.silent and self.clock() >= axis.probe_at_ns and not self.worked_on(axis):
-                self._look(axis)
+                self._verify(axis)
 
-    def _look(self, axis: _Axis) -> None:
-        look = self._looks.setdefault(axis, self.look_over(axis))
+    def _verify(self, axis: _Axis) -> None:
+        steps = self._verifying.setdefault(axis, self.verify(axis))
         try:
-            next(look)
+            next(steps)
         except StopIteration:
             _log.info("%s answers on %s", axis.name, axis.bus)
             axis.welcome(self.clock())
@@ -167,11 +183,11 @@ class MotorExchange(Exchange[_Axis]):
             axis.probe_at_ns = self.clock() + _AGAIN_NS
         else:
             return
-        del self._looks[axis]
+        del self._verifying[axis]
 
     def forget_measurements(self) -> None:
         now_ns = self.clock()
-        self._looks.clear()
+        self._verifying.clear()
         for axis in self.devices:
             axis.forget(now_ns)
             axis.probe_at_ns = now_ns

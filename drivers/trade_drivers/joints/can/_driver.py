@@ -1,8 +1,8 @@
-"""The base class of drivers for motors on a CAN bus."""
+"""The base classes of drivers for motors on a CAN bus, and of scans for such motors."""
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
@@ -11,13 +11,15 @@ from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers._validation import not_installed
 from trade_drivers.bus._can_monitor import CanMonitor
 from trade_drivers.bus._jobs import NoAnswer
-from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
+from trade_drivers.commissioning._commissioner import Bench, Commissioner
+from trade_drivers.joints import AttachedJoints, BusMotor, BusThread, PortLost, Unfit, start_thread
 from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
-from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
+from trade_robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort, Talk
+    from trade_drivers.commissioning._can_scan import CanBench
     from trade_drivers.joints.can._cycle import MotorExchange
 
 _PATIENCE_S: Final = 1.0
@@ -25,9 +27,28 @@ _PATIENCE_S: Final = 1.0
 _FIRST_CYCLES: Final = 5
 """The number of measurements needed to detect motion."""
 
-
 _Motor = TypeVar("_Motor", bound=MotorAxis)
 _Exchange = TypeVar("_Exchange", bound="MotorExchange[Any]")
+
+
+class CanMotorCommissioner(Commissioner):
+    """Motors on a CAN bus, given as ``INTERFACE:CHANNEL``; only the vendor's tool can set their ids."""
+
+    wire = "can"
+    bauds = (1_000_000,)
+    """The system sets the rate of an interface; frames at another rate would disturb the bus."""
+    libraries: ClassVar[str] = "python-can"
+    ports = "is the interface up? `ip link show type can` lists the interfaces"
+
+    @abstractmethod
+    def bench(self) -> "type[CanBench]":
+        """Returns the class of its bench; raises ImportError if a library is missing."""
+
+    def open(self, port: str, baud: int) -> Bench:
+        try:
+            return self.bench().open(port, baud)
+        except ImportError as missing:
+            raise not_installed(self.driver, self.libraries, missing) from None
 
 
 class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
@@ -41,8 +62,8 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
     libraries: ClassVar[str] = "python-can"
 
     @abstractmethod
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> _Exchange:
-        """Checks the file and returns an exchange with a closed port. Raises ``ConfigurationError``."""
+    def exchange_type(self) -> type[_Exchange]:
+        """Returns the class of its exchange, imported now, as its libraries are optional."""
 
     @staticmethod
     @abstractmethod
@@ -83,9 +104,15 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
 
             where = f"{robot.where}: bus.{bus.name}"
             wire = CanPort.of(port, bus, where, partial(self.orders, nodes=nodes))
-            return self.exchange(robot, bus, wire, port)
+            kind = self.exchange_type()
         except ImportError as missing:
             raise not_installed(self.name, self.libraries, missing) from None
+        axes = [
+            kind.axis_type(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
+            for joint in robot.joints_on(bus.name)
+        ]
+        kind.check_bus(bus, axes, robot.where)
+        return kind(wire, bus, axes)
 
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
@@ -106,7 +133,7 @@ class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
             undo.callback(wire.close)
             try:
                 wire.open()
-                exchange.opened()
+                exchange.on_open()
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
                 raise DeviceAbsent(where=f"{where}.channel", problem=f"{port}: {lost}") from None
@@ -166,11 +193,17 @@ class AttachedMotors(AttachedJoints):
         return CanMonitor(partial(self._port.look, name))
 
 
-def axes_of(
-    kind: Callable[[str, str, Joint, float, Sequence[str]], AxisT], robot: Robot, bus: CanBus, port: str
-) -> list[AxisT]:
-    """Returns the axes of a bus from the robot file."""
-    return [
-        kind(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
-        for joint in robot.joints_on(bus.name)
-    ]
+def check_load(bus: CanBus, where: str, devices: str, cycle_bits: float, other_bits: int = 0) -> None:
+    """Raises ``ConfigurationError`` for a rate whose cycles, of so many bits, leave no room on the bus.
+
+    Args:
+        bus: the bus in the robot file.
+        where: the robot file.
+        devices: their number and name.
+        cycle_bits: bits of one cycle.
+        other_bits: bits per second that the devices send by themselves.
+    """
+    if cycle_bits * bus.rate_hz > bus.bitrate - other_bits:
+        most_hz = max(0, bus.bitrate - other_bits) / cycle_bits
+        problem = f"{devices} at {bus.bitrate} bit/s: at most {most_hz:.0f} Hz"
+        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)

@@ -4,8 +4,8 @@ It is independent of a vendor's registers and packets. Only ``_wire`` needs pyse
 """
 
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused, WireError
-from trade_drivers.joints.serial._asking import as_set, health_of, tried, written
 from trade_drivers.joints.serial._axis import Answer, Health, ServoAxis
+from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.joints.serial._driver import ServoDriver
 from trade_drivers.joints.serial._inspect import Kept, check_cycle, check_own_range, check_ranges, first_look
@@ -18,15 +18,12 @@ __all__ = [
     "NoAnswer",
     "Refused",
     "ServoAxis",
+    "ServoBench",
     "ServoDriver",
     "ServoExchange",
     "WireError",
-    "as_set",
     "check_cycle",
     "check_own_range",
     "check_ranges",
     "first_look",
-    "health_of",
-    "tried",
-    "written",
 ]

@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Axis, Goal, Resolution, Sample
-from trade_drivers.robotfile import Joint
+from trade_robotfile import Joint
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
@@ -144,7 +144,7 @@ class ServoAxis(Axis, Generic[_Health]):
         """
         self.check_zero(position)
         if problem := self.outside(position):
-            raise self.faulty(f"{problem}; turn it back by hand with its torque off, or widen that register")
+            raise self.fault_error(f"{problem}; turn it back by hand with its torque off, or widen that register")
         return Goal(self.own_goal(position), self.accel_counts, self.speed_counts)
 
     def brake(self, position: int) -> Goal:
@@ -172,7 +172,7 @@ class ServoAxis(Axis, Generic[_Health]):
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample, health = self.fresh(now_ns, stale_after_ns), self.health
         if health is None or now_ns - health.at_ns > _HEALTH_STALE_NS:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         return self.measured(
             sample,
             now_ns,

@@ -2,18 +2,19 @@
 
 import logging
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade_drivers.bus._attempts import attempts
 from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus._jobs import NoAnswer, Refused
-from trade_drivers.joints import Exchange, Motion, Steps
-from trade_drivers.joints.serial._axis import ServoAxis
+from trade_drivers.joints import Exchange, Motion, Steps, Work
+from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_drivers.robotfile import SerialBus
+    from trade_robotfile import SerialBus
 
 _log = logging.getLogger("trade")
 _HEALTH_NS: Final = 500_000_000
@@ -23,6 +24,8 @@ _CHUNK_S: Final = 0.014
 """The maximum duration of one sync read; larger groups are split, so that a stop can be sent in between."""
 
 
+_Result = TypeVar("_Result")
+_Health = TypeVar("_Health", bound=Health)
 _Servo = TypeVar("_Servo", bound=ServoAxis[Any])
 _Wire_co = TypeVar("_Wire_co", bound="ServoWire", covariant=True)
 
@@ -97,6 +100,61 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             self.idle(_WAIT_S)
             yield
 
+    # --- exchanges of jobs, as steps, within a retry budget
+
+    def looking(self, axis: _Servo) -> Steps:
+        yield from self.read_health(axis)
+
+    def read_health(self, axis: ServoAxis[_Health]) -> Generator[None, None, _Health]:
+        """Reads the servo's health now."""
+
+        def read() -> _Health:
+            asked_ns = self.clock()
+            return axis.take_health(self.wire.read(axis.id, *axis.slow).data, asked_ns)
+
+        return (yield from self.retry(axis, read))
+
+    def write_register(self, job: Work[_Servo], axis: _Servo, register: Register, value: int) -> Steps:
+        """Writes a register and waits for the confirmation."""
+        data = register.encode(value)
+        yield from self.retry(axis, lambda: self.wire.write(axis.id, register.address, data, job.gate))
+
+    def verify_settings(self, axis: _Servo) -> Steps:
+        """Compares a servo with the robot file again, as it may have lost settings or have been replaced.
+
+        Raises:
+            DeviceFault: its zero has moved, it is set otherwise, or it cannot hold where it is.
+        """
+        answer = yield from self.retry(axis, lambda: self.wire.read(axis.id, *axis.settings))
+        if problem := self.misfit(axis, answer.data):
+            raise axis.fault_error(problem)
+        if axis.sample is not None:
+            axis.seed(axis.sample.position)
+
+    def retry(self, axis: ServoAxis[Any], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
+        """Runs one exchange within the retry budget; a ping before each retry discards late answers."""
+        asked, began_ns = False, self.clock()
+        for _ in attempts(self.clock, self.stale_after_ns):
+            try:
+                if asked:
+                    self.wire.ping(axis.id)
+                    yield
+                result = act()
+            except DeadlineExceeded as late:
+                if asked:  # an earlier attempt was sent, and its outcome is unknown
+                    raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
+                raise
+            except NoAnswer:
+                asked = axis.doubted = True
+                yield
+            except Refused as refused:
+                raise axis.fault_error(f"it refused a command: {refused}") from None
+            else:
+                yield
+                return result
+        waited_s = (self.clock() - began_ns) / 1e9
+        raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s, reason=self.why_silent())
+
     # --- from the bus thread
 
     def cycle(self) -> None:
@@ -110,7 +168,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
         self._recover()
         self.work(began_ns + self.period_ns // 2)
         self.watch()
-        self._read_health()
+        self._read_due_health()
 
     def readmit(self, axis: _Servo) -> None:
         """Checks model and health of a joint that was offline or missed an exchange, and settings after the former.
@@ -194,7 +252,7 @@ class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
             if axis.silent:
                 axis.probe_at_ns = self.clock() + PROBE_NS
 
-    def _read_health(self) -> None:
+    def _read_due_health(self) -> None:
         now_ns = self.clock()
         due = [axis for axis in self.devices if axis.health_due_ns <= now_ns and not axis.silent and not axis.doubted]
         if due:

@@ -1,6 +1,5 @@
 """The base class of drivers for servos on a serial bus."""
 
-import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
@@ -12,8 +11,9 @@ from trade_drivers.joints import AttachedJoints, start_thread
 from trade_drivers.joints.serial._axis import ServoAxis
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
+from trade_drivers.joints.serial._inspect import Kept, first_look
 from trade_drivers.plugins._driver import AttachedBus, Driver
-from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
+from trade_robotfile import Bus, Gripper, Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
@@ -31,14 +31,29 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
     """Supported models by the name printed on them."""
     bauds: ClassVar[Collection[int]]
     """Supported baud rates."""
+    kept: ClassVar[Kept]
+    """The layout of their persistent registers."""
 
     @abstractmethod
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange[_Servo, _Wire]:
         """Checks the file and returns an exchange with a closed port. Raises ``ConfigurationError``."""
 
-    @abstractmethod
-    def look_over(self, wire: _Wire, bus: SerialBus, axis: _Servo, clock_ns: Callable[[], int], where: str) -> None:
-        """Checks one joint's device and takes its first measurements. Raises ``ConfigurationError``."""
+    def verify(
+        self, exchange: ServoExchange[_Servo, _Wire], wire: _Wire, bus: SerialBus, axis: _Servo, where: str
+    ) -> bytes:
+        """Checks one joint's device and takes its first measurements. Moves and resets nothing.
+
+        Returns:
+            The bytes of its persistent registers, from address 0.
+
+        Raises:
+            ConfigurationError: the device is absent, another model, set wrongly, or shares its id.
+            NoAnswer: the device answers a ping, but no read.
+        """
+        key = f'{where}: joint."{axis.joint.name}"'
+        settings = first_look(wire, bus, axis, self.kept, exchange.clock, key)
+        exchange.check_settings(axis, settings, key)
+        return settings
 
     def check(self, robot: Robot, bus: Bus) -> None:
         serial = self._serial(robot, bus)
@@ -46,8 +61,9 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
 
     def fits(self, bench: Bench, robot: Robot, bus: Bus, device: Joint | Gripper) -> None:
         serial, wire = self._serial(robot, bus), cast("ServoBench[_Wire]", bench).wire
-        [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).devices
-        self.look_over(wire, serial, axis, time.monotonic_ns, robot.where)
+        exchange = self.exchange(robot, serial, serial.port, [cast("Joint", device)])
+        [axis] = exchange.devices
+        self.verify(exchange, wire, serial, axis, robot.where)
         if problem := axis.unheld:
             raise ConfigurationError(where=f'{robot.where}: joint."{axis.joint.name}"', problem=problem)
 
@@ -64,7 +80,7 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
         exchange = self.exchange(robot, bus, port, self._known(robot, bus))
         with opening(exchange.wire, port, f"{robot.where}: bus.{bus.name}"):
             for axis in exchange.devices:
-                self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
+                self.verify(exchange, exchange.wire, bus, axis, robot.where)
             for axis in exchange.devices:
                 exchange.admit(axis)
             exchange.cycle()

@@ -8,12 +8,11 @@ from trade.errors import ConfigurationError, DeviceAbsent, WrongDevice
 from trade_drivers.bus._attempts import ATTEMPTS, attempts
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Unfit, check_least, check_rate
-from trade_drivers.joints.serial._asking import check_homing
 from trade_drivers.joints.serial._axis import ServoAxis
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
-    from trade_drivers.robotfile import SerialBus
+    from trade_robotfile import SerialBus
 
 _Result = TypeVar("_Result")
 
@@ -137,6 +136,13 @@ def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
     expected = axis.joint.firmware
     if expected is not None and firmware != expected:
         raise WrongDevice(where=key, key="firmware", expected=expected, found=firmware)
+
+
+def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
+    """Raises ``WrongDevice`` for a servo with another zero; ``settings`` are its registers from address 0."""
+    if problem := axis.zero_moved(settings):
+        expected, found = str(axis.joint.homing_counts), str(axis.homing.decode(settings))
+        raise WrongDevice(where=key, key="homing_counts", expected=expected, found=found, problem=problem)
 
 
 def first_look(

@@ -1,20 +1,22 @@
-"""The state of one drive on the bus thread: its last frames, and faults that forbid motion."""
+"""The state of one drive on the bus thread: its last frames, faults that forbid motion, and its cyclic set-points.
+
+No I/O.
+"""
 
 from collections.abc import Sequence
 from enum import Enum, auto
+from math import copysign, sqrt
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
 from typing import Final
 
 from trade.errors import DeviceError
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Sample
+from trade_drivers.joints import Ramp, Sample, towards
 from trade_drivers.joints.can import MotorAxis, resolution_of
-from trade_drivers.robotfile import Joint
-from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._machine import State, state_of
-from trade_drivers.vendors.cia402._net import emergency_text
-from trade_drivers.vendors.cia402._stream import Following, Turning
+from trade_drivers.vendors.cia402._table import State, state_of
+from trade_drivers.vendors.cia402._wire import emergency_text
+from trade_robotfile import Joint
 
 _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
@@ -23,11 +25,81 @@ _ACKNOWLEDGE_NS: Final = 250_000_000
 """The time allowed for a drive to accept a set-point."""
 
 
+class Following(Ramp):
+    """Cyclic synchronous position: each position is reached one period after the SYNC that activates it."""
+
+    def __init__(self, node: int, position: int, *, speed: float, accel: float, period_s: float) -> None:
+        super().__init__(position, fastest=speed, accel=accel, braking=accel / 2)
+        self.can_id = table.FOLLOWING.base + node
+        self._period_s = period_s
+
+    def next(self, sample: Sample, now_ns: int) -> bytes:  # noqa: ARG002 - that is the drive's own business in this mode
+        """Returns the frame data for the next period."""
+        self.step(self._period_s)
+        return table.FOLLOWING.layout.pack(self.target)
+
+    @property
+    def target(self) -> int:
+        """The last set-point."""
+        return round(self.position)
+
+
+class Turning:
+    """Cyclic synchronous velocity, or profile velocity with ramps of the same steepness.
+
+    The velocity is 0 until the end and the speed are set. It slows down early enough for the drive to stop within the
+    range even if the driver's frames stop, which the drive notices after ``blind_s``. Without a new measurement, it
+    assumes that the joint follows the commanded velocity.
+
+    The drive's own units of speed and acceleration are so many counts/s and counts/s^2 of its positions.
+    """
+
+    def __init__(
+        self,
+        node: int,
+        *,
+        accel: int,
+        period_s: float,
+        blind_s: float,
+        speed_unit: float = 1.0,
+        accel_unit: float = 1.0,
+    ) -> None:
+        self.can_id = table.TURNING.base + node
+        self.end: int | None = None
+        """The end of its motion, in counts."""
+        self.fastest = 0.0
+        """Speed in the drive's own unit, without a sign."""
+        self._speed = 0.0
+        self._ramp, self._accel, self._speed_unit = accel, accel * accel_unit, speed_unit
+        self._period_s, self._blind_s = period_s, blind_s
+        self._measured_ns = self._sent_ns = 0
+        self._travelled = 0.0
+        """Expected motion since the last measurement, in counts."""
+
+    def next(self, sample: Sample, now_ns: int) -> bytes:
+        """Returns the frame data for the next period, from the newest measurement."""
+        if sample.at_ns == self._measured_ns:
+            self._travelled += self._speed * (now_ns - self._sent_ns) / 1e9
+        else:
+            self._travelled = self._speed * (now_ns - sample.at_ns) / 1e9
+        self._measured_ns, self._sent_ns = sample.at_ns, now_ns
+        wanted = 0.0 if self.end is None else self._allowed(self.end - sample.position - self._travelled)
+        self._speed = towards(self._speed, wanted, self._accel * self._period_s)
+        speed = int(round(self._speed / self._speed_unit, 6))  # never faster than allowed
+        return table.TURNING.layout.pack(self._ramp, speed)
+
+    def _allowed(self, left: float) -> float:
+        blind = self._accel * self._blind_s
+        return copysign(
+            min(self.fastest * self._speed_unit, sqrt(blind * blind + 2 * self._accel * abs(left)) - blind), left
+        )
+
+
 class Stage(Enum):
     """The stages of a drive's admission to the cycle, described in ``Admission``."""
 
     AWAY = auto()
-    LOOKED_OVER = auto()
+    VERIFYING = auto()
     SET_UP = auto()
     HERE = auto()
 
@@ -133,7 +205,7 @@ class DriveAxis(MotorAxis):
         self.controlword = self.raised_ns = 0
         self.entered, self.stream = 0, None
 
-    def be_awaited(self, now_ns: int) -> None:
+    def await_frames(self, now_ns: int) -> None:
         """Starts the wait for its frames after set-up."""
         if self.ready:
             self.latch("it was away")
@@ -163,7 +235,7 @@ class DriveAxis(MotorAxis):
             self.latch("its torque went off: it lost power, or its protection switched it off")
         elif self.ready and self.raised_ns and now_ns - self.raised_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
             self.latch("it does not take its goal (statusword bit 12)")
-        if self.ready and not self.statusword & machine.REMOTE:
+        if self.ready and not self.statusword & table.REMOTE:
             self.latch("it does not obey the bus (statusword bit 9); is it operated from its panel?")
 
     # --- state
@@ -178,12 +250,12 @@ class DriveAxis(MotorAxis):
     @property
     def acknowledged(self) -> bool:
         """Whether it acknowledges a set-point."""
-        return bool(self.statusword & machine.ACKNOWLEDGED)
+        return bool(self.statusword & table.ACKNOWLEDGED)
 
     @property
     def can_take_goal(self) -> bool:
         """Whether the handshake of the last set-point is over."""
-        return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
+        return not self.controlword & table.NEW_SET_POINT and not self.acknowledged
 
     @property
     def turning_mode(self) -> int:
@@ -216,7 +288,7 @@ class DriveAxis(MotorAxis):
         low, high = self.own_range or (place, place)
         if not low - self.resolution.arrived <= place <= high + self.resolution.arrived:
             end = self.scale.angle_rad(low if place < low else high)
-            raise self.faulty(
+            raise self.fault_error(
                 f"it is at {self.scale.angle_rad(place):.3f} rad, outside its own range, which ends at {end:.3f} rad "
                 "(607Dh): turn it back by hand, or widen 607Dh"
             )
@@ -224,7 +296,7 @@ class DriveAxis(MotorAxis):
     def absence(self, now_ns: int) -> DeviceError:
         """Returns the error for a drive that is left out."""
         why = _STOPPED if self.stopped else self.unfit
-        return self.faulty(why) if why else self.deaf(now_ns)
+        return self.fault_error(why) if why else self.silent_error(now_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample = self.fresh(now_ns, stale_after_ns)

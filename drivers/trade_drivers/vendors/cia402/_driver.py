@@ -4,18 +4,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.joints import BusMotor
-from trade_drivers.joints.can import CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
-from trade_drivers.vendors.cia402._commission import Cia402Commissioner
+from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
 from trade_drivers.vendors.cia402._table import orders
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort
+    from trade_drivers.commissioning._can_scan import CanBench
     from trade_drivers.vendors.cia402._axis import DriveAxis
-    from trade_drivers.vendors.cia402._cycle import DriveExchange
+    from trade_drivers.vendors.cia402._exchange import DriveExchange
 
 _FIRST_CYCLES: Final = 3
 """The number of measurements needed to detect motion."""
+
+
+class Cia402Commissioner(CanMotorCommissioner):
+    """CiA 402 drives on a CAN bus, given as ``INTERFACE:CHANNEL``."""
+
+    driver = "cia402"
+    libraries = "canopen and python-can"
+    ids = range(1, 127)
+
+    def bench(self) -> "type[CanBench]":
+        from trade_drivers.vendors.cia402._scan import DriveBench  # noqa: PLC0415 - the libraries are optional
+
+        return DriveBench
 
 
 class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
@@ -47,17 +58,13 @@ class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
     commissioner = Cia402Commissioner
     orders = staticmethod(orders)
 
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DriveExchange":
-        from trade_drivers.vendors.cia402._axis import DriveAxis  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._cycle import DriveExchange  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._inspect import check_bus  # noqa: PLC0415 - the libraries are optional
+    def exchange_type(self) -> "type[DriveExchange]":
+        from trade_drivers.vendors.cia402._exchange import DriveExchange  # noqa: PLC0415 - the libraries are optional
 
-        axes = axes_of(DriveAxis, robot, bus, port)
-        check_bus(bus, axes, robot.where)
-        return DriveExchange(wire, bus, axes)
+        return DriveExchange
 
     def motor(self) -> type[BusMotor[Any, Any]]:
-        from trade_drivers.vendors.cia402._motor import Drive  # noqa: PLC0415 - the libraries are optional
+        from trade_drivers.vendors.cia402._homing import Drive  # noqa: PLC0415 - the libraries are optional
 
         return Drive
 
@@ -67,7 +74,7 @@ class Cia402Driver(CanMotorDriver["DriveAxis", "DriveExchange"]):
 
     def check_away(self, exchange: "DriveExchange", axis: "DriveAxis", where: str, *, last: bool) -> None:
         from trade_drivers.vendors.cia402._axis import Stage  # noqa: PLC0415
-        from trade_drivers.vendors.cia402._net import NoAnswer, Refused  # noqa: PLC0415 - the libraries are optional
+        from trade_drivers.vendors.cia402._wire import NoAnswer, Refused  # noqa: PLC0415 - the libraries are optional
 
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):

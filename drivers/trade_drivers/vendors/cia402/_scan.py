@@ -9,9 +9,9 @@ from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.joints import Unfit
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402._machine import state_of
-from trade_drivers.vendors.cia402._net import Answer, Net, NoAnswer, Refused
+from trade_drivers.vendors.cia402._table import state_of
 from trade_drivers.vendors.cia402._units import read_scale
+from trade_drivers.vendors.cia402._wire import Answer, Net, NoAnswer, Refused
 
 _AT_ONCE: Final = 8
 """Number of simultaneous requests, as the queues of interfaces are short."""
@@ -20,7 +20,7 @@ _STOPPED: Final = "network management has stopped it, and it answers nothing; a 
 
 
 class DriveBench(CanBench):
-    """One CAN bus."""
+    """One CAN bus with CiA 402 drives."""
 
     driver = "cia402"
     remedy = "its own switches, or by the vendor's tool"
@@ -47,7 +47,7 @@ class DriveBench(CanBench):
         return self._known.pop(device_id)
 
     def _ask(self, nodes: Iterable[int]) -> None:
-        asking = {node: self._looking(node) for node in nodes}
+        asking = {node: self._identify(node) for node in nodes}
         while asking:
             for node, steps in list(asking.items()):
                 try:
@@ -57,7 +57,7 @@ class DriveBench(CanBench):
                     del asking[node]
             self._listeners.take_in(_SLICE_S)
 
-    def _looking(self, node: int) -> Answer[Found | None]:
+    def _identify(self, node: int) -> Answer[Found | None]:
         try:
             kind = (yield from self._net.read(node, table.DEVICE_TYPE)) & 0xFFFF
         except NoAnswer:

@@ -12,8 +12,8 @@ from trade_drivers.joints import Steps, Unfit, check_least
 from trade_drivers.joints.can import STILL_RAD_S
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
-from trade_drivers.vendors.cia402._net import Answer, Net, Refused
 from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.cia402._wire import Answer, Net, Refused
 
 _SAME: Final = 1e-6
 _LARGEST: Final = 2**31 - 1
@@ -85,8 +85,8 @@ def check_units(net: Net, axis: DriveAxis) -> Steps:
     speed = yield from read_optional(net, axis.id, table.VELOCITY_UNIT)
     accel = yield from read_optional(net, axis.id, table.ACCELERATION_UNIT)
     rad = axis.resolution.rad
-    rad_s = rad if speed is None else _converted(axis, scale, table.VELOCITY_UNIT, speed)
-    rad_s2 = rad if accel is None else _converted(axis, scale, table.ACCELERATION_UNIT, accel)
+    rad_s = rad if speed is None else _unit_in_rad(axis, scale, table.VELOCITY_UNIT, speed)
+    rad_s2 = rad if accel is None else _unit_in_rad(axis, scale, table.ACCELERATION_UNIT, accel)
     for missing, unit, other, converted in (
         (table.ACCELERATION_UNIT, accel, table.VELOCITY_UNIT, rad_s),
         (table.VELOCITY_UNIT, speed, table.ACCELERATION_UNIT, rad_s2),
@@ -116,12 +116,12 @@ def read_scale(net: Net, node: int) -> Answer[Scale]:
     if any(rest) or counted not in {_INCREMENT, *_ANGLES}:
         raise _unusable(table.POSITION_UNIT, unit or 0, "an angle")
     if counted != _INCREMENT:
-        return Scale(tau / _ANGLES[counted] / one / gear, _said(f"60A8h = {unit:08X}h", of_gear), gear, 0.0)
+        return Scale(tau / _ANGLES[counted] / one / gear, _join(f"60A8h = {unit:08X}h", of_gear), gear, 0.0)
     if feed is not None:
-        return Scale(feed[0] / one / gear, _said(feed[1], of_gear), gear, 1 / one)
+        return Scale(feed[0] / one / gear, _join(feed[1], of_gear), gear, 1 / one)
     if encoder is not None and not isclose(gear, 1.0):
         raise Unfit(f"its scale is unknown: it has {of_gear} and {encoder[1]}, but no feed (6092h)")
-    return Scale(encoder[0] / one if encoder else None, _said(encoder[1] if encoder else ""), gear, 1 / one)
+    return Scale(encoder[0] / one if encoder else None, _join(encoder[1] if encoder else ""), gear, 1 / one)
 
 
 def read_optional(net: Net, node: int, entry: Entry) -> Answer[int | None]:
@@ -149,7 +149,7 @@ def _ratio(net: Net, node: int, entries: tuple[Entry, Entry]) -> Answer[tuple[fl
     return above / below, source
 
 
-def _converted(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> float:
+def _unit_in_rad(axis: DriveAxis, scale: Scale, entry: Entry, unit: int) -> float:
     """Returns a unit of speed or acceleration in rad/s or rad/s^2 of the joint; raises ``Unfit``."""
     power, counted, first, second = unit.to_bytes(4, "big")
     is_speed = entry is table.VELOCITY_UNIT
@@ -177,5 +177,5 @@ def _signed(byte: int) -> int:
     return byte - 256 if byte > 127 else byte
 
 
-def _said(*parts: str) -> str:
+def _join(*parts: str) -> str:
     return ", ".join(filter(None, parts))

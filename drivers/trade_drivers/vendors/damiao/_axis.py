@@ -8,9 +8,11 @@ from typing import Final
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Ramp, Resolution
 from trade_drivers.joints.can import MotorAxis
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.damiao import _frames as frames
-from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Status
+from trade_drivers.vendors.damiao import _table as table
+from trade_drivers.vendors.damiao._frames import Feedback
+from trade_drivers.vendors.damiao._table import MODELS, Register, Status
+from trade_robotfile import Joint
 
 COUNTS_PER_RAD: Final = (1 << 16) / tau
 """Counts per radian of the motor's shaft in this driver; frames contain radians."""
@@ -44,7 +46,7 @@ class DamiaoAxis(MotorAxis):
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
         super().__init__(name, bus, joint, resolution_of(joint, rate_hz), coupled)
         self.ranges = MODELS[joint.model]
-        self.master = joint.id + frames.MASTER
+        self.master = joint.id + table.MASTER
         self.status: int | None = None
         self.heard_ns = 0
         """When it last sent feedback."""
@@ -81,7 +83,7 @@ class DamiaoAxis(MotorAxis):
         self.measured_at(
             feedback.position_rad * COUNTS_PER_RAD,
             feedback.velocity_rad_s * COUNTS_PER_RAD,
-            feedback.torque_nm / self.ranges.torque_nm * frames.FULL,
+            feedback.torque_nm / self.ranges.torque_nm * table.FULL,
             now_ns,
         )
         self._judge()
@@ -128,7 +130,7 @@ class DamiaoAxis(MotorAxis):
         """Returns the next set-point and its maximum speed, on the motor's shaft."""
         course = self.course
         if course is None:
-            raise self.faulty("it has no set-point")
+            raise self.fault_error("it has no set-point")
         elapsed_s = min((now_ns - self.stepped_ns) / 1e9, 2 * period_s)  # after a gap, it continues where it was
         self.stepped_ns = now_ns
         if elapsed_s > 0:
@@ -141,7 +143,7 @@ class DamiaoAxis(MotorAxis):
         return self.measured(
             sample,
             now_ns,
-            load=self.scale.load(sample.effort, frames.FULL),
+            load=self.scale.load(sample.effort, table.FULL),
             enabled=self.torque is True,
             temperature_c=self._celsius,
             voltage_v=None,

@@ -6,8 +6,8 @@ from typing import Final
 
 from trade_drivers.joints import Resolution, Sample
 from trade_drivers.joints.serial import Health, ServoAxis
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.dynamixel import _table as table
+from trade_robotfile import Joint
 
 CYCLIC: Final = (table.PRESENT_LOAD.address, table.PRESENT_POSITION.end - table.PRESENT_LOAD.address)
 """Address and size of the block read from each joint in each cycle: effort, velocity, position."""

@@ -2,6 +2,9 @@
 
 The vendor library is untyped, polls with a full core, uses the wall clock, stays "busy" after a call has raised,
 and does not check the length of an answer. Overrides fix all this here; the bytes sent are the library's own.
+
+Status packets are decoded here, by functions without I/O and without a clock. Source: ROBOTIS e-Manual, "DYNAMIXEL
+Protocol 2.0": ``FF FF FD 00 | ID | LEN16 | 55 | ERR | parameters | CRC16``.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -17,14 +20,82 @@ from trade_drivers.bus._serial_port import SerialLine
 from trade_drivers.joints import Gate, PortLost
 from trade_drivers.joints.serial import Answer, BadAnswer, NoAnswer, Refused
 from trade_drivers.joints.serial._wire import BROADCAST, ServoWire
-from trade_drivers.vendors.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
 from trade_drivers.vendors.dynamixel._table import BAUD_CODES, STATUS_ERRORS
+
+HEADER: Final = b"\xff\xff\xfd"
+STUFFED: Final = b"\xff\xff\xfd\xfd"
+STATUS: Final = 0x55
+OVERHEAD: Final = 11
+"""Bytes of a status packet without parameters."""
+_PREFIX: Final = 7
+_LONGEST: Final = 1024
 
 _ALERT: Final = 0x80
 _PING_ALL: Final = b"\xff\xff\xfd\x00\xfe\x03\x00\x01"
 _EACH_S: Final = 0.003
 """The time slot of each servo's answer to a broadcast ping, in the order of ids."""
 _SILENT_S: Final = 0.050
+
+
+class Corrupt(Exception):
+    """The CRC of a packet is wrong."""
+
+
+def _table() -> tuple[int, ...]:
+    entries: list[int] = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x8005 if crc & 0x8000 else crc << 1) & 0xFFFF
+        entries.append(crc)
+    return tuple(entries)
+
+
+_CRC: Final = _table()
+
+
+def crc16(data: Iterable[int], crc: int = 0) -> int:
+    """Returns the CRC-16 with polynomial 0x8005, start value 0 and no reflection, as the e-Manual defines it."""
+    table = _CRC
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ table[(crc >> 8) ^ byte]
+    return crc
+
+
+def take_status(buffer: bytearray) -> bytes | None:
+    """Removes the first complete status packet, and noise before it, from the buffer; None while it is incomplete.
+
+    Raises:
+        Corrupt: a packet with a wrong CRC was removed.
+    """
+    while True:
+        start = buffer.find(HEADER)
+        if start < 0:
+            del buffer[: max(0, len(buffer) - 2)]  # the end may be a partial header
+            return None
+        if start:
+            del buffer[:start]
+        if len(buffer) <= _PREFIX:
+            return None
+        length = buffer[5] | buffer[6] << 8
+        if buffer[3] != 0 or buffer[_PREFIX] != STATUS or not OVERHEAD - _PREFIX <= length <= _LONGEST:
+            del buffer[0]  # an instruction's echo, or noise that looks like a header
+            continue
+        end = _PREFIX + length
+        if len(buffer) < end:
+            return None
+        frame = bytes(buffer[:end])
+        del buffer[:end]
+        if crc16(frame[:-2]) != frame[-2] | frame[-1] << 8:
+            raise Corrupt
+        return frame
+
+
+def unstuffed(frame: bytes) -> bytes:
+    """Returns the packet without the stuffing bytes that keep headers out of its parameters."""
+    if STUFFED not in frame[_PREFIX:-2]:
+        return frame
+    return frame[:_PREFIX] + frame[_PREFIX:-2].replace(STUFFED, HEADER) + frame[-2:]
 
 
 class _QuietPort(PortHandler):

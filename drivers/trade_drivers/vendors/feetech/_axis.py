@@ -6,8 +6,8 @@ from typing import Final
 
 from trade_drivers.joints import Goal, Resolution, Sample
 from trade_drivers.joints.serial import Health, ServoAxis
-from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.feetech import _table as table
+from trade_robotfile import Joint
 
 CYCLIC: Final = (table.PRESENT_POSITION.address, table.PRESENT_LOAD.end - table.PRESENT_POSITION.address)
 """Address and size of the block read from each joint in each cycle: position, speed, load."""
@@ -102,7 +102,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
             DeviceSilent: the servo was never measured.
         """
         if self.sample is None:
-            raise self.deaf(now_ns)
+            raise self.silent_error(now_ns)
         here, resolution = self.sample.position, self.resolution
         speed_rad_s = aim.speed * resolution.rad_s
         lead_rad = speed_rad_s * self._lead_s + speed_rad_s**2 / (2 * aim.accel * resolution.rad_s2)

@@ -95,6 +95,8 @@ WRITE_FLAG: Final = Register(64, 1)
 STATUS: Final = Register(65, 1)
 MOVING: Final = Register(66, 1)
 
+OVERHEAD: Final = 6
+"""Bytes of a packet without parameters."""
 BAUD_CODES: Final = {1_000_000: 0, 500_000: 1, 250_000: 2, 128_000: 3, 115_200: 4}
 """Values of register 6 for each rate; sources disagree on the slower ones."""
 POSITION_MODE: Final = 0

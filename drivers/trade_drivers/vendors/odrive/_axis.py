@@ -3,31 +3,16 @@
 from collections.abc import Callable, Sequence
 from math import isfinite
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
-from typing import Final, NamedTuple
+from typing import Final
 
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints.can import MotorAxis, resolution_of
-from trade_drivers.robotfile import Joint
-from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
+from trade_drivers.vendors.odrive._frames import Health, Heartbeat, Version, two_floats
+from trade_drivers.vendors.odrive._table import MODELS, Command, Errors, Result, State
+from trade_robotfile import Joint
 
 COUNTS_PER_TURN: Final = 1 << 16
 """Counts per turn of the motor in this driver, finer than any encoder; frames contain turns."""
-
-
-class Model(NamedTuple):
-    """A kind of ODrive."""
-
-    line: int
-    """Product line, as the device reports it."""
-    peak_a: float
-    """Maximum motor current (data sheet)."""
-
-
-MODELS: Final = {
-    "ODrive Pro": Model(4, 120.0),
-    "ODrive S1": Model(5, 80.0),
-    "ODrive Micro": Model(6, 7.0),
-}
 
 
 class OdriveAxis(MotorAxis):
@@ -108,7 +93,7 @@ class OdriveAxis(MotorAxis):
         self._volts, _ = two_floats(data)
 
     def _judge(self) -> None:
-        if self.hushed:
+        if self.unfed:
             return  # the watchdog test handles this itself
         if self.errors:
             self.latch(f"error: {self.errors.text}")
@@ -141,7 +126,7 @@ class OdriveAxis(MotorAxis):
             self.fresh(now_ns, stale_after_ns),
             now_ns,
             load=max(-1.0, min(1.0, sign * self._amperes / self.model.peak_a)) if isfinite(self._amperes) else 0.0,
-            enabled=self.armed and not self.hushed,
+            enabled=self.armed and not self.unfed,
             temperature_c=self._celsius,
             voltage_v=self._volts,
         )

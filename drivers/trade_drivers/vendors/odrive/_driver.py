@@ -1,16 +1,79 @@
-"""The driver of a bus of ODrives."""
+"""The driver of a bus of ODrives, and its scan, which requests only the version, from ODrives heard on the bus."""
 
-from typing import TYPE_CHECKING
+import struct
+from typing import TYPE_CHECKING, Final
 
-from trade_drivers.joints.can import CanMotorDriver, axes_of
-from trade_drivers.robotfile import CanBus, Robot
-from trade_drivers.vendors.odrive._axis import MODELS, OdriveAxis
-from trade_drivers.vendors.odrive._commission import OdriveCommissioner
-from trade_drivers.vendors.odrive._frames import orders
+from trade_drivers.commissioning._can_scan import CanBench
+from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.joints.can import CanMotorCommissioner, CanMotorDriver
+from trade_drivers.vendors.odrive._axis import OdriveAxis
+from trade_drivers.vendors.odrive._frames import Heartbeat, Version, frame_id
+from trade_drivers.vendors.odrive._table import MODELS, NODES, Command, State, orders
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort
-    from trade_drivers.vendors.odrive._cycle import OdriveExchange
+    from trade_drivers.vendors.odrive._exchange import OdriveExchange
+
+_ANSWER_S: Final = 0.25
+
+
+class OdriveBench(CanBench):
+    """One CAN bus with ODrives."""
+
+    driver = "odrive"
+    remedy = "odrivetool or its web interface"
+    zero = "its zero is set by odrivetool or its web interface"
+
+    orders = staticmethod(orders)
+
+    def refuse(self) -> None:
+        """Sends no requests to other nodes."""
+
+    def anybody(self) -> bool:
+        return bool(self._talk.odrives) or self._nameless() is not None
+
+    def look(self, device_id: int) -> Found | None:
+        if device_id == NODES:
+            return self._nameless()
+        beat = self._talk.odrives.get(device_id)
+        if beat is None:
+            return None
+        torque = Heartbeat.decode(beat).state != State.IDLE
+        version = self._version(device_id)
+        if version is None:
+            problem = "its heartbeat is heard, but it does not tell its version: its firmware is older than 0.6"
+            return self.found(device_id, torque=torque, problem=problem)
+        names = [name for name, model in MODELS.items() if model.line == version.line]
+        return self.found(
+            device_id,
+            names[0] if names else f"product line {version.line}",
+            firmware=".".join(map(str, version.firmware)),
+            torque=torque,
+            problem="" if names else f"this driver knows {', '.join(MODELS)}",
+        )
+
+    def _nameless(self) -> Found | None:
+        """Returns an ODrive that reported its serial number instead of a node."""
+        for data in self._talk.frames.get(frame_id(NODES, Command.ADDRESS), ()):
+            if len(data) == struct.calcsize("<B6s"):
+                serial_number = int.from_bytes(data[1:], "little")
+                problem = f"it has no node number yet; give it one by {self.remedy}"
+                return self.found(NODES, serial_number=serial_number, problem=problem)
+        return None
+
+    def _version(self, node: int) -> Version | None:
+        wanted = frame_id(node, Command.VERSION)
+        data = self.ask(wanted, b"", lambda frame: (frame.data or None) if frame.id == wanted else None, _ANSWER_S)
+        return Version.decode(data[0]) if data else None
+
+
+class OdriveCommissioner(CanMotorCommissioner):
+    """ODrives; one without a node number is shown with the number 63."""
+
+    driver = "odrive"
+    ids = range(NODES + 1)
+
+    def bench(self) -> type[OdriveBench]:
+        return OdriveBench
 
 
 class OdriveDriver(CanMotorDriver[OdriveAxis, "OdriveExchange"]):
@@ -41,10 +104,7 @@ class OdriveDriver(CanMotorDriver[OdriveAxis, "OdriveExchange"]):
     commissioner = OdriveCommissioner
     orders = staticmethod(orders)
 
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "OdriveExchange":
-        from trade_drivers.vendors.odrive._cycle import OdriveExchange  # noqa: PLC0415 - python-can is optional
-        from trade_drivers.vendors.odrive._inspect import check_bus  # noqa: PLC0415
+    def exchange_type(self) -> "type[OdriveExchange]":
+        from trade_drivers.vendors.odrive._exchange import OdriveExchange  # noqa: PLC0415 - python-can is optional
 
-        axes = axes_of(OdriveAxis, robot, bus, port)
-        check_bus(bus, axes, robot.where)
-        return OdriveExchange(wire, bus, axes)
+        return OdriveExchange

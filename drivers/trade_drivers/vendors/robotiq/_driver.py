@@ -1,22 +1,23 @@
-"""The driver of a bus of grippers."""
+"""The driver of a bus of grippers, their services, and the scan for them."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from trade.errors import ConfigurationError, DeviceAbsent
-from trade_drivers import robotfile
-from trade_drivers._validation import not_installed
+import trade_robotfile
+from trade import Resource
+from trade.errors import ConfigurationError, DeviceAbsent, DeviceSilent
+from trade_drivers._validation import finite, not_installed, within
 from trade_drivers.bus._attempts import attempts
+from trade_drivers.bus._gate import admitted, at_once, span
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.bus._thread import BusThread, opening, start_thread
-from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
+from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found
+from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState, JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
-from trade_drivers.robotfile import Bus, Robot, SerialBus
 from trade_drivers.vendors.robotiq import _table as table
-from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
-from trade_drivers.vendors.robotiq._cycle import Exchange
-from trade_drivers.vendors.robotiq._gripper import RobotiqGripper
-from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
+from trade_drivers.vendors.robotiq._exchange import Activate, ClearFault, Exchange, GripperCommand, Move
+from trade_drivers.vendors.robotiq._gripper import GripperDevice
+from trade_robotfile import Bus, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
@@ -31,12 +32,139 @@ _MEANINGLESS: Final = {
 """Keys of a serial bus that grippers do not support, and why."""
 
 
+class RobotiqGripper(Gripper):
+    """One gripper of a bus. It checks arguments, queues a job for the bus thread, and waits for it."""
+
+    def __init__(self, thread: BusThread[Exchange], device: GripperDevice) -> None:
+        self._thread = thread
+        self._exchange = thread.exchange
+        self._device = device
+        self._name = device.name
+
+    @property
+    def resources(self) -> tuple[Resource, ...]:
+        return (self._device.resource,)
+
+    def state(self) -> GripperState:
+        exchange = self._exchange
+        try:
+            return self._device.state(exchange.clock(), exchange.stale_after_ns)
+        except DeviceSilent as silent:
+            raise exchange.absence(self._device, silent) from None
+
+    def limits(self) -> GripperLimits:
+        gripper, model = self._device.gripper, self._device.model
+        return GripperLimits(
+            name=self._name,
+            min_width_m=gripper.min_width_m,
+            max_width_m=gripper.max_width_m,
+            min_speed_m_s=model.speeds_m_s[0],
+            max_speed_m_s=gripper.max_speed_m_s,
+            min_force_n=model.forces_n[0],
+            max_force_n=gripper.max_force_n,
+        )
+
+    def activate(self) -> GripperState:
+        with admitted(f"{self._name}.activate", self.resources, span(self._exchange.clock)) as terms:
+            self._finish(Activate(self._exchange, [self._device], terms))
+        return self.state()
+
+    def move_to(self, width_m: float, speed_m_s: float | None = None, force_n: float | None = None) -> GripperState:
+        return self._move("move_to", width_m, speed_m_s, force_n)
+
+    def open(self, speed_m_s: float | None = None) -> GripperState:
+        return self._move("open", self._device.gripper.max_width_m, speed_m_s, None)
+
+    def close(self, speed_m_s: float | None = None, force_n: float | None = None) -> GripperState:
+        return self._move("close", self._device.gripper.min_width_m, speed_m_s, force_n)
+
+    def stop(self) -> None:
+        self._exchange.stop([self._device]).wait(self._thread.alive)
+
+    def clear_fault(self) -> None:
+        with admitted(f"{self._name}.clear_fault", self.resources, at_once(self._exchange.clock)) as terms:
+            self._finish(ClearFault(self._exchange, [self._device], terms))
+
+    def _move(self, name: str, width_m: float, speed_m_s: float | None, force_n: float | None) -> GripperState:
+        service, limits, model = f"{self._name}.{name}", self.limits(), self._device.model
+        width = finite(width_m, service, "width_m")
+        within(width, limits.min_width_m, limits.max_width_m, f"{self._name} width", "m")
+        speed = limits.max_speed_m_s if speed_m_s is None else finite(speed_m_s, service, "speed_m_s")
+        within(speed, limits.min_speed_m_s, limits.max_speed_m_s, f"{self._name} speed", "m/s")
+        force = limits.max_force_n if force_n is None else finite(force_n, service, "force_n")
+        within(force, limits.min_force_n, limits.max_force_n, f"{self._name} force", "N")
+        registers = table.command(model.counts(width), model.speed_counts(speed), model.force_counts(force))
+        with admitted(service, self.resources, span(self._exchange.clock)) as terms:
+            self._finish(Move(self._exchange, [self._device], registers, terms))
+        return self.state()
+
+    def _finish(self, job: GripperCommand) -> None:
+        self._exchange.submit(job)
+        job.wait(self._thread.alive)
+
+
+class RobotiqCommissioner(Commissioner):
+    """2F-85 grippers; they leave the factory with id 9 at 115200 baud."""
+
+    driver = "robotiq"
+    bauds = (115_200,)
+    ids = range(1, 248)
+
+    def open(self, port: str, baud: int) -> Bench:
+        wire = _wire_at(port, baud, "")
+        wire.open()
+        return RobotiqBench(wire, port, baud)
+
+
+class RobotiqBench(Bench):
+    """An open line of 2F-85 grippers."""
+
+    def __init__(self, wire: "Wire", port: str, baud: int) -> None:
+        self._wire, self._port, self._baud = wire, port, baud
+
+    def anybody(self) -> bool:
+        return True
+
+    def look(self, device_id: int) -> Found | None:
+        try:
+            status = table.Status.decode(self._wire.read(device_id), 0)
+        except NoAnswer:
+            self._wire.settled_at = 0.0  # a late answer must not be taken for that of the next id
+            return None
+        except Refused:
+            return self._found(device_id, "", "it is a Modbus device, but no 2F-85")
+        if not status.plausible:
+            return self._found(device_id, "", "it has the registers of a 2F-85, but what they read makes no sense")
+        return self._found(device_id, "2F-85", "")
+
+    def _found(self, device_id: int, model: str, problem: str) -> Found:
+        return Found(driver="robotiq", kind="gripper", baud=self._baud, id=device_id, model=model, problem=problem)
+
+    def angle_rad(self, device_id: int) -> NoReturn:
+        self._cannot(device_id, "a gripper has no angle; its widths are known, so there is nothing to calibrate")
+
+    def write_id(self, device_id: int, to: int) -> NoReturn:  # noqa: ARG002
+        self._cannot(device_id, "the id of a 2F-85 is set by the vendor's tool alone (Robotiq User Interface)")
+
+    def write_baud(self, device_id: int, to: int) -> NoReturn:  # noqa: ARG002
+        self._cannot(device_id, "the baud rate of a 2F-85 is set by the vendor's tool alone (Robotiq User Interface)")
+
+    def seal(self, device_id: int) -> None:
+        """Does nothing, as this bench unlocks no registers."""
+
+    def _cannot(self, device_id: int, problem: str) -> NoReturn:
+        raise ConfigurationError(where=f"{self._port}, id {device_id}", problem=problem)
+
+    def close(self) -> None:
+        self._wire.close()
+
+
 class AttachedGrippers(ThreadedBus[Exchange]):
     """A bus with its grippers and its owner thread."""
 
     def __init__(self, thread: BusThread[Exchange]) -> None:
         super().__init__(thread)
-        self._hands = {hand.gripper.name: hand for hand in thread.exchange.hands}
+        self._devices = {device.gripper.name: device for device in thread.exchange.devices}
 
     def motor(self, joint: str) -> Motor:
         raise ConfigurationError(where=f'joint."{joint}"', problem="driver robotiq has no joints, only grippers")
@@ -45,7 +173,7 @@ class AttachedGrippers(ThreadedBus[Exchange]):
         raise ConfigurationError(where=name, problem=f"driver robotiq has no joints such as {', '.join(joints)}")
 
     def gripper(self, name: str) -> Gripper:
-        return RobotiqGripper(self._thread, self._hands[name])
+        return RobotiqGripper(self._thread, self._devices[name])
 
 
 class RobotiqDriver(Driver):
@@ -68,14 +196,14 @@ class RobotiqDriver(Driver):
     """
 
     modules = ("pymodbus", "serial")
-    devices = (robotfile.Gripper,)
+    devices = (trade_robotfile.Gripper,)
     without_watchdog = "no watchdog: without its driver it completes its last stroke"
     commissioner = RobotiqCommissioner
 
     def check(self, robot: Robot, bus: Bus) -> None:
         serial = _serial(robot, bus)
         _check(robot, serial)
-        wire_at(serial.port, serial.baud, f"{robot.where}: bus.{bus.name}")
+        _wire_at(serial.port, serial.baud, f"{robot.where}: bus.{bus.name}")
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         exchange = open_exchange(robot, _serial(robot, bus), port)
@@ -95,15 +223,15 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
         ConfigurationError: the port cannot be opened, or a gripper is absent, another device, or set wrongly.
     """
     _check(robot, bus)
-    hands = [GripperDevice(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
+    devices = [GripperDevice(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
     where = f"{robot.where}: bus.{bus.name}"
-    wire = wire_at(port, bus.baud, where)
-    exchange = Exchange(wire, bus, hands)
+    wire = _wire_at(port, bus.baud, where)
+    exchange = Exchange(wire, bus, devices)
     with opening(wire, port, where):
-        for hand in hands:
-            _look_over(exchange, hand, bus, robot.where)
-        for hand in hands:
-            exchange.admit(hand)
+        for device in devices:
+            _verify(exchange, device, bus, robot.where)
+        for device in devices:
+            exchange.admit(device)
         exchange.cycle()
     return exchange
 
@@ -141,30 +269,30 @@ def _check(robot: Robot, bus: SerialBus) -> None:
         _wrong(f"{where}.rate_hz", f"{problem}: at most {1 / cycle_s:.0f} Hz")
 
 
-def _look_over(exchange: Exchange, hand: GripperDevice, bus: SerialBus, where: str) -> None:
+def _verify(exchange: Exchange, device: GripperDevice, bus: SerialBus, where: str) -> None:
     """Takes a gripper's first measurements; writes nothing."""
-    key = f'{where}: gripper."{hand.gripper.name}"'
+    key = f'{where}: gripper."{device.gripper.name}"'
     for _ in attempts(exchange.clock, exchange.stale_after_ns):
         try:
-            exchange.probe(hand)
-            exchange.read(hand)
-            exchange.read(hand)  # two measurements show motion
+            exchange.probe(device)
+            exchange.read(device)
+            exchange.read(device)  # two measurements show motion
         except NoAnswer:
             continue
         except Refused as refused:
             _wrong(key, f"what answers on bus {bus.name!r} is no 2F-85: {refused}")
-        if hand.sample is not None and not hand.sample.plausible:
-            _wrong(key, f"what answers to id {hand.id} on bus {bus.name!r} is no 2F-85: its status makes no sense")
-        hand.silent = False
+        if device.sample is not None and not device.sample.plausible:
+            _wrong(key, f"what answers to id {device.id} on bus {bus.name!r} is no 2F-85: its status makes no sense")
+        device.silent = False
         return
     problem = (
-        f"no gripper answers to id {hand.id} on bus {bus.name!r} ({exchange.wire.path}, {bus.baud} baud); check its "
+        f"no gripper answers to id {device.id} on bus {bus.name!r} ({exchange.wire.path}, {bus.baud} baud); check its "
         "power and cable, its id and its baud rate with the vendor's tool"
     )
     raise DeviceAbsent(where=key, problem=problem)
 
 
-def wire_at(port: str, baud: int, where: str) -> "Wire":
+def _wire_at(port: str, baud: int, where: str) -> "Wire":
     """Returns a closed line. Raises ``ConfigurationError`` without the vendor library."""
     try:
         from trade_drivers.vendors.robotiq._wire import Wire  # noqa: PLC0415 - the vendor library is optional

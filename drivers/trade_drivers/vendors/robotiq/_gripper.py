@@ -1,83 +1,137 @@
-"""A 2F-85 as a Gripper. It checks arguments, queues a job for the bus thread, and waits for it."""
+"""The state of one gripper on the bus thread: its measurement, its faults and its motion."""
+
+import time
+from typing import Final, Literal
 
 from trade import Resource
-from trade.errors import DeviceSilent
-from trade_drivers._validation import finite, within
-from trade_drivers.bus._gate import admitted, at_once, span
-from trade_drivers.bus._thread import BusThread
-from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState
+from trade.errors import DeviceFault
+from trade_drivers.bus._cycle import BusDevice
+from trade_drivers.bus._jobs import Work
+from trade_drivers.interfaces._motion import GripperState
 from trade_drivers.vendors.robotiq import _table as table
-from trade_drivers.vendors.robotiq._cycle import Exchange
-from trade_drivers.vendors.robotiq._gripper_state import GripperDevice
-from trade_drivers.vendors.robotiq._jobs import Activate, ClearFault, GripperCommand, Move
+from trade_drivers.vendors.robotiq._table import Contact, Status
+from trade_robotfile import Gripper
+
+_HELD: Final[dict[int, Literal["outside", "inside"]]] = {Contact.CLOSING: "outside", Contact.OPENING: "inside"}
+_HELD_COUNTS: Final = 1
+_REMEDY: Final = "remove the cause, then call activate(): it moves the fingers all the way, and what they hold falls"
+_NOT_ACTIVATED: Final = "it is not activated"
 
 
-class RobotiqGripper(Gripper):
-    """One gripper of a bus."""
+class GripperDevice(BusDevice[Status]):
+    """The state of one gripper."""
 
-    def __init__(self, thread: BusThread[Exchange], hand: GripperDevice) -> None:
-        self._thread = thread
-        self._exchange = thread.exchange
-        self._hand = hand
-        self._name = hand.name
+    def __init__(self, name: str, bus: str, gripper: Gripper) -> None:
+        super().__init__(name, bus, Resource(name))
+        self.gripper = gripper
+        self.id = gripper.id
+        self.model = table.BY_MODEL_NAME[gripper.model]
+        self.force_counts = 0
+        """The last commanded force."""
+        self.fault = ""
+        """Why it refuses to move, from the gripper or from this driver; latched until a client clears it."""
+        self.motion: GripperMotion | None = None
+        self._holding: Literal["", "outside", "inside"] = ""
+        self._held_at = 0
+        self._speed_m_s = 0.0
 
-    @property
-    def resources(self) -> tuple[Resource, ...]:
-        return (self._hand.resource,)
+    def take(self, registers: list[int], at_ns: int) -> Status:
+        """Stores a measurement that was requested at this time."""
+        before, now = self.sample, Status.decode(registers, at_ns)
+        unmoved = before is not None and before.position == now.position
+        self.still = self.still + 1 if unmoved and not now.under_way else 0
+        if before is not None and at_ns > before.at_ns:
+            counts_s = (now.position - before.position) / ((at_ns - before.at_ns) / 1e9)
+            self._speed_m_s = -counts_s * self.model.m_per_count
+        self._note_contact(now)
+        self.sample = now
+        self.fault = table.fault_text(now.fault) or self.fault
+        self.misses = 0
+        return now
 
-    def state(self) -> GripperState:
-        exchange = self._exchange
-        try:
-            return self._hand.state(exchange.clock(), exchange.stale_after_ns)
-        except DeviceSilent as silent:
-            raise exchange.absence(self._hand, silent) from None
+    def _note_contact(self, now: Status) -> None:
+        if now.going and now.activated:
+            self._holding = _HELD.get(now.contact, "")
+            self._held_at = now.position
+        elif not now.activated or abs(now.position - self._held_at) > _HELD_COUNTS:
+            self._holding = ""
 
-    def limits(self) -> GripperLimits:
-        gripper, model = self._hand.gripper, self._hand.model
-        return GripperLimits(
-            name=self._name,
-            min_width_m=gripper.min_width_m,
-            max_width_m=gripper.max_width_m,
-            min_speed_m_s=model.speeds_m_s[0],
-            max_speed_m_s=gripper.max_speed_m_s,
-            min_force_n=model.forces_n[0],
-            max_force_n=gripper.max_force_n,
+    def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
+        """Returns whether it is measured at rest without a commanded motion; it may be pressing on an object."""
+        known = self.sample is not None and not self.doubted and not self.silent
+        return known and self.motion is None and self.still > 0 and self.age_ns(now_ns) <= stale_after_ns
+
+    def standing(self, now_ns: int, stale_after_ns: int) -> bool:
+        """Returns whether it is at rest and has no goal."""
+        commanded = self.sample is not None and self.sample.going and self.sample.activated
+        return self.at_rest(now_ns, stale_after_ns) and not commanded
+
+    def halt_registers(self) -> tuple[int, int, int]:
+        """Returns the command that stops it.
+
+        Without activation, a gripper stops in each state. The command keeps the activation only if it is certain, as
+        writing it to a gripper that has lost it would move the fingers.
+        """
+        sample = self.sample
+        if sample is None or self.doubted or self.silent or not sample.activated:
+            return table.RESET
+        return table.command(sample.echo, 0, self.force_counts, go=False)
+
+    def tell_moving(self) -> None:
+        """Sets ``resource.moving`` from the last measurement or command."""
+        under_way = self.motion is not None or self.halting_since_ns > 0
+        if under_way or not (self.silent or self.doubted):
+            self.resource.moving = under_way or self.still == 0
+
+    def check_usable(self, now_ns: int, stale_after_ns: int) -> Status:
+        """Returns the newest measurement if the fingers may be commanded.
+
+        Raises:
+            DeviceSilent: the gripper does not answer.
+            DeviceFault: the gripper has a fault, or is not activated.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        if self.fault:
+            raise self.fault_error()
+        if not sample.activated:
+            raise self.inactive()
+        return sample
+
+    def inactive(self, fault: str = _NOT_ACTIVATED) -> DeviceFault:
+        """Returns the error for a gripper without activation."""
+        remedy = "call activate(): it moves the fingers all the way, and what they hold falls"
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
+
+    def fault_error(self, fault: str = "") -> DeviceFault:
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=_REMEDY)
+
+    def state(self, now_ns: int, stale_after_ns: int) -> GripperState:
+        """Returns the newest measurement.
+
+        Raises:
+            DeviceSilent: the measurement is too old.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        age_s = (now_ns - sample.at_ns) / 1e9
+        low, high = self.model.forces_n
+        return GripperState(
+            name=self.name,
+            width_m=self.model.width_m(sample.position),
+            speed_m_s=self._speed_m_s,
+            force_n=low + (high - low) * self.force_counts / 255,
+            current_a=sample.current * table.AMPERE_PER_COUNT,
+            holding=self._holding,
+            activated=sample.activated,
+            moving=self.motion is not None or self.still == 0,
+            fault=self.fault,
+            measured_at=time.monotonic() - age_s,
+            age_s=age_s,
         )
 
-    def activate(self) -> GripperState:
-        with admitted(f"{self._name}.activate", self.resources, span(self._exchange.clock)) as terms:
-            self._finish(Activate(self._exchange, [self._hand], terms))
-        return self.state()
 
-    def move_to(self, width_m: float, speed_m_s: float | None = None, force_n: float | None = None) -> GripperState:
-        return self._move("move_to", width_m, speed_m_s, force_n)
+class GripperMotion(Work[GripperDevice]):
+    """A motion of the fingers, as far as the gripper knows it."""
 
-    def open(self, speed_m_s: float | None = None) -> GripperState:
-        return self._move("open", self._hand.gripper.max_width_m, speed_m_s, None)
-
-    def close(self, speed_m_s: float | None = None, force_n: float | None = None) -> GripperState:
-        return self._move("close", self._hand.gripper.min_width_m, speed_m_s, force_n)
-
-    def stop(self) -> None:
-        self._exchange.stop([self._hand]).wait(self._thread.alive)
-
-    def clear_fault(self) -> None:
-        with admitted(f"{self._name}.clear_fault", self.resources, at_once(self._exchange.clock)) as terms:
-            self._finish(ClearFault(self._exchange, [self._hand], terms))
-
-    def _move(self, name: str, width_m: float, speed_m_s: float | None, force_n: float | None) -> GripperState:
-        service, limits, model = f"{self._name}.{name}", self.limits(), self._hand.model
-        width = finite(width_m, service, "width_m")
-        within(width, limits.min_width_m, limits.max_width_m, f"{self._name} width", "m")
-        speed = limits.max_speed_m_s if speed_m_s is None else finite(speed_m_s, service, "speed_m_s")
-        within(speed, limits.min_speed_m_s, limits.max_speed_m_s, f"{self._name} speed", "m/s")
-        force = limits.max_force_n if force_n is None else finite(force_n, service, "force_n")
-        within(force, limits.min_force_n, limits.max_force_n, f"{self._name} force", "N")
-        registers = table.command(model.counts(width), model.speed_counts(speed), model.force_counts(force))
-        with admitted(service, self.resources, span(self._exchange.clock)) as terms:
-            self._finish(Move(self._exchange, [self._hand], registers, terms))
-        return self.state()
-
-    def _finish(self, job: GripperCommand) -> None:
-        self._exchange.submit(job)
-        job.wait(self._thread.alive)
+    def watch(self, now_ns: int) -> None:
+        """Checks the newest measurement, and ends the motion if it is over or must not continue."""
+        raise NotImplementedError

@@ -6,9 +6,9 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
+import trade_robotfile
 from trade import current_call
 from trade.errors import ConfigurationError, DeviceAbsent, DeviceFault, DeviceSilent
-from trade_drivers import robotfile
 from trade_drivers.interfaces._sensing import Camera, CameraInfo, Image, Sensor
 from trade_drivers.plugins._driver import SenseDriver
 from trade_drivers.vendors.snapshot._http import Place, ask, place_of
@@ -42,14 +42,16 @@ class SnapshotDriver(SenseDriver):
         height_px = 480
     """
 
-    def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
+    def check(self, device: trade_robotfile.Camera | trade_robotfile.Sensor) -> None:
         options = device.options_as(Options)
         try:
             place_of(options.url)
         except ValueError as bad:
             raise ConfigurationError(where=f"{device.where}: {device.key}.url", problem=str(bad)) from None
 
-    def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
+    def attach(
+        self, name: str, device: trade_robotfile.Camera | trade_robotfile.Sensor, port: str | None
+    ) -> Camera | Sensor:
         options = device.options_as(Options)
         where = f"{device.where}: {device.key}"
         try:

@@ -1,17 +1,14 @@
 """The state of one arm on the bus thread: its measurement, its safety state and its motion."""
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from trade import Resource
-from trade.errors import DeviceFault
+from trade.errors import DeviceFault, TradeError
 from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._arm import ArmState, Safety
-from trade_drivers.robotfile import Arm
 from trade_drivers.vendors.ur._messages import Sample
-
-if TYPE_CHECKING:
-    from trade_drivers.vendors.ur._jobs import Motion
+from trade_robotfile import Arm
 
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 IDLE: Final = 5
@@ -36,6 +33,24 @@ _STILL: Final = 3
 """Consecutive measurements without motion that mean rest."""
 
 
+class ArmMotion(Protocol):
+    """What the exchange needs of a motion."""
+
+    attended_ns: int
+    """When it was last checked, by the lasting clock."""
+
+    @property
+    def streams(self) -> bool:
+        """True for a stream of set-points, which must also be ended after success."""
+        ...
+
+    def watch(self, now_ns: int) -> None:
+        """Checks the newest measurement, and ends the motion if it is over or must not continue."""
+
+    def finish(self, error: TradeError | None = None) -> None:
+        """Passes the outcome to the waiting service."""
+
+
 class ArmStatus(BusDevice[Sample]):
     """The state of one arm."""
 
@@ -43,7 +58,7 @@ class ArmStatus(BusDevice[Sample]):
         super().__init__(name, host, Resource(name))
         self.arm = arm
         self.joints = [f"{name}.{joint}" for joint in JOINTS]
-        self.motion: Motion | None = None
+        self.motion: ArmMotion | None = None
 
     def take(self, sample: Sample) -> None:
         """Stores a measurement."""
@@ -72,7 +87,7 @@ class ArmStatus(BusDevice[Sample]):
         """
         sample = self.fresh(now_ns, stale_after_ns)
         if self.fault:
-            raise self.faulty()
+            raise self.fault_error()
         return sample
 
     @property
@@ -116,11 +131,11 @@ class ArmStatus(BusDevice[Sample]):
         fraction = 1.0 if self.sample is None else self.sample.speed_fraction
         return f"its speed slider is at {100 * fraction:.3g} %" if fraction < 1 else ""
 
-    def lagging(self, fault: str) -> DeviceFault:
+    def lag_error(self, fault: str) -> DeviceFault:
         """Returns the error of an arm that is behind, with what slows it."""
-        return self.faulty(f"{fault}; {self.slowed}" if self.slowed else fault)
+        return self.fault_error(f"{fault}; {self.slowed}" if self.slowed else fault)
 
-    def faulty(self, fault: str = "") -> DeviceFault:
+    def fault_error(self, fault: str = "") -> DeviceFault:
         """Returns the error of an arm that does not follow a command; by default with its current fault."""
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=self.remedy)
 

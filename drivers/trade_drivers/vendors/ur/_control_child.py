@@ -20,10 +20,10 @@ from trade_drivers.vendors.ur._messages import (
     Halt,
     Heartbeat,
     HeartbeatAnswer,
-    Hello,
     MoveJoints,
     MoveLine,
     Order,
+    Ready,
     Servo,
     Solve,
     TakeControl,
@@ -56,7 +56,7 @@ class Child:
 
     def run(self) -> None:
         """Runs until the driver is gone or silent, or the connection is lost."""
-        self._channel.send(Hello())
+        self._channel.send(Ready())
         while True:
             order = self._channel.receive(_IDLE_S if self._robot is None else _QUIET_S)
             signal.setitimer(signal.ITIMER_REAL, _TAKING_S if isinstance(order, TakeControl) else _STUCK_S)

@@ -118,7 +118,7 @@ def _takes_scripts(host: str, timeout_s: float) -> None:
         raise DashboardError(f"{host}:{_SCRIPT}: {problem or 'no answer'}") from None
 
 
-def commanded(host: str, timeout_s: float) -> bool:
+def is_commanded(host: str, timeout_s: float) -> bool:
     """Returns whether another program has control of the arm, as a controller gives each register to one client.
 
     Writes nothing. If no client has the register, this connection takes it until the request is over.

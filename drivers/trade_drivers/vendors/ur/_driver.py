@@ -1,5 +1,6 @@
-"""The driver of a controller and its arm."""
+"""The driver of a controller and its arm, and the identification of an arm, by queries only."""
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -7,20 +8,21 @@ from typing import Final, NoReturn
 
 from msgspec import structs
 
+import trade_robotfile
 from trade.errors import ConfigurationError, DeviceAbsent
-from trade_drivers import robotfile
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost
 from trade_drivers.bus._thread import BusThread
+from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
-from trade_drivers.robotfile import Bus, Robot, UrBus
+from trade_drivers.vendors.ur._arm import UrArm
 from trade_drivers.vendors.ur._arm_state import ArmStatus
-from trade_drivers.vendors.ur._cycle import Exchange
-from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded
+from trade_drivers.vendors.ur._dashboard import DashboardError, ask, is_commanded, probe
+from trade_drivers.vendors.ur._exchange import Exchange
 from trade_drivers.vendors.ur._link import Link
-from trade_drivers.vendors.ur._ur_arm import UrArm
+from trade_robotfile import Bus, Robot, UrBus
 
 _CYCLES_HZ: Final = {
     "UR3": 125.0,
@@ -33,8 +35,12 @@ _CYCLES_HZ: Final = {
 }
 """Models of the CB3 and of the e-Series, with the cycles per second of their controllers."""
 _ASK_S: Final = 1.0
+_IDENTIFY_S: Final = 2.0
 _RELEASED_WITHIN_S: Final = 2.0
 _AGAIN_S: Final = 0.1
+_VERSION: Final = re.compile(r"(\d+)\.\d+(?:\.\d+)*")
+_E_SERIES: Final = 5
+"""First digit of the e-Series' software version; the CB3's is 3."""
 
 
 class AttachedController(ThreadedBus[Exchange]):
@@ -84,7 +90,7 @@ class UrDriver(Driver):
     modules = ("rtde_control", "rtde_receive", "rtde_io")
     own_clock = "its library ur-rtde is in C++, waits by itself, and runs in processes of its own"
 
-    devices = (robotfile.Arm,)
+    devices = (trade_robotfile.Arm,)
 
     def check(self, robot: Robot, bus: Bus) -> None:
         self._limb_of(robot, bus, bus.name)
@@ -116,7 +122,7 @@ class UrDriver(Driver):
             try:
                 link.wait_open()
                 _refuse_company(port, where)
-                _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
+                _verify_model(limb, f"{robot.where}: arm.{limb.arm.name}")
             except (PortLost, DashboardError) as problem:
                 raise DeviceAbsent(where=f"{where}.host", problem=str(problem)) from None
             exchange = Exchange(link, bus, limb)
@@ -147,13 +153,13 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> ArmStatus:
 def _refuse_company(port: str, where: str) -> None:
     """Refuses an arm that another program controls; a killed process keeps control for a short time."""
     until = time.monotonic() + _RELEASED_WITHIN_S
-    while commanded(port, _ASK_S):
+    while is_commanded(port, _ASK_S):
         if time.monotonic() > until:
             _wrong(f"{where}.host", f"{port}: another program has control of this arm; stop it first")
         time.sleep(_AGAIN_S)
 
 
-def _look_over(limb: ArmStatus, where: str) -> None:
+def _verify_model(limb: ArmStatus, where: str) -> None:
     """Checks that it is the arm of the robot file; commands nothing."""
     answer = ask(limb.bus, "get robot model", _ASK_S)
     if answer.rstrip("e").upper() != limb.arm.model.rstrip("e").upper():
@@ -168,3 +174,26 @@ def _stop_if_moving(exchange: Exchange) -> None:
 
 def _wrong(where: str, problem: str) -> NoReturn:
     raise ConfigurationError(where=where, problem=problem)
+
+
+def identify(host: str) -> Found:
+    """Returns a controller's arm: model, software version, serial number.
+
+    Raises:
+        ConfigurationError: nothing answers, or it is not a controller.
+    """
+    try:
+        probe(host, _IDENTIFY_S)
+        model = ask(host, "get robot model", _IDENTIFY_S)
+        version = _VERSION.search(ask(host, "PolyscopeVersion", _IDENTIFY_S))
+        serial_number = ask(host, "get serial number", _IDENTIFY_S)
+    except DashboardError as bad:
+        raise ConfigurationError(where=host, problem=f"no controller of an arm answers: {bad}") from None
+    e_series = version is not None and int(version[1]) >= _E_SERIES
+    return Found(
+        driver="ur",
+        kind="arm",
+        model=f"{model.rstrip('e')}e" if e_series else model,
+        firmware=version[0] if version else "",
+        serial_number=int(serial_number) if serial_number.isdecimal() else None,
+    )

@@ -1,19 +1,16 @@
 """Jobs of services for the bus thread: moves, set-points, freedrive, the speed slider."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError, TrajectoryPart
 from trade_drivers.bus._gate import Command, Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.motion._plan import Plan
 from trade_drivers.vendors.ur._arm_state import ArmStatus
-from trade_drivers.vendors.ur._line_path import poses_on
+from trade_drivers.vendors.ur._exchange import Exchange
 from trade_drivers.vendors.ur._messages import Free, MoveJoints, MoveLine, Sample, Solve
-from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
-
-if TYPE_CHECKING:
-    from trade_drivers.vendors.ur._cycle import Exchange
+from trade_drivers.vendors.ur._path import SetpointFilter, poses_on
 
 _NEAR: Final = 0.01
 """Distance in rad or m within which a move has arrived."""
@@ -25,10 +22,10 @@ _NO_DEADLINE_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
 
-class ArmCommand(Command[ArmStatus, "Exchange"]):
+class ArmCommand(Command[ArmStatus, Exchange]):
     """A command to the arm of a controller."""
 
-    def __init__(self, exchange: "Exchange", terms: Terms) -> None:
+    def __init__(self, exchange: Exchange, terms: Terms) -> None:
         super().__init__(exchange, [exchange.limb], terms)
         self.limb = exchange.limb
 
@@ -40,7 +37,7 @@ class ArmCommand(Command[ArmStatus, "Exchange"]):
 class Scaling(ArmCommand):
     """Set the speed slider."""
 
-    def __init__(self, exchange: "Exchange", fraction: float, terms: Terms) -> None:
+    def __init__(self, exchange: Exchange, fraction: float, terms: Terms) -> None:
         super().__init__(exchange, terms)
         self._fraction = fraction
 
@@ -74,7 +71,7 @@ class Motion(ArmCommand):
         """Returns why the motion must end: an interrupted driver, no answer, a fault, or the call's deadline."""
         attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
         if held_up := self.exchange.held_up(attended_ns):
-            return self.limb.faulty(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
+            return self.limb.fault_error(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
         try:
             self.usable()
         except TradeError as problem:
@@ -132,7 +129,7 @@ class Move(Motion):
 
     def __init__(
         self,
-        exchange: "Exchange",
+        exchange: Exchange,
         goal: Sequence[float],
         speed: float,
         terms: Terms,
@@ -140,8 +137,8 @@ class Move(Motion):
         super().__init__(exchange, terms)
         self.goal = list(goal)
         self.speed = speed
-        self._pulses = -1
-        """Number of its process's reports when it began."""
+        self._answers_before = -1
+        """Number of its process's answers to heartbeats when it began."""
         self._place: list[float] = []
         self._moved_ns = 0
 
@@ -165,16 +162,17 @@ class Move(Motion):
         self.note("began its move")
         self.attended_ns = self.exchange.lasting_clock()
         control = self.exchange.link.control
-        self._pulses = 0 if control is None else control.pulses
+        self._answers_before = 0 if control is None else control.heartbeat_answers
 
     def watch(self, now_ns: int) -> None:
         control, sample = self.exchange.link.control, self.limb.sample
-        if self._pulses < 0 or control is None or sample is None:
+        if self._answers_before < 0 or control is None or sample is None:
             return
         ending = self.trouble(now_ns, self.until_ns) or self.astray(sample) or self._stuck(sample)
-        over = ending is None and control.pulses > self._pulses + 1 and not control.running and self.limb.still > 2
+        ended = control.heartbeat_answers > self._answers_before + 1 and not control.running
+        over = ending is None and ended and self.limb.still > 2
         if over and self.off(sample) > _NEAR:
-            ending = self.limb.faulty("its move ended before it was there")
+            ending = self.limb.fault_error("its move ended before it was there")
         if over or ending is not None:
             self.exchange.release(self, ending)
 
@@ -182,7 +180,7 @@ class Move(Motion):
         """Returns the fault for measurements without any change: the arm is blocked or paused, or values are old."""
         if sample.positions != self._place or not self._moved_ns:
             self._place, self._moved_ns = sample.positions, sample.at_ns
-        return self.limb.lagging("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
+        return self.limb.lag_error("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
 
 
 class LineMove(Move):
@@ -231,7 +229,7 @@ class SetPoint(Motion):
 
     def __init__(
         self,
-        exchange: "Exchange",
+        exchange: Exchange,
         goal: Sequence[float],
         terms: Terms,
         valid_ns: int,
@@ -284,7 +282,7 @@ class Follow(Motion):
 
     def __init__(
         self,
-        exchange: "Exchange",
+        exchange: Exchange,
         plan: Plan,
         terms: Terms,
     ) -> None:
@@ -328,7 +326,7 @@ class Follow(Motion):
             self.exchange.release(self, None)
             return
         if late_s > tolerances.goal_time_s:
-            raise self.limb.lagging("it does not come to rest at the end of its trajectory")
+            raise self.limb.lag_error("it does not come to rest at the end of its trajectory")
         self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
         self._sent_ns = now_ns
 

@@ -1,17 +1,118 @@
 """The connection to a controller: two child processes, one that reads and one that commands."""
 
+import subprocess
+import sys
 import threading
 import time
-from typing import Final
+from contextlib import suppress
+from typing import Final, Literal
 
 from trade_drivers.bus._jobs import PortLost, PortOpening
-from trade_drivers.vendors.ur._child import Child
-from trade_drivers.vendors.ur._messages import Disconnected
+from trade_drivers.vendors.ur._messages import (
+    Channel,
+    Disconnected,
+    Done,
+    Failed,
+    HeartbeatAnswer,
+    Order,
+    Ready,
+    Report,
+    Sample,
+    pair,
+)
 
 _FIRST_S: Final = 10.0
 """Startup time of a reading process, which imports the library on a possibly busy machine."""
 _LOOK_S: Final = 0.01
-_END_S: Final = 1.0
+_ENDED_S: Final = 1.0
+"""How long the process that commands may take to stop its motion and end."""
+_KILLED_S: Final = 5.0
+
+
+class Child:
+    """The driver's handle of one process, which communicates with a controller through the vendor's library.
+
+    Args:
+        role: ``control`` or ``states``.
+        host: the controller.
+    """
+
+    def __init__(self, role: Literal["control", "states"], host: str) -> None:
+        own_end, child_end = pair()
+        with child_end:
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                [sys.executable, "-m", f"trade_drivers.vendors.ur._{role}_child", str(child_end.fileno()), host],
+                pass_fds=[child_end.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # output of the library's own threads
+                stderr=subprocess.DEVNULL,
+            )
+        self._channel: Channel[Report] = Channel(own_end, Report)
+        self._numbers = 0
+        self._answers: dict[int, Done] = {}
+        self.ready = False
+        """True after it has reported that it accepts orders."""
+        self.problem = ""
+        """The reported reason of its end."""
+        self.running = False
+        """True while it reports a running move."""
+        self.heartbeat_answers = 0
+        """Number of those reports."""
+        self.samples: list[Sample] = []
+        """Measurements that have not been taken yet."""
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    def number(self) -> int:
+        """Returns the number for the next order with an answer."""
+        self._numbers += 1
+        return self._numbers
+
+    def send(self, order: Order) -> None:
+        """Sends it a message; raises ``Disconnected``."""
+        self._channel.send(order)
+
+    def listen(self) -> None:
+        """Processes its messages; raises ``Disconnected``, with the reason if it reported one."""
+        try:
+            self._take_in()
+        except Disconnected as gone:
+            raise Disconnected(self.problem or str(gone)) from None
+
+    def _take_in(self) -> None:
+        for word in self._channel.waiting():
+            match word:
+                case Failed():
+                    self.problem = word.problem
+                case Sample():
+                    self.samples.append(word)
+                case HeartbeatAnswer():
+                    self.running = word.running
+                    self.heartbeat_answers += 1
+                case Done():
+                    self._answers[word.number] = word
+                case Ready():
+                    self.ready = True
+
+    def answer(self, number: int) -> Done | None:
+        """Returns the outcome of an order, once it is known."""
+        return self._answers.pop(number, None)
+
+    def end(self, patience_s: float) -> None:
+        """Requests its end, which stops its motion; kills it if it does not end."""
+        self._channel.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(patience_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """Kills it. Idempotent."""
+        self._process.kill()
+        self._channel.close()
+        self._process.wait(_KILLED_S)
 
 
 class Link:
@@ -72,7 +173,8 @@ class Link:
         states, self.states = self.states, None
         control, self.control = self.control, None
         if control is not None:
-            self._ending = threading.Thread(target=control.end, args=(_END_S,), name=f"ending {self.path}", daemon=True)
+            name = f"ending {self.path}"
+            self._ending = threading.Thread(target=control.end, args=(_ENDED_S,), name=name, daemon=True)
             self._ending.start()
         if states is not None:
             states.kill()

@@ -79,7 +79,7 @@ class Scale(_Order, frozen=True):
     fraction: float
 
 
-class Hello(Struct, frozen=True, tag=True, array_like=True):
+class Ready(Struct, frozen=True, tag=True, array_like=True):
     """Ready for orders."""
 
 
@@ -101,7 +101,7 @@ class Done(Struct, frozen=True, tag=True, array_like=True):
 
 
 class HeartbeatAnswer(Struct, frozen=True, tag=True, array_like=True):
-    """The answer to a beat."""
+    """The answer to a heartbeat."""
 
     running: bool
     """True while a move runs."""
@@ -121,7 +121,7 @@ class Sample(Struct, frozen=True, tag=True, array_like=True):
 
 
 Order = Heartbeat | TakeControl | MoveJoints | MoveLine | Servo | Solve | Halt | Free | Scale
-Report = Hello | Failed | Done | HeartbeatAnswer | Sample
+Report = Ready | Failed | Done | HeartbeatAnswer | Sample
 
 
 class Channel(Generic[Message]):

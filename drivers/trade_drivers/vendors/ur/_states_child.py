@@ -12,19 +12,41 @@ import time
 from contextlib import suppress
 from typing import Any, Final
 
-from trade_drivers.vendors.ur._clock_offset import Age
 from trade_drivers.vendors.ur._dashboard import DashboardError, probe
-from trade_drivers.vendors.ur._messages import Channel, Disconnected, Done, Failed, Hello, Order, Sample, Scale
+from trade_drivers.vendors.ur._messages import Channel, Disconnected, Done, Failed, Order, Ready, Sample, Scale
 
 RATE_HZ: Final = 125.0
 _PROBE_S: Final = 1.0
 _PROBED_S: Final = 5.0
 """Timeout of probing three ports one after the other."""
 _STUCK_S: Final = 3.0
+_DRIFT: Final = 0.001
+"""The maximum rate difference of the clocks that does not make measurements appear older."""
 _FIELDS: Final = [
     *("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "robot_mode", "safety_mode"),
     *("robot_status_bits", "safety_status_bits", "runtime_state", "target_speed_fraction"),
 ]
+
+
+class Age:
+    """Estimates the offset of another clock from the time stamps of its measurements.
+
+    The message with the least delay so far counts as measured on arrival. A lasting delay is forgotten at the maximum
+    rate difference of the clocks: one of a second after a quarter of an hour.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns: int | None = None
+        self._at_ns = 0
+
+    def measured_ns(self, at_ns: int, stamp_ns: int) -> int:
+        """Returns when a message was measured by our clock: it arrived at ``at_ns``, stamped ``stamp_ns``."""
+        delay_ns = at_ns - stamp_ns
+        if self._least_ns is None:
+            self._least_ns = delay_ns
+        self._least_ns = min(delay_ns, self._least_ns + int(_DRIFT * (at_ns - self._at_ns)))
+        self._at_ns = at_ns
+        return at_ns - (delay_ns - self._least_ns)
 
 
 class Child:
@@ -45,7 +67,7 @@ class Child:
 
     def run(self) -> None:
         """Sends each new measurement, and executes orders in between."""
-        self._channel.send(Hello())
+        self._channel.send(Ready())
         while self._robot.isConnected():
             signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
             self._measure()

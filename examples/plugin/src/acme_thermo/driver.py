@@ -6,7 +6,8 @@ from typing import Annotated
 import serial
 from msgspec import Meta, Struct
 
-from trade_drivers import Measured, PolledSensor, SenseDriver, SensorInfo, robotfile
+import trade_robotfile
+from trade_drivers import Measured, PolledSensor, SenseDriver, SensorInfo
 
 
 class Options(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -52,6 +53,6 @@ class Thermo(PolledSensor):
 
 
 class ThermoDriver(SenseDriver):
-    def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Thermo:
+    def attach(self, name: str, device: trade_robotfile.Camera | trade_robotfile.Sensor, port: str | None) -> Thermo:
         options = device.options_as(Options)
         return Thermo(name, port or options.port, options.probes).start(f"{device.where}: {device.key}.port")

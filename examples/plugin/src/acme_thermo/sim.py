@@ -4,7 +4,6 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from trade_drivers.robotfile import Camera, Sensor
 from trade_hil_sim import (
     BusState,
     ByteLog,
@@ -20,6 +19,7 @@ from trade_hil_sim import (
     Unmute,
     Unplug,
 )
+from trade_robotfile import Camera, Sensor
 
 
 class ThermoSim:

@@ -21,8 +21,8 @@ from trade.errors import ConfigurationError, WrongDevice
 from trade.text_files import as_before, as_text
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._lerobot import imported, read_calibration
+from trade_gateway.terminal._output import Output
 
 if TYPE_CHECKING:
     import tomlkit

@@ -14,14 +14,14 @@ from trade.text_files import read_text
 from trade.toml_files import read_toml_text
 from trade_drivers import SerialBus, drivers, load, refusals
 from trade_drivers.plugins._ports import SeenPorts
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import choice_of, visitor
 from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.cli.hardware import _doctor_robot as robots
 from trade_gateway.cli.hardware._doctor_brltty import brltty
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._scan import serial_ports
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 

@@ -194,7 +194,7 @@ def _datagrams() -> socket.socket:
 def in_sight(member: Container, system: str) -> Iterator[Finding]:
     """Lists the containers of the system that are visible from here."""
     reachability = member.reachability(limit_s=_PATIENCE_S if member.settings.connect else 0)
-    for endpoint, why in reachability.apart.items():
+    for endpoint, why in reachability.unreached.items():
         fix = f"the text says what may be wrong; else correct {reachability.source}"
         text = f"no container answers there ({reachability.source}): {why}"
         yield Finding(level="error", about=endpoint, text=text, fix=fix)
@@ -208,7 +208,7 @@ def in_sight(member: Container, system: str) -> Iterator[Finding]:
     if others:
         yield Finding(level="ok", about=about, text=f"visible: {', '.join(others)}")
         return
-    if reachability.apart:
+    if reachability.unreached:
         return
     fix = "`trade up ROBOT.toml` starts one; another host needs the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
     yield Finding(level="ok", about=about, text="no container is visible", fix=fix)

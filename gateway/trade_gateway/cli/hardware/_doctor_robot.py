@@ -22,9 +22,9 @@ from trade_drivers import (
 )
 from trade_drivers.bus._jobs import SHARED, TAKEN
 from trade_drivers.plugins._ports import SeenPorts, check_ports
-from trade_drivers.robotfile import Gripper
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
+from trade_robotfile import Gripper
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import Link

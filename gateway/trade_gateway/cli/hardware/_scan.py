@@ -14,9 +14,9 @@ from trade.errors import ConfigurationError
 from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import CONNECTION, OUTPUT, SELECT, Json
-from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.hardware._robot_file_template import first_file
+from trade_gateway.terminal._options import CONNECTION, OUTPUT, SELECT, Json
+from trade_gateway.terminal._output import Output, complain
 
 _PORTS: Final = ("/dev/serial/by-id/*", "/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
 _CAN: Final = re.compile(r"[a-z0-9_]+:.+")
@@ -38,7 +38,7 @@ Baud = Annotated[
 Model = Annotated[str | None, typer.Option(rich_help_panel=SELECT, help="Refuse if the device is of another model.")]
 
 
-class Here(Found, frozen=True, kw_only=True):
+class FoundOnPort(Found, frozen=True, kw_only=True):
     """A device, with the port that it was found on."""
 
     port: str
@@ -81,11 +81,11 @@ def scan(
     if write is not None and write.exists():
         raise UsageError(where=str(write), problem="exists already; choose another name, or remove the file")
     rates, wanted = _numbers(bauds, "--bauds"), _numbers(ids, "--ids")
-    found: list[Here] = []
+    found: list[FoundOnPort] = []
     for line in port or []:
-        here = _scan_port(out, line, driver, rates, wanted)
-        found += [Here(**msgspec.structs.asdict(one), port=line) for one in here]
-    found += [Here(**msgspec.structs.asdict(_arm(one)), port=one) for one in host or []]
+        found_here = _scan_port(out, line, driver, rates, wanted)
+        found += [FoundOnPort(**msgspec.structs.asdict(one), port=line) for one in found_here]
+    found += [FoundOnPort(**msgspec.structs.asdict(_arm(one)), port=one) for one in host or []]
     if as_json:
         out.data(found)
     elif found:
@@ -244,7 +244,7 @@ def _print(out: Output, now: Found, text: str) -> None:
     out.say(escape(text))
 
 
-def _row(one: Here) -> tuple[str, ...]:
+def _row(one: FoundOnPort) -> tuple[str, ...]:
     baud, device_id = ("", "") if one.kind == "arm" else (str(one.baud), str(one.id))
     return one.port, baud, device_id, one.model, one.firmware, one.driver, one.problem
 

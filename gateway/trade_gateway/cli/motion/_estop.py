@@ -10,9 +10,9 @@ from trade._estop.controller import new_estop_id
 from trade.errors import NoSuchEstop
 from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, say_elsewhere, say_unreached
-from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, say_elsewhere, say_unreached
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 
 def estop(
@@ -65,7 +65,7 @@ def _end(report: EstopReport, found: Reachability, container: Container, *, clea
     system, known = container.settings.system, _known(report, container.address.who)
     if not (clear or known):
         say_elsewhere(container.settings)
-    if found.apart and not clear:
+    if found.unreached and not clear:
         raise found.as_error(system, "containers there were not stopped; use the switch that cuts the power")
     if clear and not found.complete:
         raise found.as_error(system, "an e-stop that is open there stays open; clear it again when they answer")
@@ -131,8 +131,9 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         hears = done == "stopped" or name not in report.versions
         problem = "did not answer" if hears else "can be cleared only by a `trade` of its own version"
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {problem}[/]")
-    if report.apart:
-        out.say(f"{len(report.apart)} containers did not answer; they may offer no services, so nothing to stop")
+    if report.without_services:
+        count = len(report.without_services)
+        out.say(f"{count} containers did not answer; they may offer no services, so nothing to stop")
     known = _known(report, own)
     if not known:
         out.say(f"[bold red]no container was found[/] in system {escape(system)} that has something to stop")

@@ -16,9 +16,9 @@ from typer.core import TyperCommand
 from trade import Constraint
 from trade.errors import LockLost
 from trade_gateway._usage import UsageError, asked_for
-from trade_gateway.cli._completion import groups
-from trade_gateway.cli._options import SELECT, TIMING
-from trade_gateway.cli._system_choice import SystemChoice, choice_of, visitor_among_others
+from trade_gateway.terminal._completion import groups
+from trade_gateway.terminal._options import SELECT, TIMING
+from trade_gateway.terminal._system_choice import SystemChoice, choice_of, visitor_among_others
 
 _COMMAND: Final = "trade_gateway.command"
 _KILLED_BY: Final = 128

@@ -10,10 +10,10 @@ from trade import Constraint, Container, LockInfo
 from trade._locks.api import RESUME_WAIT_S
 from trade.timestamps import clock
 from trade_gateway._usage import asked_for
-from trade_gateway.cli._completion import groups, locked_groups
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.terminal._completion import groups, locked_groups
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 _GROUP_HELP: Final = "A group, with the groups beneath it: rosie.head."
 _GROUPS_HELP: Final = "Groups, each with the groups beneath it: rosie.head."

@@ -6,11 +6,11 @@ import typer
 from rich.markup import escape
 
 from trade import StopReport
-from trade.stop_line import StopLines, together
-from trade_gateway.cli._completion import groups
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain, say_elsewhere, say_unreached
-from trade_gateway.cli._system_choice import choice_of, visitor
+from trade.stop_line import StopLines, merge_reports
+from trade_gateway.terminal._completion import groups
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain, say_elsewhere, say_unreached
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 _LINE_S: Final = 0.3
 """The time before it also stops over links, in seconds."""
@@ -41,7 +41,7 @@ def stop(
     report = asked.wait_enough(_LINE_S)
     if not asked.is_enough():  # a container without a stop line may have a link, or see one that has
         with visitor(context) as container:
-            report = together(group, [container.stop(group, reason, limit_s=limit), asked.report()])
+            report = merge_reports(group, [container.stop(group, reason, limit_s=limit), asked.report()])
             for sentence in () if report.complete else container.beyond():
                 complain(sentence)
     if as_json:

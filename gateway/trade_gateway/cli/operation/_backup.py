@@ -20,7 +20,6 @@ from trade.errors import ConfigurationError
 from trade.text_files import read_text
 from trade.toml_files import read_toml_text
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.operation._archive import (
     CONFIG,
     SQLITE_BESIDE,
@@ -33,6 +32,7 @@ from trade_gateway.cli.operation._archive import (
 )
 from trade_gateway.cli.operation._file_closure import Named, named_files
 from trade_gateway.supervisor._single_instance import held_in
+from trade_gateway.terminal._output import Output, complain
 
 _SQLITE: Final = b"SQLite format 3\0"
 _PATIENCE_S: Final = 10.0

@@ -9,8 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from trade.errors import ConfigurationError
-from trade.text_files import read_text
-from trade.toml_files import read_toml_text
+from trade_gateway.config._toml_file import read_toml
 
 _CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
 _LOCAL: Final = "local"
@@ -115,10 +114,8 @@ def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 
 def _read(path: Path, kind: type[_Table]) -> _Table:
+    _, raw = read_toml(path)
     try:
-        raw = read_toml_text(read_text(path))
         return msgspec.convert(raw, kind)
-    except FileNotFoundError:
-        raise ConfigurationError(where=str(path), problem="there is no such file") from None
-    except (OSError, ValueError) as bad:  # ValueError: no TOML, no UTF-8, or of another shape
+    except msgspec.ValidationError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None

@@ -18,10 +18,10 @@ from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._output import Output
 from trade_gateway.cli.operation._file_closure import Named, named_files
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, hidden_in, needs_of, program_folders, unit_text
 from trade_gateway.config._gateway_file import read_gateway_file
+from trade_gateway.terminal._output import Output
 
 _MARK: Final = re.compile(r"# Written by `trade install`; [^\n]* sha256 ([0-9a-f]{64})\n")
 _HEAD: Final = "# Written by `trade install`; what you change here it will not overwrite. sha256 {digest}\n{text}"

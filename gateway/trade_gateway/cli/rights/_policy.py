@@ -8,8 +8,8 @@ from rich.markup import escape
 
 from trade.policies import VERBS, Decision, Policy, decide_call, read_policy
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -21,7 +21,7 @@ File = Annotated[Path | None, typer.Option("--policy", envvar="TRADE_POLICY", he
 
 @app.command("check")
 def check(
-    who: Annotated[str, typer.Argument(help="Identity to check.")],
+    identity: Annotated[str, typer.Argument(help="Identity to check.")],
     verb: Annotated[str, typer.Argument(help=f"Verb: {', '.join(VERBS)}.")],
     what: Annotated[str, typer.Argument(help="Group or service: rosie.neck.move_to; _ is no group.")],
     policy: File = None,
@@ -35,7 +35,7 @@ def check(
     """
     if verb not in VERBS:
         raise UsageError(where=verb, problem=f"is no verb; use {', '.join(VERBS)}")
-    decision = _decision(_read(policy), who, verb, what)
+    decision = _decision(_read(policy), identity, verb, what)
     out = Output(as_json=as_json)
     if as_json:
         out.data(decision._asdict())
@@ -44,11 +44,11 @@ def check(
         raise typer.Exit(1)
 
 
-def _decision(policy: Policy, who: str, verb: str, what: str) -> Decision:
+def _decision(policy: Policy, identity: str, verb: str, what: str) -> Decision:
     group, _, function = what.partition(".")
     if group == "trade" and function and verb in {"call", "read"}:
-        return decide_call(policy, who, group, function, "actuate")[1]
-    return policy.decide(who, verb, what)
+        return decide_call(policy, identity, group, function, "actuate")[1]
+    return policy.decide(identity, verb, what)
 
 
 @app.command("show")
@@ -71,8 +71,8 @@ def show(policy: File = None, as_json: Json = False) -> None:
         out.say(f"revoked: {escape(', '.join(sorted(read.revoked)))}")
 
 
-def _groups(policy: Policy, who: str) -> dict[str, list[str]]:
-    return {verb: policy.groups_of(who, (verb,)) for verb in VERBS}
+def _groups(policy: Policy, identity: str) -> dict[str, list[str]]:
+    return {verb: policy.groups_of(identity, (verb,)) for verb in VERBS}
 
 
 def _read(path: Path | None) -> Policy:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 from trade import Container, where
 from trade.errors import ConfigurationError, DeviceAbsent, TradeError
 from trade_drivers import FaultInfo
-from trade_drivers.robotfile import Robot
 from trade_gateway.process._signals import SignalEvent
+from trade_robotfile import Robot
 
 if TYPE_CHECKING:  # importing them delays the start of a robot that needs none of them
     from trade_gateway.config._children import Child

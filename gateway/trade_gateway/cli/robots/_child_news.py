@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from trade_gateway.cli._output import Output, complain
+from trade_gateway.terminal._output import Output, complain
 
 if TYPE_CHECKING:
     from trade_gateway.supervisor import News

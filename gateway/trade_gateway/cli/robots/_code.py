@@ -7,9 +7,9 @@ import typer
 from rich.markup import escape
 
 from trade.starting import hash_of, pack
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
 
 def code(

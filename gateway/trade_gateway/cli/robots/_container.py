@@ -7,11 +7,11 @@ import typer
 from rich.markup import escape
 
 from trade import Container
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import choice_of
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.process._signals import leaving, refuse_twice, settle
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import choice_of
 
 _LOOK_EVERY_S = 0.2
 

@@ -12,19 +12,19 @@ from rich.markup import escape
 from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli.robots._child_news import say_news
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._file_changes import Named, digest, named_by
 from trade_gateway.cli.robots._hub import allow_many_links
-from trade_gateway.config._changes import Named, digest, named_by
-from trade_gateway.config._described import described
 from trade_gateway.config._gateway_file import Plan, read_gateway_file
 from trade_gateway.process._addresses import forwarding
 from trade_gateway.process._signals import hangups, leaving, settle
 from trade_gateway.sharing._guests import Guests, opened
 from trade_gateway.supervisor import ChildServices, News, Supervisor
+from trade_gateway.supervisor._described import described
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._sd_notify import Notifier
 
 _LOOK_EVERY_S: Final = 1.0
 
@@ -141,9 +141,9 @@ class Gateway:
         changed = named.since(self._named)
         reopen = reopen or named.digests != self._named.digests
         try:
-            self._go_by(plan, reopen=reopen)
+            self._set_plan(plan, reopen=reopen)
         except TradeError as refused:
-            self._go_by(self._plan, reopen=False)
+            self._set_plan(self._plan, reopen=False)
             complain(f"{file} was changed and cannot be used; continuing as before: {refused}")
             return False
         self._plan, self._named = plan, named
@@ -154,7 +154,7 @@ class Gateway:
             out.data({"reloaded": str(file), "changed": changed})
         return True
 
-    def _go_by(self, plan: Plan, *, reopen: bool) -> None:
+    def _set_plan(self, plan: Plan, *, reopen: bool) -> None:
         if reopen or plan.settings != self._running:
             self._running = None
             self._leave_networks()

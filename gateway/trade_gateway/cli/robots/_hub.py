@@ -8,12 +8,12 @@ from typing import Annotated, Final
 import typer
 
 from trade import Container
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._sd_notify import Notifier
-from trade_gateway.cli._system_choice import choice_of
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.process._signals import leaving, settle
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._sd_notify import Notifier
+from trade_gateway.terminal._system_choice import choice_of
 
 _LOOK_EVERY_S: Final = 1.0
 

@@ -6,11 +6,11 @@ import typer
 from rich.markup import escape
 
 from trade_gateway._usage import asked_for
-from trade_gateway.cli._completion import containers, groups
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.cli.services._services import describe
+from trade_gateway.terminal._completion import containers, groups
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 
 def migrate(

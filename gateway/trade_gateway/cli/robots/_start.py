@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._options import CONNECTION, SECURITY, TIMING, Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
+from trade_gateway.terminal._options import CONNECTION, SECURITY, TIMING, Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
 
 def start(

@@ -14,17 +14,17 @@ from trade.errors import ConfigurationError, as_commands
 from trade_drivers import AttachedRobot, FaultInfo, attach, load, without
 from trade_drivers import check as drivers_check
 from trade_drivers.plugins._ports import check_ports
-from trade_drivers.robotfile import Robot
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import CONNECTION, SELECT, Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._sd_notify import Notifier
-from trade_gateway.cli._system_choice import choice_of
 from trade_gateway.cli.robots._bus_processes import BusProcesses
 from trade_gateway.cli.robots._child_news import say_news
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.process._real_time import RealTime
 from trade_gateway.process._signals import leaving, refuse_twice, settle
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import CONNECTION, SELECT, Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._sd_notify import Notifier
+from trade_gateway.terminal._system_choice import choice_of
+from trade_robotfile import Robot
 
 _SIMULATION: Final = "Simulation"
 

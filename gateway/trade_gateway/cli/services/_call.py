@@ -3,26 +3,22 @@
 import math
 import re
 import shlex
-import signal
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Mapping
 from typing import Annotated, Any, Final
 
 import msgspec
 import typer
 
-from trade import Handle
 from trade._protocol.keys import is_chunk
 from trade._protocol.messages import ServiceInfo
 from trade._protocol.schema import read_schema
-from trade.errors import TradeError
 from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError, find
-from trade_gateway.cli._completion import containers, services
-from trade_gateway.cli._options import TIMING, Json, Wait
-from trade_gateway.cli._output import Output, say_error
-from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.terminal._calls import run_to_end
+from trade_gateway.terminal._completion import containers, services
+from trade_gateway.terminal._options import TIMING, Json, Wait
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import choice_of, visitor
 
 _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
@@ -96,41 +92,6 @@ def _stopped_by_line(context: typer.Context, service: str, limit_s: float) -> bo
     asked = StopLines(choice_of(context).settings()).stop(group, f"trade call {service}", min(limit_s, _STOP_LIMIT_S))
     report = asked.wait_enough()
     return asked.is_enough() and service in report.stopped
-
-
-def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
-    """Calls a service; Ctrl-C and similar signals cancel the call and raise KeyboardInterrupt."""
-    with _interruptible():
-        run = handle.start(*args, **kwargs)
-        try:
-            return run.result()
-        except KeyboardInterrupt:
-            _cancel(handle)
-            raise
-
-
-@contextmanager
-def _interruptible() -> Generator[None]:
-    """Makes SIGTERM and SIGHUP end a call as Ctrl-C does, so that its motion is stopped."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    numbers = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _cancel(handle: Handle) -> None:
-    """Cancels the call after Ctrl-C, and reports if that failed."""
-    try:
-        handle.cancel_service()()
-    except TradeError as error:
-        say_error(error)
 
 
 def check_brackets(texts: list[str]) -> None:

@@ -11,12 +11,12 @@ from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
 from trade._calls.pddl import domain_of
 from trade._protocol.messages import PROTOCOL
 from trade_gateway._usage import UsageError, asked_for
-from trade_gateway.cli import _completion as completion
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import NOT_FOUND, Output, complain
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.cli.services._states import State, say_state
 from trade_gateway.clients._load_table import loads, loads_table
+from trade_gateway.terminal import _completion as completion
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import NOT_FOUND, Output, complain
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 HEALTHY: Final = "healthy"
 _CONDITIONS: Final = "Conditions"

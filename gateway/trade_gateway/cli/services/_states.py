@@ -10,7 +10,7 @@ from msgspec import Struct
 from trade import Container, LinkInfo, ListenerInfo, NetworkInfo, StateEvent
 from trade.errors import AccessDenied
 from trade.timestamps import clock
-from trade_gateway.cli._output import Output, complain
+from trade_gateway.terminal._output import Output, complain
 
 Row = tuple[str, ...]
 

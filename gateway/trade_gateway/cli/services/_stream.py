@@ -9,10 +9,10 @@ import typer
 from trade import Sample
 from trade.timestamps import clock
 from trade_gateway._usage import find
-from trade_gateway.cli._completion import services
-from trade_gateway.cli._options import OUTPUT, SELECT, TIMING, Json, Wait
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
+from trade_gateway.terminal._completion import services
+from trade_gateway.terminal._options import OUTPUT, SELECT, TIMING, Json, Wait
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
 
 def stream(

@@ -12,9 +12,9 @@ from trade._chosen_system import CHOSEN, chosen_file, chosen_settings
 from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import choice_of
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import choice_of
 
 _MODE = 0o600
 

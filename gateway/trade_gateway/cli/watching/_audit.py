@@ -19,8 +19,8 @@ from trade._context.sessions import client_of
 from trade.auditing import AuditRow, ChainCheck, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import FirstByDefault, Json
-from trade_gateway.cli._output import Output, complain
+from trade_gateway.terminal._options import FirstByDefault, Json
+from trade_gateway.terminal._output import Output, complain
 
 _EVERY_S: Final = 0.5
 _UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}

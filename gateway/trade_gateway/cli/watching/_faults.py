@@ -11,9 +11,9 @@ from trade import Container, where
 from trade.errors import InvalidArgument, TradeError, as_commands
 from trade.timestamps import day_and_clock
 from trade_gateway._usage import UsageError, asked_for
-from trade_gateway.cli._options import FirstByDefault, Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.terminal._options import FirstByDefault, Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 if TYPE_CHECKING:
     from trade import Handle

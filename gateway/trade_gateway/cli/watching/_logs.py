@@ -9,10 +9,10 @@ from rich.markup import escape
 
 from trade import LogLine, LogReader
 from trade.timestamps import clock
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.cli.watching._trace import Name
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 _EVERY_S: Final = 0.5
 Level = Literal["debug", "info", "warning", "error", "critical"]

@@ -6,10 +6,10 @@ import typer
 from rich.markup import escape
 
 from trade import HookInfo, NotificationInfo
-from trade_gateway.cli import _completion as completion
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.terminal import _completion as completion
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 
 def notifications(

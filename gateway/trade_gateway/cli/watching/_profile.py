@@ -16,10 +16,10 @@ from trade.atomic_files import replace
 from trade.errors import ConfigurationError
 from trade.text_files import read_text
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import visitor_among_others
 from trade_gateway.cli.watching._trace import Name
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 
 def write(path: Path, model: CallModel) -> None:

@@ -11,12 +11,12 @@ from trade import Container, where
 from trade.errors import TradeError
 from trade.rules import GROUP, DryRun, Firing, RuleInfo, Rules, StepResult, read_rules, rehearse
 from trade.timestamps import clock
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, complain
-from trade_gateway.cli._system_choice import choice_of, visitor_among_others
-from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.cli.watching.rule_file import RuleFile
 from trade_gateway.process._signals import hangups, leaving, refuse_twice
+from trade_gateway.terminal._detached import Detach, detach_now, ready
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, complain
+from trade_gateway.terminal._system_choice import choice_of, visitor_among_others
 
 _LOOK_EVERY_S: Final = 0.5
 
@@ -56,7 +56,7 @@ def run(
         leaving() as asked_to_leave,
         hangups() as hangup,
         Container(settings, on_terminate=asked_to_leave.set) as container,
-        Rules(container, file, audit=audit, dry_run=dry_run, tell=firings.put) as rules,
+        Rules(container, file, audit=audit, dry_run=dry_run, callback=firings.put) as rules,
     ):
         container.register_functions(RuleFile(container, file), "rule_file")
         refuse_twice(container, "trade rules run")

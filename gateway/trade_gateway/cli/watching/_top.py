@@ -17,10 +17,10 @@ from rich.text import Text
 from trade import Container, Handle, LoadInfo, where
 from trade._protocol.messages import HEALTHY
 from trade.timestamps import clock
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output, table_lines
-from trade_gateway.cli._system_choice import visitor
 from trade_gateway.clients._load_table import loads_table
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output, table_lines
+from trade_gateway.terminal._system_choice import visitor
 
 _ANSWERS_WITHIN_S: Final = 1.0
 

@@ -8,9 +8,9 @@ import typer
 from trade import Span, Trace
 from trade.timestamps import clock
 from trade_gateway._usage import UsageError
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor_among_others
 
 _LATEST: Final = 20
 

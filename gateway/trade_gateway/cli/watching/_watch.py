@@ -17,9 +17,9 @@ from trade._protocol.messages import HEALTHY
 from trade.errors import TradeError
 from trade.timestamps import clock
 from trade_gateway._usage import asked_for
-from trade_gateway.cli._options import Json
-from trade_gateway.cli._output import Output
-from trade_gateway.cli._system_choice import visitor
+from trade_gateway.terminal._options import Json
+from trade_gateway.terminal._output import Output
+from trade_gateway.terminal._system_choice import visitor
 
 _EVERY_S: Final = 0.3
 """Events of one container within this time share a line."""

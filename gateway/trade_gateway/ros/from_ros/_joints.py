@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from trade import Meta, Resource, current_call, service
+from trade._protocol.schema_types import publish
 from trade.errors import InvalidArgument
 from trade_drivers import Trajectory
 from trade_gateway.ros._file import FromJoints
@@ -39,6 +40,9 @@ class RosJoint(Struct, frozen=True, kw_only=True):
     effort_nm: float | None
     age_s: float
     """The age of this state in seconds."""
+
+
+publish("trade_gateway.ros", RosJoint)
 
 
 class RosJoints:

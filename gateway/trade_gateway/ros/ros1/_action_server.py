@@ -37,7 +37,7 @@ _NEVER: Final[Time] = {"sec": 0, "nanosec": 0}
 _log: Final = logging.getLogger("trade.ros1")
 
 
-class _Taken:
+class _ServedGoal:
     """A received goal. See `Goal`; changed under the server's lock."""
 
     def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str, at: float) -> None:
@@ -55,12 +55,12 @@ class _Taken:
     def feedback(self, message: Mapping[str, Any]) -> None:
         self._server.feedback(self, message)
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         with self._server.lock:
             if not self._canceled:
-                self._callbacks.append(tell)
+                self._callbacks.append(callback)
                 return
-        tell()
+        callback()
 
     def cancel(self) -> None:
         """Requests its end."""
@@ -68,9 +68,9 @@ class _Taken:
             callbacks, self._callbacks, self._canceled = self._callbacks, [], True
             if self.status is Status.ACTIVE:
                 self.status = Status.PREEMPTING
-        for tell in callbacks:
+        for callback in callbacks:
             try:
-                tell()
+                callback()
             except Exception:  # noqa: BLE001 - the callback is the user's
                 _log.exception("the cancel of a goal failed")
 
@@ -93,10 +93,10 @@ class ActionServer:
         self._numbers = itertools.count(1)
         self._node = graph.node
         self.lock = threading.RLock()
-        self._goals: dict[str, _Taken] = {}
+        self._goals: dict[str, _ServedGoal] = {}
         self._early: dict[str, float] = {}
-        self._running: _Taken | None = None
-        self._waiting: _Taken | None = None
+        self._running: _ServedGoal | None = None
+        self._waiting: _ServedGoal | None = None
         self._cancels_until = (0, 0)
         self._closed = threading.Event()
         self._idle = threading.Condition(self.lock)
@@ -108,9 +108,9 @@ class ActionServer:
         # a latched message is not a goal: it may be as old as its publisher
         _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE, latched=False)
         self._ends = (*cancels, *goals, self._result.close, self._feedback.close, self._status.close)
-        threading.Thread(target=self._tell_often, name=f"trade-ros1{name}/status", daemon=True).start()
+        threading.Thread(target=self._publish_status, name=f"trade-ros1{name}/status", daemon=True).start()
 
-    def feedback(self, goal: _Taken, message: Mapping[str, Any]) -> None:
+    def feedback(self, goal: _ServedGoal, message: Mapping[str, Any]) -> None:
         """Sends feedback to the client of a goal."""
         with self.lock:
             state = goal.state
@@ -137,7 +137,7 @@ class ActionServer:
         number = message["goal_id"]["id"] or f"{self._node}-{next(self._numbers)}-{time.time():.9f}"
         sent = _of(message["goal_id"]["stamp"])
         goal_id: Message = {"id": number, "stamp": day(at) if sent == (0, 0) else message["goal_id"]["stamp"]}
-        taken = _Taken(self, goal_id, message["goal"], who, at)
+        taken = _ServedGoal(self, goal_id, message["goal"], who, at)
         refused = None if self._refuse is None else self._refuse(taken.message)
         with self.lock:
             if number in self._goals or self._closed.is_set():
@@ -174,7 +174,7 @@ class ActionServer:
         for goal in meant:
             self._cancel(goal)
 
-    def _cancel(self, goal: _Taken) -> None:
+    def _cancel(self, goal: _ServedGoal) -> None:
         with self.lock:
             waits = self._waiting is goal
             if waits:
@@ -197,7 +197,7 @@ class ActionServer:
         self._tell()
         run.start()
 
-    def _run(self, goal: _Taken) -> None:
+    def _run(self, goal: _ServedGoal) -> None:
         try:
             outcome = self._do(goal)
             self._end(goal, _HOW[outcome.how], outcome.result, outcome.text)
@@ -209,7 +209,7 @@ class ActionServer:
                 self._idle.notify_all()
             self._next()
 
-    def _end(self, goal: _Taken, status: Status, result: Mapping[str, Any], text: str) -> None:
+    def _end(self, goal: _ServedGoal, status: Status, result: Mapping[str, Any], text: str) -> None:
         state = {"goal_id": goal.goal_id, "status": int(status), "text": text}
         made = {"header": {"stamp": now()}, "status": state, "result": result}
         try:
@@ -223,7 +223,7 @@ class ActionServer:
 
     # --- status
 
-    def _tell_often(self) -> None:
+    def _publish_status(self) -> None:
         while not self._closed.wait(_EVERY_S):
             self._tell()
 
@@ -241,7 +241,7 @@ class ActionServer:
             self._status.send({"header": {"stamp": now()}, "status_list": states})
 
 
-def _is_meant(goal: _Taken, number: str, until: tuple[int, int]) -> bool:
+def _is_meant(goal: _ServedGoal, number: str, until: tuple[int, int]) -> bool:
     """Whether a cancel matches a goal: by its id; by its time, this and all goals before; with neither, always."""
     if not number and until == (0, 0):
         return True

@@ -30,7 +30,10 @@ _STEADY_S: Final = 10.0
 
 
 class Child:
-    """The child process. `came` receives the channel of each new one, `gone` reports its end, `heard` gets frames."""
+    """The child process.
+
+    `on_start` gets the channel of each new one, `on_end` reports its end, and `on_frame` gets its frames.
+    """
 
     def __init__(
         self,
@@ -39,14 +42,14 @@ class Child:
         node: str,
         python: str,
         ip: str,
-        came: Callable[[Channel], object],
-        gone: Callable[[], object],
-        heard: Callable[[Head, bytes], object],
+        on_start: Callable[[Channel], object],
+        on_end: Callable[[], object],
+        on_frame: Callable[[Head, bytes], object],
     ) -> None:
         self._command = [python, "-B", "-c", _START, _HERE]
         self._arguments = [master, node]
         self._environment = environment(master, ip)
-        self._callbacks = came, gone, heard
+        self._callbacks = on_start, on_end, on_frame
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._channel: Channel | None = None
@@ -137,9 +140,9 @@ class Child:
 class _Signs:
     """The signs of life among the frames."""
 
-    def __init__(self, sock: socket.socket, heard: Callable[[Head, bytes], object]) -> None:
+    def __init__(self, sock: socket.socket, on_frame: Callable[[Head, bytes], object]) -> None:
         self._sock = sock
-        self._heard = heard
+        self._on_frame = on_frame
         self._patience_s = _START_S
         self._at = time.monotonic()
 
@@ -148,7 +151,7 @@ class _Signs:
             self._patience_s = _SILENT_S
             self._sock.settimeout(_SILENT_S)
         else:
-            self._heard(head, body)
+            self._on_frame(head, body)
         self._at = time.monotonic()
 
     @property

@@ -70,7 +70,13 @@ class Link:
         self._closed = False
         self._problem: str | None = None
         self._child = Child(
-            master=master, node=node, python=python, ip=ip, came=self._came, gone=self._gone, heard=self._heard
+            master=master,
+            node=node,
+            python=python,
+            ip=ip,
+            on_start=self._on_start,
+            on_end=self._on_end,
+            on_frame=self._on_frame,
         )
 
     @property
@@ -168,7 +174,7 @@ class Link:
         if self._channel is not None:
             self._channel.put(head, body, key=key, most=most)
 
-    def _came(self, channel: Channel) -> None:
+    def _on_start(self, channel: Channel) -> None:
         with self._state:
             self._channel = channel
             for opened in self._open.values():
@@ -177,7 +183,7 @@ class Link:
                     self._put({"op": "message", "id": opened.number}, opened.last)
             self._state.notify_all()
 
-    def _gone(self) -> None:
+    def _on_end(self) -> None:
         with self._state:
             self._channel, self._problem = None, None
             lost = list(self._asked.values())
@@ -186,7 +192,7 @@ class Link:
             answered.set_result(_Answer({"failed": "unreachable", "problem": _GONE}, b""))
         self._alone()
 
-    def _heard(self, head: Head, body: bytes) -> None:
+    def _on_frame(self, head: Head, body: bytes) -> None:
         match head["op"]:
             case "health":
                 self._problem = head["problem"]

@@ -156,21 +156,21 @@ class Ros1(Graph):
         head = self._topic("publish", topic, type_name)
         return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
         def came(message: Message, who: str, _: float) -> None:
-            heard(message, who)
+            callback(message, who)
 
         return self._closing(self.hear(topic, type_name, came, most=_NEWEST, latched=latched)[1])
 
     def hear(
-        self, topic: str, type_name: str, heard: HeardAt, *, most: int, latched: bool = True
+        self, topic: str, type_name: str, callback: HeardAt, *, most: int, latched: bool = True
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
         """As `subscribe`; at most `most` messages wait, the newest ones. The node shares our monotonic clock."""
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
 
         def tell(message: tuple[Head, bytes]) -> None:
             head, body = message
-            heard(self._types.from_bytes(type_name, body), head["who"], head["at"])
+            callback(self._types.from_bytes(type_name, body), head["who"], head["at"])
 
         mailbox = Mailbox[tuple[Head, bytes]](f"trade-ros1{topic}", tell, most=most, end_s=0.0)
 

@@ -55,13 +55,13 @@ class Pursued(Goal):
         """See `Goal`. Raises ConfigurationError: the message does not fit the type."""
         self._action.feedback.send({"goal_id": uuid(self.id), "feedback": message})
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         """See `Goal`."""
         with self._lock:
             if not self._canceled:
-                self._tell.append(tell)
+                self._tell.append(callback)
                 return
-        tell()
+        callback()
 
     @property
     def canceled(self) -> bool:
@@ -143,8 +143,8 @@ class Action:
             )
             goal.thread.start()
 
-    def _cancel(self, asked: ServiceRequest) -> None:
-        info = asked.request()["goal_info"]
+    def _cancel(self, request: ServiceRequest) -> None:
+        info = request.request()["goal_info"]
         goal_id, until_ns = info["goal_id"]["uuid"], _nanoseconds(info["stamp"])
         with self._lock:
             known = self._goals.get(goal_id)
@@ -154,20 +154,20 @@ class Action:
         for goal in ending:
             goal.cancel()
         self._tell_status()
-        asked.answer({"return_code": _refusal(goal_id, known, ending), "goals_canceling": [g.info() for g in ending]})
+        request.answer({"return_code": _refusal(goal_id, known, ending), "goals_canceling": [g.info() for g in ending]})
 
-    def _result(self, asked: ServiceRequest) -> None:
-        goal_id = asked.request()["goal_id"]["uuid"]
+    def _result(self, request: ServiceRequest) -> None:
+        goal_id = request.request()["goal_id"]["uuid"]
         with self._lock:
             goal = self._goals.get(goal_id)
             if goal is not None and goal.outcome is None:
-                goal.waiting.append(asked)
+                goal.waiting.append(request)
                 return
-        asked.answer({"status": Status.UNKNOWN} if goal is None else _status_of(goal))
+        request.answer({"status": Status.UNKNOWN} if goal is None else _status_of(goal))
 
     # --- execution
 
-    def _pursue(self, goal: Pursued, before: list[Pursued], asked: ServiceRequest) -> None:
+    def _pursue(self, goal: Pursued, before: list[Pursued], request: ServiceRequest) -> None:
         with self._lock:
             goal.status = max(goal.status, Status.EXECUTING)
             for other in before:
@@ -176,7 +176,7 @@ class Action:
         for other in before:
             other.cancel()
         self._tell_status()
-        goal.of = asked.who()
+        goal.of = request.who()
         try:
             self._end(goal, Outcome(Ended.CANCELED, {}) if goal.canceled else self._do(goal))
         except Exception:  # noqa: BLE001 - its client receives the failure

@@ -139,11 +139,11 @@ class Pursuing:
             self._over.set()
             self._abandon(why)
 
-    def _abandon(self, why: RosUnreachable) -> None:
+    def _abandon(self, reason: RosUnreachable) -> None:
         """S05: the goal may still run, so this cancels it repeatedly for some time."""
-        threading.Thread(target=self._end, args=(why,), name=f"ros2 end {self._name}", daemon=True).start()
+        threading.Thread(target=self._end, args=(reason,), name=f"ros2 end {self._name}", daemon=True).start()
 
-    def _end(self, why: RosUnreachable) -> None:
+    def _end(self, reason: RosUnreachable) -> None:
         deadline = time.monotonic() + _ABANDON_S
         canceled, ended = False, False
         while not ended and time.monotonic() < deadline and not self._closed.is_set():
@@ -152,7 +152,7 @@ class Pursuing:
             ended = refusal is Refusal.GOAL_TERMINATED or (canceled and self._has_ended(deadline - time.monotonic()))
             if not ended:
                 self._closed.wait(_AGAIN_S)
-        problem = f"{why.problem}; {_end_of(canceled=canceled, ended=ended)}"
+        problem = f"{reason.problem}; {_end_of(canceled=canceled, ended=ended)}"
         self._finish(RosUnreachable(what=self._name, problem=problem))
 
     def _cancel_once(self) -> Refusal | None:

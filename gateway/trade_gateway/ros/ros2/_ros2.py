@@ -78,7 +78,7 @@ class Ros2(Graph):
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""
         return self._keep(Topic(self._node, topic, type_name, latched=latched))
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
+    def subscribe(self, topic: str, type_name: str, callback: Heard, *, latched: bool = False) -> Closes:
         """See `Graph`; latched: also delivers earlier messages that the publisher keeps.
 
         While a call of `heard` lasts, at most ten messages wait, each for at most a second.
@@ -86,7 +86,7 @@ class Ros2(Graph):
         Raises:
             ConfigurationError: its name or type is invalid.
         """
-        return self._keep(TopicHeard(self._node, topic, type_name, heard, latched=latched))
+        return self._keep(TopicHeard(self._node, topic, type_name, callback, latched=latched))
 
     def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         """See `Graph`. Raises ConfigurationError: its name or type is invalid."""

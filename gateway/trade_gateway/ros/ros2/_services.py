@@ -72,8 +72,8 @@ class ServiceRequest:
             self._query.reply_err(problem.encode())
 
     def _attachment(self) -> bytes | None:
-        asked = self._sender.attached
-        return None if asked is None else asked._replace(time_ns=time.time_ns()).to_bytes()
+        attachment = self._sender.attached
+        return None if attachment is None else attachment._replace(time_ns=time.time_ns()).to_bytes()
 
 
 class Server:

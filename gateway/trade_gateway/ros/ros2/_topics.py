@@ -94,11 +94,11 @@ class Topic:
 class TopicHeard:
     """A topic subscription."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, heard: Heard, *, latched: bool) -> None:
+    def __init__(self, node: Node, topic: str, type_name: str, callback: Heard, *, latched: bool) -> None:
         self._endpoint = node.topic(Kind.SUBSCRIPTION, topic, type_name, LATCHED if latched else USUAL)
         self._node = node
         self._type_name = type_name
-        self._heard = heard
+        self._heard = callback
         self._latched = latched
         longest_s = float("inf") if latched else _LATE_S
         self._mailbox = Mailbox[_Came](f"ros2 {topic}", self._tell, most=_DEPTH, longest_s=longest_s)
@@ -112,8 +112,8 @@ class TopicHeard:
     def _put(self, sample: zenoh.Sample) -> None:
         self._mailbox.put((sample, self._node.sender(sample.attachment)))
 
-    def _tell(self, came: _Came) -> None:
-        sample, sender = came
+    def _tell(self, received_at: _Came) -> None:
+        sample, sender = received_at
         try:
             message = self._node.types.from_bytes(self._type_name, sample.payload.to_bytes())
         except ValueError as malformed:

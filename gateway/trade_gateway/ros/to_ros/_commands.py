@@ -60,25 +60,25 @@ class CommandsToRos:
         if handle.effect == "stop":
             problem = "is a stop, which any node may call at any time; a topic accepts one node. Use [[to_ros.service]]"
             raise ConfigurationError(where=handle.label, problem=problem)
-        asked = RequestMapping(self._graph.types, entry.type, handle, entry.args, entry.fixed)
+        request_mapping = RequestMapping(self._graph.types, entry.type, handle, entry.args, entry.fixed)
         stops = stops_of(self._container, handle) if handle.effect == "actuate" else []
         if handle.effect == "actuate" and not stops:
             problem = "has no stop, so silence could not end a command's motion"
             raise ConfigurationError(where=handle.label, problem=problem)
-        executor = _TopicExecutor(entry, handle, asked, stops, self._nodes, self._say)
+        executor = _TopicExecutor(entry, handle, request_mapping, stops, self._nodes, self._say)
         try:
-            executor.hears(self._graph.subscribe(place.name, entry.type, executor.heard))
+            executor.set_subscription(self._graph.subscribe(place.name, entry.type, executor.on_message))
         except BaseException:
             executor.close()
             raise
         return executor
 
 
-class _Commanded(NamedTuple):
+class _Command(NamedTuple):
     """A waiting message."""
 
     message: Message
-    who: str
+    node_name: str
     at: float
     admitted: int | None
     """The number of stops that its node had requested before."""
@@ -91,59 +91,61 @@ class _TopicExecutor:
         self,
         entry: Command,
         handle: Handle,
-        asked: RequestMapping,
+        request_mapping: RequestMapping,
         stops: Sequence[Handle],
         nodes: Nodes,
         say: Callable[[str], object],
     ) -> None:
         self._entry = entry
         self._handle = handle
-        self._asked = asked
+        self._request_mapping = request_mapping
         self._stops = stops
         self._nodes = nodes
         self._say = say
-        self._news = threading.Condition()
-        self._newest: _Commanded | None = None
+        self._changed = threading.Condition()
+        self._newest: _Command | None = None
         self._owner: str | None = None
-        self._heard_at = 0.0
+        self._last_message_at = 0.0
         self._closing = False
         self._guest: Guest | None = None
         self._watched: Client | None = None
         """The client whose end wakes the thread."""
-        self._grip = ExitStack()
+        self._held_locks = ExitStack()
         self._runs: list[Run] = []
         self._problem = ("", 0.0)
         self._subscription: Closes | None = None
         self._thread = threading.Thread(target=self._run, name="trade-ros-command", daemon=True)
         self._thread.start()
 
-    def hears(self, subscription: Closes) -> None:
+    def set_subscription(self, subscription: Closes) -> None:
         """Sets the subscription that delivers the messages."""
         self._subscription = subscription
 
-    def heard(self, message: Message, who: str) -> None:
+    def on_message(self, message: Message, node_name: str) -> None:
         """Queues a message. Does not wait."""
-        with self._news:
-            if self._owner not in (None, who):
-                self._report(f"{who or 'another node'} is refused on {self._entry.topic}: {self._owner} commands there")
+        with self._changed:
+            if self._owner not in (None, node_name):
+                self._report(
+                    f"{node_name or 'another node'} is refused on {self._entry.topic}: {self._owner} commands there"
+                )
                 return
-            self._owner, self._heard_at = who, time.monotonic()
+            self._owner, self._last_message_at = node_name, time.monotonic()
             guest = self._guest
-            number = None if guest is None or guest.who != who else guest.client.admit(self._handle)
-            self._newest = _Commanded(message, who, self._heard_at, number)
-            self._news.notify()
+            number = None if guest is None or guest.who != node_name else guest.client.admit(self._handle)
+            self._newest = _Command(message, node_name, self._last_message_at, number)
+            self._changed.notify()
 
     # --- its thread
 
     def _run(self) -> None:
         while True:
-            with self._news:
-                self._news.wait_for(self._ready, self._left_s())
+            with self._changed:
+                self._changed.wait_for(self._ready, self._left_s())
                 if self._closing:
                     break
                 newest = self._newest if self._may_begin() else None
                 self._newest = None if newest is not None else self._newest
-                reason = self._over()
+                reason = self._end_reason()
             try:
                 if reason:
                     self._end(reason)
@@ -154,23 +156,23 @@ class _TopicExecutor:
         self._end(f"{self._entry.topic} is not mapped any more")
 
     def _ready(self) -> bool:
-        return self._closing or bool(self._over()) or (self._newest is not None and self._may_begin())
+        return self._closing or bool(self._end_reason()) or (self._newest is not None and self._may_begin())
 
     def _left_s(self) -> float | None:
         """Remaining time until the silence is too long."""
         if self._owner is None:
             return None
-        return max(0.0, self._heard_at + self._entry.deadman_s - time.monotonic())
+        return max(0.0, self._last_message_at + self._entry.deadman_s - time.monotonic())
 
     def _may_begin(self) -> bool:
         self._runs = [run for run in self._runs if not run.done()] + [run for run in self._runs[-1:] if run.done()]
         return sum(not run.done() for run in self._runs) < _MOST_UNDER_WAY
 
-    def _over(self) -> str:
+    def _end_reason(self) -> str:
         """Why the commanding node's turn ends; empty if it continues."""
         if self._owner is None:
             return ""
-        if time.monotonic() - self._heard_at >= self._entry.deadman_s:
+        if time.monotonic() - self._last_message_at >= self._entry.deadman_s:
             return f"no message on {self._entry.topic} for {self._entry.deadman_s:g} s"
         if self._guest is not None and self._guest.client.closed:
             return f"{self._guest.named} is gone"
@@ -178,38 +180,38 @@ class _TopicExecutor:
             return f"{self._entry.topic}: {failure(error)}"
         return ""
 
-    def _begin(self, command: _Commanded) -> None:
+    def _begin(self, command: _Command) -> None:
         """Calls the service with a command; an error ends the node's turn."""
         if time.monotonic() - command.at >= self._entry.deadman_s:
             return
-        guest = self._nodes.guest(command.who, command.at)
+        guest = self._nodes.guest(command.node_name, command.at)
         if self._handle.effect == "actuate" and self._guest is not guest:
-            self._grip.close()
+            self._held_locks.close()
             hold = guest.grips.hold([self._handle], f"commands of {guest.named} on {self._entry.topic}", 0.0)
-            self._grip.enter_context(hold)
+            self._held_locks.enter_context(hold)
         if self._guest is not guest:
             self._guest = guest
             if self._watched is not guest.client:
                 self._watched = guest.client
                 guest.client.when_closed(self._wake)
-        words, deadline_s = self._asked(command.message), self._entry.deadline_s
+        words, deadline_s = self._request_mapping(command.message), self._entry.deadline_s
         run = guest.begin(self._handle, words, deadline_s, command.at, command.admitted)
         self._runs.append(run)
         run.add_done_callback(lambda _: self._wake())
 
     def _wake(self) -> None:
-        with self._news:
-            self._news.notify()
+        with self._changed:
+            self._changed.notify()
 
     def _end(self, reason: str) -> None:
         """Stops the motion, then releases the lock."""
-        with self._news:
+        with self._changed:
             guest, self._guest, self._owner = self._guest, None, None
             moved, self._runs, self._newest = bool(self._runs), [], None
         if moved and guest is not None and not guest.client.closed:
             self._stop(guest, reason)
         try:
-            self._grip.close()
+            self._held_locks.close()
         except TradeError as error:
             _logger.warning("the lock for %s could not be released: %s", self._entry.topic, error)
         if not self._closing:
@@ -240,15 +242,15 @@ class _TopicExecutor:
         """Stops its motion and ends. Idempotent."""
         if self._subscription is not None:
             self._subscription.close()
-        with self._news:
+        with self._changed:
             self._closing = True
-            self._news.notify()
+            self._changed.notify()
         self._thread.join()
 
 
 def stops_of(container: Container, handle: Handle) -> list[Handle]:
     """The stops of a service's provider."""
     key = handle.key
-    beside = container.services(where(container=handle.container))
-    own = [one for one in beside if one.effect == "stop" and one.key.address == key.address]
+    siblings = container.services(where(container=handle.container))
+    own = [one for one in siblings if one.effect == "stop" and one.key.address == key.address]
     return [one for one in own if (one.key.domain, one.key.provider) == (key.domain, key.provider)]

@@ -16,7 +16,7 @@ from trade_gateway.ros_messages._types import Message
 _SET_BOOL: Final = "std_srvs/srv/SetBool"
 
 
-class _Taken(NamedTuple):
+class _ClientLock(NamedTuple):
     """The lock of a node."""
 
     client: Client
@@ -78,8 +78,8 @@ class ServicesToRos:
 
         stops = handle.effect == "stop"
 
-        def answer(request: Message, who: str, came_at: float) -> Message:
-            guest = self._nodes.guest(who, came_at, stops=stops)
+        def answer(request: Message, client: str, came_at: float) -> Message:
+            guest = self._nodes.guest(client, came_at, stops=stops)
             return response(guest.call(handle, asked(request), deadline_s, came_at))
 
         return self._graph.serve(place.name, self._entry.type, answering(response, answer), stops=stops)
@@ -93,7 +93,7 @@ class LocksToRos:
         self._graph = graph
         self._nodes = nodes
         self._container = container
-        self._taken: dict[str, _Taken] = {}
+        self._taken: dict[str, _ClientLock] = {}
         """By node."""
 
     @property
@@ -113,8 +113,8 @@ class LocksToRos:
     def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - the lock covers a whole group
         response = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
-        def answer(request: Message, who: str, came_at: float) -> Message:
-            text = self._take(who, came_at) if request["data"] else self._give_back(who)
+        def answer(request: Message, client: str, came_at: float) -> Message:
+            text = self._take(client, came_at) if request["data"] else self._give_back(client)
             return {"success": True, "message": text}
 
         return self._graph.serve(place.name, _SET_BOOL, answering(response, answer))
@@ -133,17 +133,17 @@ class LocksToRos:
             purpose = f"of {who}, a node of ROS"
             lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
         handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
-        taken = self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
+        taken = self._taken[who] = _ClientLock(client, lock, client.keep(lock, handles))
         client.when_closed(lambda: self._forget(who, taken))
         client.session.check()
         return ", ".join(lock.resources)
 
-    def _forget(self, who: str, taken: _Taken) -> None:
-        if self._taken.get(who) is taken:
-            del self._taken[who]
+    def _forget(self, client: str, taken: _ClientLock) -> None:
+        if self._taken.get(client) is taken:
+            del self._taken[client]
 
-    def _give_back(self, who: str) -> str:
-        taken = self._taken.pop(who, None)
+    def _give_back(self, client: str) -> str:
+        taken = self._taken.pop(client, None)
         given_back = taken is not None and not taken.client.closed and taken.client.unlock(taken.name)
         return "released" if given_back else "it had none"
 
@@ -151,9 +151,9 @@ class LocksToRos:
 def answering(response: ResponseMapping, answer: Answer) -> Answer:
     """Wraps an answer to report errors in the response, if its type can."""
 
-    def guarded(request: Message, who: str, came_at: float) -> Message:
+    def guarded(request: Message, client: str, came_at: float) -> Message:
         try:
-            return answer(request, who, came_at)
+            return answer(request, client, came_at)
         except Exception as error:  # noqa: BLE001 - reported to the node, whatever it is
             return response.failed(error)
 

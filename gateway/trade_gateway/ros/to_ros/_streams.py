@@ -9,9 +9,10 @@ from typing import Final
 from trade import Constraint, Container, Handle, Sample, Stream, where
 from trade_gateway.ros._file import JointStates, RobotEntry, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
-from trade_gateway.ros._joints import LIMBS, JointNames, Measured, joints_of, limbs, measured
+from trade_gateway.ros._joints import LIMBS, Measured, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place, absent_name, named_services, of_name
 from trade_gateway.ros_messages._conversion import ResponseMapping, failure, ros_stamp
+from trade_gateway.ros_messages._joint_names import JointNames
 from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")

@@ -21,11 +21,12 @@ from trade_gateway.ros._goals import (
     trajectory_of,
 )
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph
-from trade_gateway.ros._joints import LIMBS, JointNames, beside, joints_of, limbs, measured
+from trade_gateway.ros._joints import LIMBS, beside, joints_of, limbs, measured
 from trade_gateway.ros._mapping_sync import Place
 from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros.to_ros._served_goals import CallOfGoal, ServedGoals, text_of
 from trade_gateway.ros_messages._conversion import ros_stamp, seconds
+from trade_gateway.ros_messages._joint_names import JointNames
 from trade_gateway.ros_messages._types import Message
 
 _logger = logging.getLogger("trade")
@@ -68,13 +69,13 @@ class TrajectoriesToRos:
         if not entry.topic:
             return served
         try:
-            return _Both(served, TopicGoals(self._graph, entry.topic, goals))
+            return _ClosesAll(served, TopicGoals(self._graph, entry.topic, goals))
         except BaseException:
             served.close()
             raise
 
 
-class _Both:
+class _ClosesAll:
     def __init__(self, *parts: Closes) -> None:
         self._parts = parts
 
@@ -90,24 +91,24 @@ class TopicGoals:
         self._topic = topic
         self._goals = goals
         self._zero = graph.types.zero(graph.types.parts(ACTION)[0])
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._next: _TopicGoal | None = None
         self._now: _TopicGoal | None = None
         self._closed = False
-        self._subscription = graph.subscribe(topic, _TRAJECTORY, self._heard)
+        self._subscription = graph.subscribe(topic, _TRAJECTORY, self._on_message)
         self._thread = threading.Thread(target=self._run, name=f"trade-ros{topic}", daemon=True)
         self._thread.start()
 
-    def _heard(self, message: Message, who: str) -> None:
+    def _on_message(self, message: Message, who: str) -> None:
         goal = _TopicGoal({**self._zero, "trajectory": message}, who)
         ends = not message["points"]
         if ends or self._goals.refuse(goal.message) is None:
             self._replace(None if ends else goal)
 
     def _replace(self, goal: "_TopicGoal | None") -> None:
-        with self._news:
+        with self._changed:
             self._next, before = goal, self._now
-            self._news.notify_all()
+            self._changed.notify_all()
         if before is not None:
             before.cancel()
 
@@ -118,16 +119,16 @@ class TopicGoals:
                 _logger.warning("a trajectory of %s on %s failed: %s", goal.client, self._topic, outcome.text)
 
     def _take(self) -> "_TopicGoal | None":
-        with self._news:
+        with self._changed:
             self._now = None
-            self._news.wait_for(lambda: self._next is not None or self._closed)
+            self._changed.wait_for(lambda: self._next is not None or self._closed)
             self._now, self._next = None if self._closed else self._next, None
             return self._now
 
     def close(self) -> None:
         """Ends the motion, and waits for its end."""
         self._subscription.close()
-        with self._news:
+        with self._changed:
             self._closed = True
         self._replace(None)
         self._thread.join(_ENDS_WITHIN_S)
@@ -147,20 +148,20 @@ class _TopicGoal:
     def feedback(self, message: Mapping[str, Any]) -> None:
         """No client has asked for it."""
 
-    def when_canceled(self, tell: Callable[[], object]) -> None:
+    def when_canceled(self, callback: Callable[[], object]) -> None:
         with self._guard:
             if not self._canceled:
-                self._tell.append(tell)
+                self._tell.append(callback)
                 return
-        tell()
+        callback()
 
     def cancel(self) -> None:
         """Another one replaces it, or its node ends the motion."""
         with self._guard:
             self._canceled, waiting = True, self._tell
             self._tell = []
-        for tell in waiting:
-            tell()
+        for callback in waiting:
+            callback()
 
 
 class _Trajectories:
@@ -177,11 +178,11 @@ class _Trajectories:
         trajectory_of(message, self._names, dict.fromkeys(self._names.trade_names.values(), 0.0))
 
     def call_of(self, goal: Goal) -> CallOfGoal:
-        trajectory = trajectory_of(goal.message, self._names, self._here(goal))
+        trajectory = trajectory_of(goal.message, self._names, self._current_angles(goal))
         args = {"trajectory": trajectory, "tolerances": tolerances_of(goal.message)}
         return CallOfGoal(args, lasts_s(trajectory) + _MORE_S)
 
-    def _here(self, goal: Goal) -> dict[str, float] | None:
+    def _current_angles(self, goal: Goal) -> dict[str, float] | None:
         """The current angles, unless the goal says where the joints begin."""
         points = goal.message["trajectory"]["points"]
         if not points or seconds(points[0]["time_from_start"]) < AT_ONCE_S:

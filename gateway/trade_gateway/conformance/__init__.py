@@ -1,6 +1,0 @@
-"""``trade conformance``: starts a container in any language and checks from outside that it follows the rules."""
-
-from trade_gateway.conformance._check import Check
-from trade_gateway.conformance._run import CHECKS, Outcome, Result, run
-
-__all__ = ["CHECKS", "Check", "Outcome", "Result", "run"]
