@@ -18,7 +18,6 @@ from trade._calls.find_types import Find as _Find
 from trade._calls.find_types import FindRobot as _FindRobot
 from trade._calls.group_view import GroupView
 from trade._calls.handle import Bound, Handle, handle_of, start_call
-from trade._calls.pddl import pddl_domain
 from trade._calls.reachability import Reachability
 from trade._calls.run import Run
 from trade._container.container import Container
@@ -37,24 +36,25 @@ from trade._hooks.hook import HookEvent, HookInfo
 from trade._locks.lock import Lock
 from trade._notifications.events import StateEvent
 from trade._notifications.notification import Notification, NotificationInfo
-from trade._protocol.container_info import ContainerInfo
-from trade._protocol.messages import Estop
-from trade._protocol.samples import Sample
-from trade._protocol.schema_types import publish as _publish
 from trade._registry.constraints import Constraint, where
 from trade._resources.grants import LockInfo, StopInfo
 from trade._resources.resource import Permit, Resource, permit
-from trade._services.decorator import service
+from trade._services.decorator import effect_of, service
 from trade._services.secret import Secret
 from trade._settings import Settings
 from trade._streams.source import ListenerInfo
 from trade._streams.stream import Stream
 from trade._table import Table
-from trade._telemetry.call_model import CallDeviation, CallModel, CallProfile
 from trade._telemetry.load import LoadInfo
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
 from trade._tracing.api import LogReader, Trace
+from trade.call_model import CallDeviation, CallModel, CallProfile
+from trade.pddl import pddl_domain
+from trade.protocol.container_info import ContainerInfo
+from trade.protocol.messages import Estop
+from trade.protocol.samples import Sample
+from trade.protocol.schema_types import publish as _publish
 from trade.stop_line import StopReport
 
 __all__ = [
@@ -130,6 +130,7 @@ __all__ = [
     "current_call",
     "deregister",
     "detach_hook",
+    "effect_of",
     "errors",
     "estop",
     "estop_clear",

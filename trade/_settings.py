@@ -13,14 +13,13 @@ from types import MappingProxyType
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
-from trade._chosen_system import chosen_settings
-from trade._default_system import account_home, account_name, default_system
-from trade._protocol.keys import as_chunk, is_chunk
-from trade._protocol.samples import STEPS_HZ
 from trade._security.certificates import Certificate
 from trade._security.policy import EVERYTHING
-from trade._transport.endpoints import Endpoint, dialled_from_here
+from trade.default_system import account_home, account_name, chosen_settings, default_system
 from trade.errors import ConfigurationError
+from trade.protocol.keys import as_chunk, is_chunk
+from trade.protocol.samples import STEPS_HZ
+from trade.transport.endpoints import Endpoint, dialled_from_here
 
 _logger = logging.getLogger("trade")
 _VARIABLES: Final = (

@@ -1,6 +1,6 @@
 """Motors, grippers, arms, cameras and sensors as TRADE services: interfaces in SI units, robot file, drivers."""
 
-from trade._protocol.schema_types import publish as _publish
+from trade.protocol.schema_types import publish as _publish
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._robot_file import load, parse, without
 from trade_drivers.bus._can_monitor import CanBusState, CanMonitor

@@ -11,9 +11,9 @@ from typing import Final, TypeVar
 import trade
 import trade_robotfile
 from trade import Container, Measure
-from trade._default_system import take_over
-from trade._protocol.messages import HEALTHY
+from trade.default_system import take_over
 from trade.errors import ConfigurationError, TradeError
+from trade.protocol.messages import HEALTHY
 from trade_drivers._metrics import measures_of
 from trade_drivers._robot_file import robot_file_errors
 from trade_drivers.bus._angle_store import AngleStore

@@ -1,9 +1,8 @@
 """Checks command-line words: the usage error, and the services that the words name."""
 
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from trade import Constraint, Container, Handle, where
-from trade._calls.picking import Pick
 from trade.errors import ConfigurationError
 
 ABSENT: Final = 75
@@ -48,7 +47,7 @@ def find(visiting: Container, service: str, container: str | None, wait_s: float
         UsageError: the text does not name a service.
     """
     try:
-        return visiting.find(service, container=container, wait_s=wait_s, pick=cast("Pick | None", pick))
+        return visiting.find(service, container=container, wait_s=wait_s, pick=cast("Any", pick))
     except ConfigurationError as bad:
         if pick is not None and "pick" in bad.problem:
             raise UsageError(where=f"--pick {pick}", problem=bad.problem) from None

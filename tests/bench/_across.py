@@ -116,9 +116,9 @@ def bare_session(
 ):
     """A zenoh session with TRADE's settings, without a container around it."""
     from trade._security.certificates import Certificate
-    from trade._transport.zenoh import configuration
-    from trade._transport.zenoh_links import open_session
     from trade.policies import acl, read_policy
+    from trade.transport.zenoh import configuration
+    from trade.transport.zenoh_links import open_session
 
     return open_session(
         configuration(

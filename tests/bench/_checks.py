@@ -100,7 +100,7 @@ class Joint(Trade):
                 yield self.link(handle)
 
     def endpoint(self) -> str:
-        from trade._transport.endpoints import free_endpoint
+        from trade.transport.endpoints import free_endpoint
 
         return free_endpoint()
 
@@ -138,7 +138,7 @@ class _BareTls(BarePair):
 
     @contextmanager
     def serve(self) -> Iterator[str]:
-        from trade._transport.endpoints import free_endpoint
+        from trade.transport.endpoints import free_endpoint
 
         endpoint = free_endpoint().replace("tcp/", "tls/")
         with bare_session([endpoint], [], self._papers["robot"], None) as session:

@@ -214,7 +214,7 @@ def _put_all(session, flood: Flood, callee: str, ended: threading.Event, sent_hz
 def _call(number: int, kind: str) -> bytes:
     from msgspec import Raw
 
-    from trade._protocol.messages import PROTOCOL, Call, encode_message
+    from trade.protocol.messages import PROTOCOL, Call, encode_message
 
     service = "stop" if kind == "stop" else "angle"
     return encode_message(Call(PROTOCOL, number + 1, service, "m/e-0", "mallory/m/e", None, (), Raw(b"\x90")))

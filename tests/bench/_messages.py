@@ -15,7 +15,7 @@ from msgspec import Raw
 
 from tests.bench._links import Link, Peer, Pipeline
 from tests.bench._peers import framed
-from trade._protocol.messages import PROTOCOL, Call, Reply, Status, decode_call, decode_reply
+from trade.protocol.messages import PROTOCOL, Call, Reply, Status, decode_call, decode_reply
 
 _KEY: Final = b"call/bench/bench/server/epoch/bench/Provider-1"
 _CALLER: Final = "bench/client/epoch"

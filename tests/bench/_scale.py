@@ -309,6 +309,6 @@ def _median_us(action: Callable[[int], object], times: int) -> float:
 
 
 def _own_kib(infos: Sequence[Any]) -> float:
-    from trade._protocol.messages import encode_message
+    from trade.protocol.messages import encode_message
 
     return sum(len(encode_message(info)) for info in infos) / 1024

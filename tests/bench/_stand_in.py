@@ -12,10 +12,10 @@ from msgspec import structs
 
 from trade import Container
 from trade._discovery.announcer import Announcer
-from trade._protocol.keys import ALIVE, ESTOPS, REGISTRY, Address, calls_to, registry_key
-from trade._protocol.messages import ProviderInfo, decode_provider
-from trade._transport.base import ChannelClosed, Message
-from trade._transport.memory import MemoryTransport, Network
+from trade.protocol.keys import ALIVE, ESTOPS, REGISTRY, Address, calls_to, registry_key
+from trade.protocol.messages import ProviderInfo, decode_provider
+from trade.transport.base import ChannelClosed, Message
+from trade.transport.memory import MemoryTransport, Network
 
 Offer = Mapping[tuple[str, str], ProviderInfo]
 """Providers by domain and name."""

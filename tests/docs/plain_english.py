@@ -40,9 +40,9 @@ AVOIDED = {
     r"passers?-by|passes by": "a short-lived container",
 }
 KEPT = {
-    ("trade/_default_system.py", "nobody"),  # the account of that name
+    ("trade/default_system.py", "nobody"),  # the account of that name
     ("trade/_resources/grants.py", "nobody"),  # the owner of a lock without one, as clients see it
-    ("trade/_protocol/messages.py", "told"),  # a field on the wire
+    ("trade/protocol/messages.py", "told"),  # a field on the wire
     ("gateway/trade_gateway/clients/_schemas.py", "told"),  # the same at the HTTP gateway
     ("gateway/trade_gateway/config/_children.py", "stands"),  # a key of a file
     ("gateway/trade_gateway/language/_lexicon.py", "nobody"),  # a word that people say

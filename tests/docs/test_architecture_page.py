@@ -26,6 +26,7 @@ PACKAGES: Final = {
     "trade_hil_sim": "hil-sim",
 }
 """Where each of them is."""
+DOORS: Final = "What other packages need of trade has a public name"
 LAYERS: Final = "The rooms of trade: each imports only from those below it"
 LINKS: Final = re.findall(r"\[([^\]]+)\]\(([^)#]+)\)(:\s+(?:`[\w.]+`(?:,\s+)?)+)?", TEXT)
 """Text, target, and the names behind the colon."""
@@ -126,3 +127,12 @@ def test_the_picture_has_the_layers_that_are_checked() -> None:
     lines = picture.text.partition(" trade: ")[2].splitlines()
     drawn = [re.search(r" {2,}((?:\w+(?:, | \| )?)+)$", line) for line in lines]
     assert [layer for row in drawn if row for layer in row[1].split(", ")] == wanted
+
+
+def test_the_contract_on_private_modules_names_each_of_them() -> None:
+    contracts = toml.decode((ROOT / "pyproject.toml").read_bytes())["tool"]["importlinter"]["contracts"]
+    [named] = [one["forbidden_modules"] for one in contracts if one["name"] == DOORS]
+    private = {
+        path.stem for path in (ROOT / "trade").glob("_*") if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert named == sorted(f"trade.{name}" for name in private if not name.startswith("__"))

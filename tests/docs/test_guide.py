@@ -15,8 +15,8 @@ from tests.docs.conftest import Play, Said
 from tests.support.waiting import wait_until
 from tests.system.conftest import Program
 from trade import Handle, Settings, StateEvent, service, where
-from trade._transport.endpoints import free_endpoint
 from trade.errors import Cancelled, CannotStart, DeviceFault, InvalidArgument
+from trade.transport.endpoints import free_endpoint
 from trade_drivers.testing import FakeJointGroup
 from trade_gateway.stubs import write_stubs
 

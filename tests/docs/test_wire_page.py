@@ -13,8 +13,8 @@ from msgspec import Struct, structs
 
 from tests.docs.blocks import DOCS
 from trade._paths import runtime_folder
-from trade._protocol.messages import ProviderInfo, ServiceInfo, decode_provider
-from trade._transport.credentials import user_secret
+from trade.protocol.messages import ProviderInfo, ServiceInfo, decode_provider
+from trade.transport.credentials import user_secret
 
 PAGE = (DOCS / "wire-protocol.md").read_text(encoding="utf-8")
 PROVIDER = {"revision": 1, "groups": ["a"], "kind": "Arm", "host": "rosie", "pid": 1}

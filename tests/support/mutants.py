@@ -146,7 +146,7 @@ def _twin_unplaced(patch: Patch) -> None:
 
 def _deviations_unseen(patch: Patch) -> None:
     """Calls are not compared with what is usual."""
-    from trade._telemetry.call_model import CallWatch
+    from trade.call_model import CallWatch
 
     patch(CallWatch, "see", lambda self, span: None)
 

@@ -1,8 +1,8 @@
 """Systems in memory with names of their own, for tests of what two of them share."""
 
 from trade import Container, Settings
-from trade._transport.memory import MemoryTransport
 from trade.testing import MemorySystem
+from trade.transport.memory import MemoryTransport
 
 
 def member(system: MemorySystem, name: str, of: str, identity: str) -> Container:

@@ -10,7 +10,7 @@ from msgspec import Raw
 from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.system.sites import GATEWAY, Site
-from trade._protocol.messages import PROTOCOL, Call, encode_message
+from trade.protocol.messages import PROTOCOL, Call, encode_message
 
 POLICY: Final = policy_text(
     "arm=driver planner=operator porter=operator thief=operator dash=viewer chief=chief idle=",

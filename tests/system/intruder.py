@@ -15,9 +15,9 @@ from typing import Any
 import zenoh
 
 from trade._security.certificates import Certificate
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import configuration
-from trade._transport.zenoh_links import open_session
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import configuration
+from trade.transport.zenoh_links import open_session
 
 _PATIENCE_S = 20.0
 

@@ -13,8 +13,8 @@ from typing import Any
 import zenoh
 
 from trade import Container, Handle, HookEvent, Lock, Resource, Run, Settings, Stream, current_call, service, where
-from trade._protocol.samples import stream_key
-from trade._transport.zenoh_links import _others
+from trade.protocol.samples import stream_key
+from trade.transport.zenoh_links import _others
 
 PROVIDERS = 5
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Final
 
-_MODULE: Final = "trade._protocol.messages"
+_MODULE: Final = "trade.protocol.messages"
 _AS_IT_IS: Final = "PROTOCOL: Final = 1\n"
 
 

@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 
 from tests.system.attack import ARM, Attack
 from trade import Container, Resource, service, where
-from trade._protocol.messages import Call
 from trade.errors import AccessDenied
+from trade.protocol.messages import Call
 from trade.testing import MemorySystem, memory_system
 
 WHO: Final = {

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tests.support.waiting import wait_until
-from trade._transport.endpoints import Endpoint, free_endpoint
+from trade.transport.endpoints import Endpoint, free_endpoint
 
 _PLACES = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/local/sbin", "/usr/sbin", "/sbin"))
 

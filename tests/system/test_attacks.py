@@ -20,7 +20,8 @@ from tests.system import rights
 from tests.system.attack import ARM, POLICY, Attack, numbers
 from tests.system.conftest import ROOT, networks_of_ones_own
 from tests.system.sites import GATEWAY, Site
-from trade._protocol.messages import (
+from trade._security.authorizer import FUNCTIONS
+from trade.protocol.messages import (
     EMPTY,
     PROTOCOL,
     Behalf,
@@ -32,7 +33,6 @@ from trade._protocol.messages import (
     Token,
     encode_message,
 )
-from trade._security.authorizer import FUNCTIONS
 
 pytestmark = [pytest.mark.timeout(300)]
 

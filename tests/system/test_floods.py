@@ -12,8 +12,8 @@ from tests.support.certificates import Papers
 from tests.support.policies import policy_text
 from trade import Container, Settings, service, where
 from trade._threads import channel_workers
-from trade._transport.endpoints import free_endpoint
 from trade.errors import Busy
+from trade.transport.endpoints import free_endpoint
 
 POLICY = policy_text(
     "robot=driver planner=operator mallory=operator", driver="register=lab", operator="read=* call=lab"

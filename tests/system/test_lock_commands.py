@@ -14,8 +14,8 @@ import trade
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.system.conftest import ROSIES_HEAD, Program, Rosie
 from trade import Container, where
-from trade._transport.endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
+from trade.transport.endpoints import free_endpoint
 from trade_hil_sim import events, read_log
 
 Command = Callable[..., subprocess.CompletedProcess[str]]

@@ -7,7 +7,7 @@ import pytest
 
 from tests.system.conftest import Program
 from trade import Container, where
-from trade._transport.endpoints import free_endpoint
+from trade.transport.endpoints import free_endpoint
 
 PLANNER = Path(__file__).parents[2] / "examples" / "planner.py"
 

@@ -22,7 +22,7 @@ from tests.system.siege import Driver
 from tests.system.siege_judge import judge
 from tests.system.siege_records import Answer, AnyRecord, Fault
 from tests.system.sites import GATEWAY, SYSTEM, Site
-from trade._protocol.messages import PROTOCOL
+from trade.protocol.messages import PROTOCOL
 
 NOW, NEXT = PROTOCOL, PROTOCOL + 1
 _THROUGH: Final = Path(__file__).with_name("other_version.py")

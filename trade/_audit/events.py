@@ -13,7 +13,6 @@ from trade._context.call_context import CallContext
 from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.sessions import foreign
 from trade._counters import CallCounters
-from trade._protocol.keys import DOMAIN, Address
 from trade.errors import (
     AccessDenied,
     Busy,
@@ -30,6 +29,7 @@ from trade.errors import (
     Stopped,
     TradeError,
 )
+from trade.protocol.keys import DOMAIN, Address
 
 Kind = Literal["call", "read", "stop", "lock", "configure", "refused", "audit"]
 

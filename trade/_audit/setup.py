@@ -4,8 +4,8 @@ from contextlib import ExitStack
 
 from trade._audit.events import Audit
 from trade._counters import CallCounters
-from trade._protocol.keys import Address
 from trade._settings import Settings
+from trade.protocol.keys import Address
 
 
 def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:

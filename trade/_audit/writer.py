@@ -16,8 +16,8 @@ from typing import Any, Final
 from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow, Head
 from trade._audit.store import SUFFIX, AuditStore, Keep, move_aside
-from trade._protocol.keys import Address, ServiceKey
 from trade._settings import Settings
+from trade.protocol.keys import Address, ServiceKey
 
 _logger = logging.getLogger("trade")
 

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 from msgspec import structs
 
-from trade._protocol.codec import Codec
-from trade._protocol.messages import EMPTY, LARGE, MOST_BYTES, Call, LargeBytes, ServiceInfo, encode_message
 from trade._services.signature import too_many
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
+from trade.protocol.codec import Codec
+from trade.protocol.messages import EMPTY, LARGE, MOST_BYTES, Call, LargeBytes, ServiceInfo, encode_message
 
 _UNSENDABLE: Final = (TypeError, ValueError, OverflowError, RecursionError)
 

@@ -18,8 +18,11 @@ from msgspec import Raw, structs
 from trade._calls.arguments import ArgumentEncoder
 from trade._calls.local_path import LocalPath, LocalSlot, LocalStarter
 from trade._calls.peer import CallPublishers, OnReply, Peer, Pending, ReplySlot, Route, Slot, ended
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, call_key, reply_key
-from trade._protocol.messages import (
+from trade._telemetry.spans import Spans
+from trade._threads.condition import InterruptibleCondition
+from trade._threads.scheduler import NEVER, Scheduler
+from trade.protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, call_key, reply_key
+from trade.protocol.messages import (
     CANCEL,
     EMPTY_ARGUMENTS,
     PROTOCOL,
@@ -32,11 +35,8 @@ from trade._protocol.messages import (
     decode_reply,
     encode_message,
 )
-from trade._telemetry.spans import Spans
-from trade._threads.condition import InterruptibleCondition
-from trade._threads.scheduler import NEVER, Scheduler
-from trade._transport.base import ChannelClosed, Message, Publisher, Transport
-from trade._transport.local_connection import ConnectionEnded
+from trade.transport.base import ChannelClosed, Message, Publisher, Transport
+from trade.transport.local_connection import ConnectionEnded
 
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0

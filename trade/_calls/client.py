@@ -17,7 +17,6 @@ from trade._calls.target_cache import Target, Targets
 from trade._context.call_context import patience_s, running
 from trade._context.outgoing import new_request
 from trade._discovery.dialer import Dialer
-from trade._protocol.keys import Address, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, group_at, service_at, services_at, where
 from trade._registry.registry import Change, Record, Registry
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services
@@ -25,6 +24,7 @@ from trade._security.authorizer import Authorizer, verb_of
 from trade._table import Table
 from trade._threads import fork_guard
 from trade.errors import ConfigurationError
+from trade.protocol.keys import Address, ServiceKey
 
 _WAIT_S: Final = 2.0
 """How long a call waits for a service that matches."""

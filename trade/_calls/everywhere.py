@@ -8,10 +8,10 @@ from typing import Final, NamedTuple
 from trade._calls.batch import Outcome
 from trade._calls.handle import CallHost, Handle
 from trade._context.call_context import patience_s
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
-from trade._protocol.messages import PROTOCOL
 from trade._registry.registry import ContainerState, Registry
 from trade.errors import AccessDenied, ContainerLost, ServiceGone
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
+from trade.protocol.messages import PROTOCOL
 
 _logger = logging.getLogger("trade")
 

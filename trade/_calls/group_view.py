@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NoReturn
 
 from trade._calls.handle import Handle
-from trade._protocol.keys import ServiceKey
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade._registry.suggestions import too_many_services
 from trade.errors import ConfigurationError, NoSuchService
+from trade.protocol.keys import ServiceKey
 
 _MOST_SHOWN = 12
 

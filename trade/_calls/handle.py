@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NoReturn, ParamSpec, Prot
 import msgspec
 
 from trade._calls.run import Run
-from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import Parameter, Scalar, encode_message
-from trade._protocol.schema import read_schema, schema_name
 from trade._registry.registry import Record
 from trade.errors import ConfigurationError
+from trade.protocol.codec import Codec
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import Parameter, Scalar, encode_message
+from trade.protocol.schema import read_schema, schema_name
 
 if TYPE_CHECKING:
     from typing_extensions import ParamSpec as ParamSpecWithDefault  # every type checker has it

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Final
 
 from trade._calls.peer import Slot
-from trade._protocol.keys import LOCAL, Address
-from trade._transport.host_socket import dial_on_host, host_sockets
-from trade._transport.local_connection import ConnectionEnded, LocalConnection
-from trade._transport.local_greeting import Passport
 from trade.errors import TradeError
+from trade.protocol.keys import LOCAL, Address
+from trade.transport.host_socket import dial_on_host, host_sockets
+from trade.transport.local_connection import ConnectionEnded, LocalConnection
+from trade.transport.local_greeting import Passport
 
 _logger = logging.getLogger("trade")
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 
 from trade._calls.arguments import ArgumentEncoder
-from trade._protocol.keys import Address, call_key
-from trade._protocol.messages import EMPTY, PROTOCOL, Call, Reply, encode_message
 from trade._threads.scheduler import NEVER
-from trade._transport.base import Channel, Publisher, Transport
+from trade.protocol.keys import Address, call_key
+from trade.protocol.messages import EMPTY, PROTOCOL, Call, Reply, encode_message
+from trade.transport.base import Channel, Publisher, Transport
 
 if TYPE_CHECKING:
     from trade._calls.local_path import LocalPeer, LocalStarter

@@ -12,11 +12,11 @@ from math import inf
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 from trade._calls.handle import Handle
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
 from trade._registry.registry import Record
 from trade._telemetry.load import busyness
 from trade.errors import ConfigurationError, TradeError, never_ran
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 
 Pick = Literal["any", "local", "least_busy", "nearest"]
 """Which one of several services to use; see `Container.call`."""

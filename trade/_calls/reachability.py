@@ -9,11 +9,11 @@ from msgspec import Struct, structs
 from trade._calls import batch
 from trade._calls.handle import Handle
 from trade._discovery.dialer import Dialer
-from trade._protocol.container_info import ContainerInfo
-from trade._protocol.keys import DOMAIN, Address, ServiceKey
 from trade._registry.constraints import where
 from trade._registry.registry import Registry
 from trade.errors import NoContainerFound
+from trade.protocol.container_info import ContainerInfo
+from trade.protocol.keys import DOMAIN, Address, ServiceKey
 
 _LOOK_S: Final = 0.02
 _ASK_S: Final = 0.5

@@ -4,9 +4,9 @@ import itertools
 from collections.abc import Callable
 
 from trade._calls.target import container_closed
-from trade._context.sessions import Session, client_name
-from trade._protocol.keys import Address, alive_key, as_chunk
-from trade._transport.base import ChannelClosed, Transport
+from trade._context.sessions import Session
+from trade.protocol.keys import Address, alive_key, as_chunk, client_name
+from trade.transport.base import ChannelClosed, Transport
 
 
 class Sessions:

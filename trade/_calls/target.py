@@ -17,21 +17,6 @@ from trade._context.active_calls import ActiveCall
 from trade._context.call_context import CallContext, patience_s, running
 from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, handed_down, holding, in_ns, new_request
 from trade._context.sessions import speaking
-from trade._protocol.codec import Codec
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address
-from trade._protocol.messages import (
-    EMPTY_ARGUMENTS,
-    PROTOCOL,
-    UNREADABLE,
-    Call,
-    ErrorInfo,
-    Reply,
-    ServiceInfo,
-    Status,
-)
-from trade._protocol.remote_errors import unpack_error
-from trade._protocol.schema import read_schema
-from trade._protocol.schema_types import type_from_schema
 from trade._registry.registry import Record
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import SerialQueue, Turn
@@ -50,6 +35,21 @@ from trade.errors import (
     ServiceGone,
     as_never_ran,
 )
+from trade.protocol.codec import Codec
+from trade.protocol.keys import CLOCK, DOMAIN, PROVIDER, Address
+from trade.protocol.messages import (
+    EMPTY_ARGUMENTS,
+    PROTOCOL,
+    UNREADABLE,
+    Call,
+    ErrorInfo,
+    Reply,
+    ServiceInfo,
+    Status,
+)
+from trade.protocol.remote_errors import unpack_error
+from trade.protocol.schema import read_schema
+from trade.protocol.schema_types import type_from_schema
 
 _logger = logging.getLogger("trade")
 

@@ -6,15 +6,15 @@ from trade._audit.events import Audit
 from trade._calls.caller import Caller
 from trade._calls.handle import Handle
 from trade._calls.target import LocalTarget, RemoteTarget, container_closed
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, ServiceKey
-from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Change, Record, Registry, gone_to
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._threads.thread_pool import ThreadPool
-from trade._transport.base import ChannelClosed
 from trade.errors import AccessDenied, ServiceGone, as_never_ran
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, ServiceKey
+from trade.protocol.messages import ServiceInfo
+from trade.transport.base import ChannelClosed
 
 Target = LocalTarget | RemoteTarget
 

@@ -44,9 +44,6 @@ from trade._notifications.api import NotificationApi
 from trade._notifications.events import EventLog
 from trade._notifications.notifier import Notifier
 from trade._notifications.states import States
-from trade._protocol.container_info import ContainerInfo
-from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
-from trade._protocol.messages import Token
 from trade._registry.constraints import where
 from trade._registry.listing import containers_of
 from trade._registry.registry import Change, Record, Registry
@@ -70,13 +67,16 @@ from trade._telemetry.spans import Spans, new_spans
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade._tracing.api import TraceApi
-from trade._transport.base import Transport
-from trade._transport.credentials import keep_secret, user_secret
-from trade._transport.host_socket import host_sockets, listen_on_host
-from trade._transport.local_greeting import Passport
-from trade._transport.zenoh import ZenohTransport
 from trade.errors import AccessDenied, ConfigurationError, TradeError
+from trade.protocol.container_info import ContainerInfo
+from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
+from trade.protocol.messages import Token
 from trade.stop_line import RelayedEstop, StopApi, StopLines, StopLineService
+from trade.transport.base import Transport
+from trade.transport.credentials import keep_secret, user_secret
+from trade.transport.host_socket import host_sockets, listen_on_host
+from trade.transport.local_greeting import Passport
+from trade.transport.zenoh import ZenohTransport
 
 _logger = logging.getLogger("trade")
 

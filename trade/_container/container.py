@@ -26,15 +26,15 @@ from trade._locks.api import LockApi
 from trade._migration.api import MigrationApi
 from trade._migration.factory import ProviderFactory
 from trade._notifications.api import NotificationApi
-from trade._protocol.keys import Address, ServiceKey
 from trade._registry.registry import Registry
 from trade._settings import Settings
 from trade._streams.api import StreamApi
 from trade._threads import fork_guard
 from trade._threads.event import Event
 from trade._tracing.api import TraceApi
-from trade._transport.base import Transport
+from trade.protocol.keys import Address, ServiceKey
 from trade.stop_line import StopApi
+from trade.transport.base import Transport
 
 _STOPPING_S: Final = 2.0
 

@@ -9,14 +9,14 @@ from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed
 from trade._estop.deadman import Deadman
-from trade._protocol.keys import DOMAIN
-from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
 from trade._registry.constraints import checked_meta
 from trade._services.decorator import provider_of
 from trade._services.providers import Providers
 from trade._services.registration import checked_groups, checked_health
 from trade._services.withdrawn import WithdrawnProviders
-from trade._transport.base import ChannelClosed
+from trade.protocol.keys import DOMAIN
+from trade.protocol.messages import HEALTHY, ProviderInfo, Scalar
+from trade.transport.base import ChannelClosed
 
 _logger = logging.getLogger("trade")
 

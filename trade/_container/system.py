@@ -8,14 +8,14 @@ from typing import Any, Literal
 from trade._calls.handle import Handle
 from trade._container.assembly import Components
 from trade._migration.delivered_code import pack
-from trade._protocol.container_info import ContainerInfo
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import where
 from trade._remote.ssh import Started, start
 from trade._services.withdrawn import WithdrawnInfo
 from trade._table import Table
 from trade._telemetry.load import LoadInfo
 from trade.errors import ConfigurationError, LinkStays, NoSuchService, TooManyServices
+from trade.protocol.container_info import ContainerInfo
+from trade.protocol.keys import CLOCK, DOMAIN, PROVIDER, ServiceKey
 
 
 class System:

@@ -6,10 +6,10 @@ from typing import Any
 from trade._calls.handle import Handle
 from trade._container.system import System
 from trade._context.call_context import current_call
-from trade._protocol.container_info import ContainerInfo
 from trade._services.decorator import service
 from trade._services.withdrawn import WithdrawnInfo
 from trade._telemetry.load import LoadInfo
+from trade.protocol.container_info import ContainerInfo
 
 
 class SystemServices:

@@ -10,10 +10,10 @@ from typing import Any, Final
 from msgspec import Raw
 
 from trade._context.sessions import within
-from trade._protocol.messages import Call, LargeBytes, Status, encode_message
-from trade._protocol.remote_errors import pack_error
 from trade._threads.scheduler import Scheduler
 from trade.errors import Cancelled, OutcomeUnknown
+from trade.protocol.messages import Call, LargeBytes, Status, encode_message
+from trade.protocol.remote_errors import pack_error
 
 _logger = logging.getLogger("trade")
 

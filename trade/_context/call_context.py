@@ -8,9 +8,9 @@ from typing import Any, Final, Protocol
 from msgspec import Struct
 
 from trade._context.active_calls import ActiveCall
-from trade._context.sessions import client_of
-from trade._protocol.messages import Behalf, Token
 from trade.errors import Cancelled
+from trade.protocol.keys import client_of
+from trade.protocol.messages import Behalf, Token
 
 _MOST_EVENTS: Final = 100
 _ANSWER_S: Final = 0.3

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from trade._context.call_context import CallContext
-from trade._protocol.messages import ServiceInfo
+from trade.protocol.messages import ServiceInfo
 
 
 class ServiceSignature(Protocol):

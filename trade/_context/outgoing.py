@@ -9,11 +9,11 @@ from msgspec import Struct
 
 from trade._context.call_context import CallContext, running
 from trade._context.sessions import Session, speaking
-from trade._protocol.keys import DOMAIN, Address
-from trade._protocol.messages import Behalf, Token
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade.errors import Cancelled, LockLost, NotLocked
+from trade.protocol.keys import DOMAIN, Address
+from trade.protocol.messages import Behalf, Token
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)

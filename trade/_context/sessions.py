@@ -5,9 +5,9 @@ from collections.abc import Callable, Generator, Iterable
 from contextvars import ContextVar
 from typing import Final
 
-from trade._protocol.keys import Address, as_chunk
-from trade._transport.base import Presence
 from trade.errors import SessionEnded
+from trade.protocol.keys import Address
+from trade.transport.base import Presence
 
 _REMEMBERED: Final = 4096
 
@@ -55,17 +55,6 @@ def foreign(session: str) -> str:
     identity, *chunks = session.split("/")
     system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
     return f"{system}/{client.rpartition('.')[0]} via {identity}" if crossed else ""
-
-
-def client_name(client: str) -> str:
-    """A client's name as it is part of the name of its session."""
-    return as_chunk(client)[:40]
-
-
-def client_of(session: str) -> str:
-    """``anna``, if a container acts for this client in the session; else empty."""
-    client = session.split("/")[3:]
-    return client[0].rpartition(".")[0] if client else ""
 
 
 class Session:

@@ -4,9 +4,9 @@ import logging
 import threading
 from typing import Final
 
-from trade._protocol.keys import Address, alive_key, registry_key, tally_key
-from trade._protocol.messages import PROTOCOL, ProviderInfo, Tally, encode_message
-from trade._transport.base import ChannelClosed, Presence, Question, Transport
+from trade.protocol.keys import Address, alive_key, registry_key, tally_key
+from trade.protocol.messages import PROTOCOL, ProviderInfo, Tally, encode_message
+from trade.transport.base import ChannelClosed, Presence, Question, Transport
 
 _logger = logging.getLogger("trade")
 

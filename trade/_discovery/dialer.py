@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._threads.scheduler import NEVER, Scheduler
-from trade._transport.addresses import Attempt, Attempts
-from trade._transport.endpoints import Endpoint, accepts
-from trade._transport.interfaces import is_near
-from trade._transport.scouting import Beacon
-from trade._transport.zenoh_links import WITHOUT_HUB, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
+from trade.transport.addresses import Attempt, Attempts
+from trade.transport.endpoints import Endpoint, accepts
+from trade.transport.interfaces import is_near
+from trade.transport.scouting import Beacon
+from trade.transport.zenoh_links import WITHOUT_HUB, Links
 
 _logger = logging.getLogger("trade")
 

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Final
 
 from trade._paths import runtime_folder, runtime_folders
-from trade._transport.endpoints import Endpoint
 from trade.atomic_files import fresh_beside
 from trade.errors import ConfigurationError
+from trade.transport.endpoints import Endpoint
 
 try:
     import fcntl

@@ -7,18 +7,18 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from trade._discovery.host_folder import HostFolder
-from trade._discovery.hub_file import HubFile
 from trade._security.certificates import Certificate
 from trade._security.network_crossings import crossings
 from trade._security.policy_file import read_policy
 from trade._security.zenoh_acl import acl
 from trade._settings import Settings
-from trade._transport.credentials import user_secret
-from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
-from trade._transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
-from trade._transport.zenoh import ZenohTransport, configuration
-from trade._transport.zenoh_links import Links
 from trade.errors import ConfigurationError
+from trade.hub_file import HubFile
+from trade.transport.credentials import user_secret
+from trade.transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
+from trade.transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
+from trade.transport.zenoh import ZenohTransport, configuration
+from trade.transport.zenoh_links import Links
 
 _logger = logging.getLogger("trade")
 _PORTS_TRIED: Final = 4

@@ -8,10 +8,10 @@ from typing import Literal
 from msgspec import Struct
 
 from trade._discovery.dialer import Dialer
-from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.registry import Record, Registry
 from trade._security.certificates import Certificate
-from trade._transport.zenoh_links import Link, Links
+from trade.protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, ServiceKey
+from trade.transport.zenoh_links import Link, Links
 
 Tell = Callable[[Literal["linked", "unlinked"], str, str, "Record | None"], None]
 """Takes the kind of an event, the container at the other end, its endpoint, and its service ``clock``."""

@@ -9,9 +9,11 @@ from typing import Final
 
 from trade._discovery.grace_period import GracePeriods
 from trade._discovery.resync import Resynchronizer
-from trade._protocol.estop_messages import decode_open_estops
-from trade._protocol.keys import ALIVE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
-from trade._protocol.messages import (
+from trade._registry.registry import ContainerState, Registry
+from trade._threads.scheduler import Scheduler
+from trade.protocol.estop_messages import decode_open_estops
+from trade.protocol.keys import ALIVE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
+from trade.protocol.messages import (
     PROTOCOL,
     Estop,
     Malformed,
@@ -20,9 +22,7 @@ from trade._protocol.messages import (
     decode_provider,
     decode_tally,
 )
-from trade._registry.registry import ContainerState, Registry
-from trade._threads.scheduler import Scheduler
-from trade._transport.base import Answer, Channel, ChannelClosed, Message, Transport
+from trade.transport.base import Answer, Channel, ChannelClosed, Message, Transport
 
 _logger = logging.getLogger("trade")
 

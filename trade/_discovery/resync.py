@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-from trade._protocol.keys import REGISTRY, Address, registry_key
 from trade._registry.registry import ContainerState, Registry
 from trade._threads.scheduler import NEVER, Scheduler
-from trade._transport.base import Answer, ChannelClosed, Transport
+from trade.protocol.keys import REGISTRY, Address, registry_key
+from trade.transport.base import Answer, ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
 

@@ -12,11 +12,11 @@ import msgspec
 from msgspec import Struct, structs
 
 from trade._audit.events import Audit
-from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
-from trade._protocol.keys import ESTOPS, Address, estop_confirmed_key, estop_key, is_chunk
-from trade._protocol.messages import PROTOCOL, EstopConfirmed, EstopOrder, Malformed, encode_message
 from trade._security.authorizer import Authorizer
-from trade._transport.base import ChannelClosed, Message, Transport
+from trade.protocol.estop_messages import decode_estop_confirmed, decode_estop_order
+from trade.protocol.keys import ESTOPS, Address, estop_confirmed_key, estop_key, is_chunk
+from trade.protocol.messages import PROTOCOL, EstopConfirmed, EstopOrder, Malformed, encode_message
+from trade.transport.base import ChannelClosed, Message, Transport
 
 _logger = logging.getLogger("trade")
 

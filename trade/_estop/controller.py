@@ -15,15 +15,16 @@ from trade._estop.deadman import Deadman
 from trade._estop.latch import EstopLatch
 from trade._estop.ledger import as_reported
 from trade._estop.store import EstopStore
-from trade._protocol.keys import DOMAIN, Address, is_chunk
-from trade._protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
 from trade._registry.registry import Change, ContainerState, Record, Registry
 from trade._resources.lock_table import LockTable
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._settings import Settings
-from trade._transport.base import ChannelClosed, Transport
 from trade.errors import ConfigurationError, NoSuchEstop
+from trade.protocol.estop_messages import new_estop_id
+from trade.protocol.keys import DOMAIN, Address, is_chunk
+from trade.protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
+from trade.transport.base import ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
 
@@ -343,11 +344,6 @@ def check_id(estop_id: str) -> None:
     """Raises ConfigurationError if it is not a valid id of an e-stop."""
     if not is_chunk(estop_id):
         raise ConfigurationError(where="estop", problem=f"{estop_id!r} is not an id; use letters, digits, . _ -")
-
-
-def new_estop_id() -> str:
-    """A new, unique id."""
-    return secrets.token_hex(4)
 
 
 def _with(info: ProviderInfo, estops: tuple[Estop, ...]) -> ProviderInfo:

@@ -15,10 +15,10 @@ from trade._estop.deadman import Deadman
 from trade._estop.ledger import Ledger, age, as_reported, identity_of
 from trade._estop.store import EstopStore
 from trade._estop.worker import SHARED_S, Pending, Relay, Round, Worker
-from trade._protocol.keys import Address
-from trade._protocol.messages import Estop, EstopOrder
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Latch
+from trade.protocol.keys import Address
+from trade.protocol.messages import Estop, EstopOrder
 
 _logger = logging.getLogger("trade")
 

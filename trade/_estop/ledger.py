@@ -5,8 +5,8 @@ from typing import Final, TypeVar
 
 from msgspec import structs
 
-from trade._protocol.keys import Address
-from trade._protocol.messages import Estop
+from trade.protocol.keys import Address
+from trade.protocol.messages import Estop
 
 MOST_OF_ONE: Final = 16
 """The most open e-stops of one identity in a container. Beyond that, the newest replaces the one before it: the first

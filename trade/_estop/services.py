@@ -7,8 +7,8 @@ twelfth of that of all other functions of the middleware.
 from trade._context.call_context import current_call
 from trade._estop.broadcast import EstopReport
 from trade._estop.controller import LIMIT_S, EstopController
-from trade._protocol.messages import Estop
 from trade._services.decorator import service
+from trade.protocol.messages import Estop
 
 
 class EstopServices:

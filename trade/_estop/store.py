@@ -8,11 +8,11 @@ from typing import Final
 
 import msgspec
 
-from trade._default_system import account_name, earlier_folders
-from trade._protocol.keys import Address, is_chunk
-from trade._protocol.messages import UNREADABLE, Estop
 from trade._settings import Settings
 from trade.atomic_files import replace
+from trade.default_system import account_name, earlier_folders
+from trade.protocol.keys import Address, is_chunk
+from trade.protocol.messages import UNREADABLE, Estop
 
 _logger = logging.getLogger("trade")
 _PRIVATE: Final = 0o700

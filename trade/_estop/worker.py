@@ -9,8 +9,8 @@ from typing import Final
 from msgspec import Struct
 
 from trade._estop.deadman import Deadman
-from trade._protocol.messages import Estop
 from trade._resources.resource import Resource
+from trade.protocol.messages import Estop
 
 _logger = logging.getLogger("trade")
 

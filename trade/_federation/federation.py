@@ -11,15 +11,15 @@ from trade._estop.controller import EstopController
 from trade._federation.proxy import Speaking, passed_on_service
 from trade._locks.lease_client import LeaseClient
 from trade._locks.remote_locks import RemoteLocks, SharedResource
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, Address, ServiceKey
-from trade._protocol.messages import ProviderInfo, ServiceInfo
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
 from trade._services.providers import Providers
 from trade.errors import ConfigurationError, SessionEnded
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, Address, ServiceKey
+from trade.protocol.messages import ProviderInfo, ServiceInfo
 
 _PATIENCE_S = 1.0
 """How long a call that arrives before its caller's liveliness token waits for it."""

@@ -8,16 +8,16 @@ from msgspec import Raw
 
 from trade._calls.handle import LONGEST_DEADLINE_S, Handle
 from trade._context.call_context import CallContext, current_call
-from trade._protocol.codec import Codec
-from trade._protocol.messages import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
-from trade._protocol.remote_errors import passed_on
-from trade._protocol.schema import read_schema
 from trade._resources.resource import Resource
 from trade._services.decorator import Effect, ServiceMark
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
 from trade._services.signature import Signature
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
+from trade.protocol.codec import Codec
+from trade.protocol.messages import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
+from trade.protocol.remote_errors import passed_on
+from trade.protocol.schema import read_schema
 
 _AT_LEAST_S: Final = 0.001
 """The shortest deadline of a forwarded call: the home refuses expired calls, as it does all others."""

@@ -12,9 +12,9 @@ from trade._hooks.callee import Callee, callee_of
 from trade._hooks.hook import HookInfo, Side, require_limit
 from trade._notifications.api import NotificationApi
 from trade._notifications.notification import Notification
-from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, services_at, where
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
+from trade.protocol.keys import DOMAIN, PROVIDER, ServiceKey
 
 _logger = logging.getLogger("trade")
 

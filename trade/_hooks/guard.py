@@ -12,13 +12,13 @@ from trade._context.call_context import CallContext
 from trade._context.interceptor import ServedCall
 from trade._hooks.callee import Callee, callee_of
 from trade._hooks.hook import CallCopies, HookEvent, as_the_container
-from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, as_constraint, services_at
 from trade._registry.registry import Record
 from trade._services.decorator import require_check
 from trade._services.local_service import LocalService
 from trade._threads.thread_pool import ThreadPool
 from trade.errors import CallRefused, ConfigurationError
+from trade.protocol.keys import DOMAIN
 
 LIMIT_S: Final = 1.0
 """How long a check may take by default."""

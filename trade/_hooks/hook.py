@@ -17,8 +17,6 @@ from trade._context.interceptor import Interceptor, ServedCall, ServedService
 from trade._context.outgoing import holding
 from trade._context.sessions import speaking
 from trade._hooks.callee import Callee
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Change, Record
 from trade._services.local_service import LocalService
@@ -27,6 +25,8 @@ from trade._telemetry.spans import SpanRecorder, Spans, traceable
 from trade._threads.event import Event
 from trade._threads.scheduler import Scheduler
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, ServiceKey
 
 _logger = logging.getLogger("trade")
 

@@ -8,10 +8,10 @@ from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._hooks.callee import Callee
 from trade._hooks.hook import AttachedHook, HookInfo, Hooks, Side
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, ConfigurationError
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 
 _logger = logging.getLogger("trade")
 

@@ -11,7 +11,6 @@ from trade._calls.run import Run
 from trade._context.outgoing import Claim
 from trade._locks.lease_client import LeaseClient
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, as_constraint, group_at, under
 from trade._resources.grants import LockInfo, LockRequest
 from trade._table import Table
@@ -25,6 +24,7 @@ from trade.errors import (
     OutcomeUnknown,
     TradeError,
 )
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 
 _logger = logging.getLogger("trade")
 

@@ -6,9 +6,9 @@ from typing import Final
 import msgspec
 
 from trade._context.outgoing import Claim
-from trade._protocol.keys import Address
-from trade._protocol.messages import Token
 from trade.errors import ConfigurationError, LockLost
+from trade.protocol.keys import Address
+from trade.protocol.messages import Token
 
 VARIABLE: Final = "TRADE_LOCK"
 

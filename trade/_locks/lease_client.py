@@ -14,11 +14,11 @@ from trade._calls.client import CallClient
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 from trade._locks.lock import Lock, in_own_thread
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
-from trade._protocol.messages import Token
 from trade._resources.grants import LockRequest
 from trade._threads.scheduler import Scheduler
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
+from trade.protocol.messages import Token
 
 _ANSWER_S: Final = 2.0
 """How long a container may take to answer, beyond the requested wait."""

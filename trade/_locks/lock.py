@@ -14,10 +14,10 @@ from msgspec import structs
 from trade._context.call_context import patience_s
 from trade._context.outgoing import Claim, Held, holding
 from trade._locks.inherited import VARIABLE, passed_on
-from trade._protocol.keys import Address
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade.errors import ConfigurationError, LockLost, TradeError
+from trade.protocol.keys import Address
+from trade.protocol.messages import Token
 
 if TYPE_CHECKING:
     from trade._locks.lease_client import LeaseClient

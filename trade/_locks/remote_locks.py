@@ -10,12 +10,12 @@ from msgspec import structs
 
 from trade._context.call_context import CallContext
 from trade._locks.lock import Lock, OnLost, OnRequest
-from trade._protocol.keys import Address
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade.errors import LockLost
+from trade.protocol.keys import Address
+from trade.protocol.messages import Token
 
 Wanted = Mapping[Address, Sequence[str]]
 """Resources of one other system, by the container that grants their locks."""

@@ -10,14 +10,14 @@ from msgspec import structs
 from trade._context.call_context import CallContext, served_call
 from trade._context.sessions import foreign
 from trade._locks.remote_locks import RemoteLocks
-from trade._protocol.keys import Address
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockInfo, LockRequest, StopInfo
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import Busy, LockedByOther, TradeError
+from trade.protocol.keys import Address
+from trade.protocol.messages import Token
 
 _MOST_WAITING: Final = 24
 """The most requests in the queues of a container; further clients ask again later."""

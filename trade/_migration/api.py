@@ -5,9 +5,9 @@ from typing import Any, Final
 
 from trade._calls.client import CallClient
 from trade._calls.handle import Handle
-from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, as_constraint, services_at
 from trade.errors import NoSuchService, TooManyServices
+from trade.protocol.keys import DOMAIN, PROVIDER, ServiceKey
 
 _LONGEST_S: Final = 45.0
 

@@ -10,10 +10,10 @@ from typing import Any, Final, NamedTuple
 
 from trade._calls.handle import Handle
 from trade._migration.delivered_code import CodeStore
-from trade._protocol.keys import Address
 from trade._services.providers import Providers
 from trade._services.withdrawn import WithdrawnProviders
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchClass, NotInstantiable
+from trade.protocol.keys import Address
 
 _logger = logging.getLogger("trade")
 _PATH: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")

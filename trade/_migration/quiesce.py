@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Any, Final
 
-from trade._protocol.keys import Address
 from trade._resources.grants import LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource, locked
 from trade._services.local_service import LocalService
 from trade.errors import ConfigurationError, LockedByOther
+from trade.protocol.keys import Address
 
 CALLS_S: Final = 2.0
 """How long running calls may take to end."""

@@ -16,8 +16,6 @@ from trade._context.call_context import running
 from trade._migration.factory import Arguments, ProviderFactory, path_of
 from trade._migration.quiesce import Frozen, Quiescer, is_stateful, restore, save
 from trade._migration.target import Prepared, ProviderSnapshot, fingerprint
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import where
 from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
@@ -35,6 +33,8 @@ from trade.errors import (
     ServiceGone,
     TradeError,
 )
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 
 _logger = logging.getLogger("trade")
 PREPARE: Final = "prepare_arrival"

@@ -12,10 +12,6 @@ from msgspec import Struct, structs
 
 from trade._migration.factory import ProviderFactory, end, path_of
 from trade._migration.quiesce import Quiescer, is_stateful, restore
-from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey, domain_of
-from trade._protocol.messages import Scalar, encode_message
-from trade._protocol.schema_types import imported
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import marked_methods
 from trade._services.providers import Providers
@@ -23,6 +19,10 @@ from trade._services.registration import Built, checked_groups
 from trade._services.signature import Signature
 from trade._threads.scheduler import ScheduledTask, Scheduler
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
+from trade.protocol.codec import Codec
+from trade.protocol.keys import Address, ServiceKey, domain_of
+from trade.protocol.messages import Scalar, encode_message
+from trade.protocol.schema_types import imported
 
 TICKET_S: Final = 20.0
 """A prepared provider that is not fetched within this time is closed again."""

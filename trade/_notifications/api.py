@@ -12,9 +12,9 @@ from trade._notifications.notification import Notification, NotificationInfo, Ow
 from trade._notifications.notifier import Notifier
 from trade._notifications.services import Hosted, placed
 from trade._notifications.triggers import OF_CHANGES, TriggerSpec, What, action_of, epoch_s, target_of
-from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, as_constraint, services_at, where
 from trade.errors import NoSuchNotification
+from trade.protocol.keys import DOMAIN
 
 POLL_S: Final = 1.0
 

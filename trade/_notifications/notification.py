@@ -17,8 +17,8 @@ from trade._notifications.events import StateEvent
 from trade._notifications.triggers import Action, Target, TriggerSpec, text_of
 from trade._registry.registry import Record
 from trade._threads.scheduler import Scheduler
-from trade._transport.wait_clock import WaitClock
 from trade.errors import ConfigurationError
+from trade.transport.wait_clock import WaitClock
 
 _logger = logging.getLogger("trade")
 

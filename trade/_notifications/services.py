@@ -12,10 +12,10 @@ from trade._context.sessions import Session
 from trade._notifications.notification import ActiveNotification, Notification, NotificationInfo, Owner
 from trade._notifications.notifier import Notifier
 from trade._notifications.triggers import OF_SERVICES, Action, TriggerSpec
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.registry import Record, Registry
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, NoSuchNotification
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 
 _logger = logging.getLogger("trade")
 

@@ -5,14 +5,14 @@ from collections.abc import Callable, Sequence
 from trade._discovery.dialer import Dialer
 from trade._discovery.link_table import LinkTable, NetworkInfo, network
 from trade._notifications.events import EventLog, StateEvent
-from trade._protocol.keys import CLOCK, DOMAIN, Address, ServiceKey
 from trade._registry.constraints import as_constraint, services_at
 from trade._registry.registry import Change, Record, Registry
 from trade._security.certificates import Certificate
 from trade._services.decorator import service
-from trade._telemetry.call_model import CallModel, CallProfile, CallWatch, deviations, learn, made_here
 from trade._telemetry.spans import Spans
-from trade._transport.zenoh_links import Links
+from trade.call_model import CallModel, CallProfile, CallWatch, deviations, learn, made_here
+from trade.protocol.keys import CLOCK, DOMAIN, Address, ServiceKey
+from trade.transport.zenoh_links import Links
 
 
 class States:

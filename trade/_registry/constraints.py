@@ -10,11 +10,11 @@ from typing import Any, Final, Literal, Protocol
 import msgspec
 from msgspec import Struct
 
-from trade._protocol.keys import GROUP
-from trade._protocol.messages import Scalar, ServiceInfo
-from trade._protocol.schema import fits, known_schema, read_json, read_types, readable, types_text
 from trade._registry.predicates import fits_all, parse_predicates
 from trade.errors import ConfigurationError
+from trade.protocol.keys import GROUP
+from trade.protocol.messages import Scalar, ServiceInfo
+from trade.protocol.schema import fits, known_schema, read_json, read_types, readable, types_text
 
 """The form of a group: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000

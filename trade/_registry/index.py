@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
-from trade._protocol.keys import ServiceKey
 from trade._registry.constraints import Candidate, Constraint, Term, is_exact
 from trade._registry.predicates import parse_predicates, read_condition
+from trade.protocol.keys import ServiceKey
 
 _Slot = tuple[str, str]
 """A field and one value of it."""

@@ -2,9 +2,9 @@
 
 from typing import Final
 
-from trade._protocol.container_info import ContainerInfo
 from trade._registry.registry import Registry
 from trade._table import Table
+from trade.protocol.container_info import ContainerInfo
 
 _COLUMNS: Final = {
     "CONTAINER": "name",

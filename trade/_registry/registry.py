@@ -8,14 +8,14 @@ from typing import Final, NamedTuple
 
 from msgspec import Struct
 
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import HEALTHY, PROTOCOL, Estop, ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import Constraint
 from trade._registry.index import Index
 from trade._registry.revision_tracker import RevisionTracker
 from trade._threads.condition import InterruptibleCondition
 from trade._threads.event import Event
 from trade.errors import ServiceGone
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import HEALTHY, PROTOCOL, Estop, ProviderInfo, Scalar, ServiceInfo
 
 _KNOWN_WITHIN_S: Final = 1.0
 

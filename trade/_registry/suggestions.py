@@ -4,10 +4,10 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade.errors import NoSuchService, TooManyServices
+from trade.protocol.keys import DOMAIN
 
 _LIKE: Final = 0.7
 _NAME_LIKE: Final = 0.6

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from trade._protocol.messages import Token
 from trade._resources.resource import Holder, Resource
+from trade.protocol.messages import Token
 
 
 class LockRequest(Struct, frozen=True):

@@ -14,11 +14,11 @@ from msgspec import structs
 
 from trade._audit.events import Audit
 from trade._context.sessions import EndedSessions, foreign, within
-from trade._protocol.messages import Token
 from trade._resources.grants import Grant, Granted, LockInfo, LockRequest, StopInfo, Waiter, withheld
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
 from trade._threads.scheduler import Scheduler
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
+from trade.protocol.messages import Token
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 

@@ -14,8 +14,8 @@ from msgspec import Struct, structs
 
 from trade._context.call_context import CallContext, running
 from trade._context.sessions import foreign
-from trade._protocol.messages import Token
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, SessionEnded, Stopped
+from trade.protocol.messages import Token
 from trade.timestamps import clock
 
 _stop_numbers: Final = itertools.count(1).__next__

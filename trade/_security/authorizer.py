@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, domain_of
 from trade._security.policy import Decision, Policy
 from trade._security.policy_file import Seen, look_at, policy_files, read_policy
 from trade.errors import AccessDenied
+from trade.protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, domain_of
 
 _ALL: Final = ""
 FUNCTIONS: Final = {

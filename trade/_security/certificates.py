@@ -16,8 +16,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final, cast
 
-from trade._protocol.keys import is_chunk
 from trade.errors import ConfigurationError
+from trade.protocol.keys import is_chunk
 
 _CA: Final = "ca.pem"
 _CERTIFICATE: Final = "cert.pem"

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, cast
 
-from trade._protocol.keys import GROUP, NO_GROUP, is_chunk
 from trade._security.policy import EVERYTHING, VERBS, Policy, Role
 from trade.errors import ConfigurationError
+from trade.protocol.keys import GROUP, NO_GROUP, is_chunk
 from trade.text_files import read_text
 from trade.toml_files import read_toml_text
 

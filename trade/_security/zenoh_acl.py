@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from typing import Any, Final, Literal
 
-from trade._protocol.keys import ALIVE, DOMAIN, ESTOPS, REGISTRY
-from trade._protocol.samples import STEPS_HZ, STREAMS
 from trade._security.network_crossings import Crossing
 from trade._security.policy import EVERYTHING, VERBS, Policy
+from trade.protocol.keys import ALIVE, DOMAIN, ESTOPS, REGISTRY
+from trade.protocol.samples import STEPS_HZ, STREAMS
 
 _IN: Final = "ingress"
 _OUT: Final = "egress"

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, overload
 
-from trade._protocol.messages import Scalar
 from trade._registry.constraints import checked_meta
 from trade._registry.predicates import parse_condition
 from trade.errors import ConfigurationError
+from trade.protocol.messages import Scalar
 
 Effect = Literal["read", "note", "actuate", "stop"]
 

@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from trade._protocol.codec import Codec
-from trade._protocol.messages import Parameter, ServiceInfo
-from trade._protocol.schema import schema_message, type_text
-from trade._protocol.schema_types import name_of, noted
 from trade._services.decorator import ServiceMark
 from trade._services.secret import MASK, is_secret
 from trade.errors import ConfigurationError
+from trade.protocol.codec import Codec
+from trade.protocol.messages import Parameter, ServiceInfo
+from trade.protocol.schema import schema_message, type_text
+from trade.protocol.schema_types import name_of, noted
 
 
 def field_of(parameter: inspect.Parameter, kind: Any) -> Any:

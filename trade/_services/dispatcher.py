@@ -26,8 +26,25 @@ from trade._context.active_calls import (
 )
 from trade._context.call_context import CallContext, outer_of
 from trade._context.sessions import foreign
-from trade._protocol.keys import DOMAIN, LOCAL, PROVIDER, Address, calls_to, is_chunk, reply_key
-from trade._protocol.messages import (
+from trade._security.authorizer import Authorizer
+from trade._services.event_loop import AsyncLoop
+from trade._services.local_service import LocalService
+from trade._services.providers import Providers
+from trade._services.serial_queue import SerialQueue
+from trade._threads.channel_workers import WorkerPool
+from trade._threads.scheduler import Scheduler
+from trade.errors import (
+    AccessDenied,
+    Busy,
+    DeadlineExceeded,
+    InvalidResult,
+    NotSerialisable,
+    RemoteError,
+    ServiceGone,
+    TradeError,
+)
+from trade.protocol.keys import DOMAIN, LOCAL, PROVIDER, Address, calls_to, is_chunk, reply_key
+from trade.protocol.messages import (
     CANCEL,
     EMPTY,
     LARGE,
@@ -42,24 +59,7 @@ from trade._protocol.messages import (
     decode_call,
     encode_message,
 )
-from trade._security.authorizer import Authorizer
-from trade._services.event_loop import AsyncLoop
-from trade._services.local_service import LocalService
-from trade._services.providers import Providers
-from trade._services.serial_queue import SerialQueue
-from trade._threads.channel_workers import WorkerPool
-from trade._threads.scheduler import Scheduler
-from trade._transport.base import ChannelClosed, Message, Publisher, Transport
-from trade.errors import (
-    AccessDenied,
-    Busy,
-    DeadlineExceeded,
-    InvalidResult,
-    NotSerialisable,
-    RemoteError,
-    ServiceGone,
-    TradeError,
-)
+from trade.transport.base import ChannelClosed, Message, Publisher, Transport
 
 _logger = logging.getLogger("trade")
 

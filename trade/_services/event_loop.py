@@ -8,8 +8,8 @@ from collections.abc import Coroutine
 from typing import Any
 
 from trade._context.call_context import CallContext
-from trade._protocol.remote_errors import pack_error, unpack_error
 from trade.errors import Cancelled, OutcomeUnknown
+from trade.protocol.remote_errors import pack_error, unpack_error
 
 
 class AsyncLoop:

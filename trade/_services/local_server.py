@@ -18,15 +18,15 @@ from typing import Final
 
 from msgspec import Raw
 
-from trade._protocol.keys import Address
-from trade._protocol.messages import Malformed
 from trade._services.dispatcher import Dispatcher
 from trade._services.process_watch import ProcessWatch
 from trade._threads.channel_workers import MOST_THREADS, WorkerPool
-from trade._transport.base import Channel, ChannelClosed, Message, Publisher
-from trade._transport.local_connection import ConnectionEnded, LocalConnection
-from trade._transport.local_greeting import Greeting, Passport
 from trade.errors import TradeError
+from trade.protocol.keys import Address
+from trade.protocol.messages import Malformed
+from trade.transport.base import Channel, ChannelClosed, Message, Publisher
+from trade.transport.local_connection import ConnectionEnded, LocalConnection
+from trade.transport.local_greeting import Greeting, Passport
 
 _logger = logging.getLogger("trade")
 

@@ -12,8 +12,6 @@ from msgspec import Raw, structs
 from trade._context.call_context import CallContext, running
 from trade._context.interceptor import CallGuard, Interceptor, ServedCall
 from trade._context.sessions import foreign
-from trade._protocol.messages import ErrorInfo, ServiceInfo
-from trade._protocol.remote_errors import pack_error, unpack_error
 from trade._resources.resource import Resource, admitted
 from trade._security.policy import Policy
 from trade._services.decorator import ServiceMark
@@ -21,6 +19,8 @@ from trade._services.event_loop import AsyncLoop
 from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import DeadlineExceeded, TradeError
+from trade.protocol.messages import ErrorInfo, ServiceInfo
+from trade.protocol.remote_errors import pack_error, unpack_error
 
 _COROUTINE: Final[type] = CoroutineType
 """The type that an ``async def`` returns; compared with every result, hence cheap."""

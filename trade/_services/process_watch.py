@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from trade._protocol.keys import Address
+from trade.protocol.keys import Address
 
 _logger = logging.getLogger("trade")
 

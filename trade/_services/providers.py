@@ -12,9 +12,6 @@ from msgspec import structs
 
 from trade._audit.events import Audit
 from trade._discovery.announcer import Announcer
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, Address, ServiceKey, as_chunk, domain_of
-from trade._protocol.messages import ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import checked_meta
 from trade._registry.registry import Record, Registry, gone_to, records_of
 from trade._resources.lock_table import LockTable
@@ -27,6 +24,9 @@ from trade._services.registration import Built, Offer, Registered, require_stop
 from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, Address, ServiceKey, as_chunk, domain_of
+from trade.protocol.messages import ProviderInfo, Scalar, ServiceInfo
 
 _MOST_MOVED: Final = 4096
 

@@ -5,11 +5,11 @@ from typing import Any, Final, NamedTuple
 
 from msgspec import Struct
 
-from trade._protocol.keys import DOMAIN, GROUP, ServiceKey, is_chunk
-from trade._protocol.messages import ProviderInfo, Scalar
 from trade._services.decorator import ServiceMark
 from trade._services.local_service import LocalService
 from trade.errors import ConfigurationError
+from trade.protocol.keys import DOMAIN, GROUP, ServiceKey, is_chunk
+from trade.protocol.messages import ProviderInfo, Scalar
 
 _LONGEST_HEALTH: Final = 500
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, TypeVar, cast, get_args
 import msgspec
 from msgspec import Meta, Raw, structs
 
-from trade._protocol.messages import UNREADABLE, ErrorInfo
+from trade.protocol.messages import UNREADABLE, ErrorInfo
 
 # Masked values have no types: they came over the wire.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false

@@ -14,13 +14,13 @@ import msgspec
 from msgspec import UNSET, Raw
 from msgspec.structs import astuple
 
-from trade._protocol.codec import Codec
-from trade._protocol.messages import LARGE, MOST_BYTES, UNREADABLE, ErrorInfo, LargeBytes, ServiceInfo
-from trade._protocol.schema import NOT_FINITE, problem_text, value_at
 from trade._services.decorator import ServiceMark
 from trade._services.description import describe, described, field_of
 from trade._services.secret import MASK, is_secret, mask
 from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable, TooLarge
+from trade.protocol.codec import Codec
+from trade.protocol.messages import LARGE, MOST_BYTES, UNREADABLE, ErrorInfo, LargeBytes, ServiceInfo
+from trade.protocol.schema import NOT_FINITE, problem_text, value_at
 
 _AT: Final = re.compile(r" - at `\$(?:\[(\d+)\]|\.(\w+))(.*)`$")
 _MAP_HEADS: Final = frozenset([*range(0x80, 0x90), 0xDE, 0xDF])

@@ -6,11 +6,11 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._resources.resource import Resource
 from trade._services.providers import Providers
 from trade._services.registration import Offer, checked_groups
 from trade.errors import ConfigurationError, DeviceFault
+from trade.protocol.keys import DOMAIN, ServiceKey
 
 
 class WithdrawnInfo(Struct, frozen=True):

@@ -11,13 +11,13 @@ from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.sessions import speaking
 from trade._notifications.triggers import Action, Target, What, target_of
-from trade._protocol.samples import Value
 from trade._registry.constraints import Constraint, as_constraint, service_at
 from trade._streams.source import LEAST_HZ, MOST_HZ, check_sampled
 from trade._streams.stream import If, Stream
 from trade._streams.subscriptions import Subscriptions
 from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError, ServiceGone, SourceLost
+from trade.protocol.samples import Value
 
 _logger = logging.getLogger("trade")
 

@@ -4,9 +4,9 @@ from typing import Final, NamedTuple
 
 from msgspec import Raw
 
-from trade._protocol.messages import PROTOCOL, encode_message
-from trade._protocol.samples import StreamSample
-from trade._transport.base import Publisher
+from trade.protocol.messages import PROTOCOL, encode_message
+from trade.protocol.samples import StreamSample
+from trade.transport.base import Publisher
 
 SIGN_S: Final = 1.0
 """An unchanged value is still published this often."""

@@ -15,16 +15,16 @@ from msgspec import Struct, structs
 from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._context.call_context import CallContext
-from trade._protocol.keys import ServiceKey
-from trade._protocol.messages import EMPTY_ARGUMENTS, encode_message
-from trade._protocol.samples import STEPS_HZ, stream_key
 from trade._registry.registry import Change
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import Turn
 from trade._streams.rate import ActiveRate, Rate, period_ns
 from trade._threads.scheduler import Scheduler
-from trade._transport.base import ChannelClosed, Transport
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
+from trade.protocol.keys import ServiceKey
+from trade.protocol.messages import EMPTY_ARGUMENTS, encode_message
+from trade.protocol.samples import STEPS_HZ, stream_key
+from trade.transport.base import ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
 

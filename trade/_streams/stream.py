@@ -11,11 +11,11 @@ import msgspec
 
 from trade._calls.handle import Handle
 from trade._context.sessions import Session
-from trade._protocol.messages import UNREADABLE, ErrorInfo
-from trade._protocol.remote_errors import unpack_error
-from trade._protocol.samples import Sample, StreamSample, Value
 from trade._threads.condition import InterruptibleCondition
 from trade.errors import ConfigurationError, InvalidResult, SessionEnded
+from trade.protocol.messages import UNREADABLE, ErrorInfo
+from trade.protocol.remote_errors import unpack_error
+from trade.protocol.samples import Sample, StreamSample, Value
 
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 

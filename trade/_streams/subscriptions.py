@@ -17,15 +17,15 @@ from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed, result_decoder
 from trade._context.sessions import Session
-from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
-from trade._protocol.messages import Malformed
-from trade._protocol.samples import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._registry.registry import Change
 from trade._streams.stream import If, Stream
 from trade._threads.scheduler import Scheduler
-from trade._transport.base import Channel, ChannelClosed, Transport
 from trade.errors import AccessDenied, ServiceGone, SessionEnded, SourceLost, TradeError
+from trade.protocol.codec import Codec
+from trade.protocol.keys import DOMAIN, PROVIDER, ServiceKey
+from trade.protocol.messages import Malformed
+from trade.protocol.samples import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
+from trade.transport.base import Channel, ChannelClosed, Transport
 
 _logger = logging.getLogger("trade")
 

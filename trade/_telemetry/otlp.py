@@ -5,10 +5,10 @@ from contextlib import ExitStack
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Final
 
-from trade._protocol.keys import Address
 from trade._settings import Settings
 from trade._telemetry.spans import Span
 from trade.errors import ConfigurationError
+from trade.protocol.keys import Address
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import SpanProcessor

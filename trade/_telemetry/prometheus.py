@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final, cast
 
 from trade._counters import BOUNDS_S, CallCounters, Measure
 from trade._settings import Settings
-from trade._transport.bounded_listener import BoundedListener
-from trade._transport.endpoints import Endpoint
 from trade.errors import ConfigurationError
+from trade.transport.bounded_listener import BoundedListener
+from trade.transport.endpoints import Endpoint
 
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric

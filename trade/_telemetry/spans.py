@@ -12,9 +12,9 @@ from msgspec import Struct, structs
 from trade._context.call_context import CallContext
 from trade._context.interceptor import Interceptor, ServedCall
 from trade._context.outgoing import Request
-from trade._protocol.keys import DOMAIN, Address, ServiceKey
-from trade._protocol.messages import Token
 from trade._telemetry.log_buffer import listen
+from trade.protocol.keys import DOMAIN, Address, ServiceKey
+from trade.protocol.messages import Token
 
 if TYPE_CHECKING:
     from trade._resources.lock_table import LockTable

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from trade._transport.base import Channel, ChannelClosed, Message
+from trade.transport.base import Channel, ChannelClosed, Message
 
 _logger = logging.getLogger("trade")
 

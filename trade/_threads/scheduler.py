@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from trade._transport.wait_clock import WaitClock
+from trade.transport.wait_clock import WaitClock
 
 _logger = logging.getLogger("trade")
 

@@ -10,10 +10,10 @@ from trade._calls.batch import Outcome
 from trade._calls.client import CallClient
 from trade._calls.everywhere import Everywhere, answers
 from trade._calls.handle import Bound, Handle
-from trade._protocol.keys import Address, ServiceKey
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span
 from trade.errors import NoSuchCall
+from trade.protocol.keys import Address, ServiceKey
 
 NOT_TRACED: Final = "(not traced)"
 

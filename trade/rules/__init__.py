@@ -1,6 +1,6 @@
 """Rules that configure a running system, from a TOML file: when an event occurs and a condition holds, make calls."""
 
-from trade._protocol.schema_types import publish as _publish
+from trade.protocol.schema_types import publish as _publish
 from trade.rules._engine import GROUP, DryRun, RuleInfo, Rules, rehearse
 from trade.rules._file import Condition, Occasion, Rule, Selection, Step, read_rules
 from trade.rules._steps import Firing, StepResult

@@ -14,8 +14,8 @@ from msgspec import Struct, structs
 from trade._calls.handle import Handle
 from trade._container.container import Container
 from trade._notifications.notification import Notification
-from trade._protocol.messages import HEALTHY
 from trade._services.decorator import service
+from trade.protocol.messages import HEALTHY
 from trade.rules._file import Rule, read_rules
 from trade.rules._steps import TURNS, Firing, LoopDetector, Mark, StepResult, Way, done, fired, holds, turns
 

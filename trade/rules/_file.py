@@ -12,10 +12,10 @@ from msgspec import UNSET, Struct, UnsetType
 from trade._calls.handle import LONGEST_DEADLINE_S, Handle
 from trade._calls.picking import Pick
 from trade._notifications.triggers import LONGEST_S, SHORTEST_S
-from trade._protocol.keys import is_chunk
-from trade._protocol.messages import Scalar
 from trade._registry.constraints import Constraint, where
 from trade.errors import ConfigurationError
+from trade.protocol.keys import is_chunk
+from trade.protocol.messages import Scalar
 from trade.text_files import read_text
 from trade.toml_files import mismatch, read_toml_text
 

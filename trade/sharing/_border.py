@@ -22,13 +22,13 @@ from trade._federation.federation import Exposed, MemberSystem, inside, shown
 from trade._locks.api import LEASE_S
 from trade._locks.lock import Lock, OnLost, OnRequest, Selection
 from trade._locks.remote_locks import SharedResource, Wanted
-from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
-from trade._protocol.messages import Behalf, Estop, ProviderInfo
 from trade._registry.registry import Change
 from trade._resources.grants import LockRequest
-from trade._transport.base import ChannelClosed
 from trade.errors import ConfigurationError, TradeError
+from trade.protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
+from trade.protocol.messages import Behalf, Estop, ProviderInfo
 from trade.sharing._guest_sessions import GuestSessions
+from trade.transport.base import ChannelClosed
 
 _logger = logging.getLogger("trade")
 

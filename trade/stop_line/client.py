@@ -12,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Generic, TypeVar
 
 from trade._estop.broadcast import EstopReport, all_of, as_seen_here
-from trade._protocol.messages import Malformed
 from trade._settings import Settings
-from trade._transport.endpoints import accepts
+from trade.protocol.messages import Malformed
 from trade.stop_line.group_stop import StopReport, merge_reports
 from trade.stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
 from trade.stop_line.places import Place, places
+from trade.transport.endpoints import accepts
 
 _logger = logging.getLogger("trade")
 

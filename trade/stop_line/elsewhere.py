@@ -4,12 +4,12 @@ import contextlib
 from typing import Final
 
 from trade._paths import runtime_folders
-from trade._protocol.messages import Malformed
 from trade._settings import Settings
-from trade._transport.host_socket import process_of
 from trade.errors import ConfigurationError
+from trade.protocol.messages import Malformed
 from trade.stop_line.messages import VERSION, StopRequest, encoded, read_answer
 from trade.stop_line.places import host_places
+from trade.transport.host_socket import process_of
 
 _MOST: Final = 16
 _ANSWER_S: Final = 0.3

@@ -10,14 +10,14 @@ from msgspec import Struct, structs
 from trade._calls.client import CallClient
 from trade._calls.run import Run
 from trade._context.call_context import served_call
-from trade._context.sessions import Session, client_name
+from trade._context.sessions import Session
 from trade._estop.controller import LIMIT_S, is_stop
-from trade._protocol.keys import DOMAIN, Address
 from trade._registry.constraints import where
 from trade._registry.registry import Record, Registry
 from trade._services.decorator import service
 from trade._threads.condition import InterruptibleCondition
-from trade._transport.base import Presence
+from trade.protocol.keys import DOMAIN, Address, client_name
+from trade.transport.base import Presence
 
 _logger = logging.getLogger("trade")
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._security.certificates import common_name
-from trade._transport.host_socket import is_own_user
 from trade.stop_line.messages import MOST_BYTES
+from trade.transport.host_socket import is_own_user
 
 _logger = logging.getLogger("trade")
 

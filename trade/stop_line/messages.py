@@ -7,8 +7,8 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade._estop.broadcast import EstopReport
-from trade._protocol.keys import is_chunk
-from trade._protocol.messages import Estop, Malformed
+from trade.protocol.keys import is_chunk
+from trade.protocol.messages import Estop, Malformed
 from trade.stop_line.group_stop import StopReport
 
 VERSION: Final = 1

@@ -6,13 +6,13 @@ import ssl
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from trade._default_system import earlier_folders
 from trade._paths import runtime_folders
 from trade._security.certificates import line_context
 from trade._settings import Settings
-from trade._transport.endpoints import Endpoint
-from trade._transport.host_socket import dial_on_host, host_sockets, listen_on_host
+from trade.default_system import earlier_folders
 from trade.errors import ConfigurationError
+from trade.transport.endpoints import Endpoint
+from trade.transport.host_socket import dial_on_host, host_sockets, listen_on_host
 
 _PORTS_BEYOND: Final = 1000
 _LAST_PORT: Final = 65535

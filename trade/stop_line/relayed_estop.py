@@ -11,8 +11,8 @@ import msgspec
 from trade._calls.client import CallClient
 from trade._calls.handle import Handle
 from trade._estop.broadcast import EstopReport, all_of, as_seen_here
-from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import where
+from trade.protocol.keys import DOMAIN
 
 ESTOP: Final = "estop"
 _RELAYS: Final = 4

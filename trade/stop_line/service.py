@@ -12,18 +12,18 @@ from typing import Final
 
 from trade._audit.events import Audit
 from trade._estop.controller import EstopController
-from trade._protocol.keys import Address
-from trade._protocol.messages import Malformed
 from trade._security.authorizer import Authorizer
 from trade._security.certificates import Certificate, line_context
 from trade._settings import Settings
-from trade._transport.endpoints import Endpoint
-from trade._transport.host_socket import is_deaf
 from trade.errors import LimitExceeded, TradeError
+from trade.protocol.keys import Address
+from trade.protocol.messages import Malformed
 from trade.stop_line.group_stop import StopReport
 from trade.stop_line.listener import Listener
 from trade.stop_line.messages import StopAnswer, StopRequest, encoded, estop_fields, read_request
 from trade.stop_line.places import host_socket, network_socket
+from trade.transport.endpoints import Endpoint
+from trade.transport.host_socket import is_deaf
 
 _logger = logging.getLogger("trade")
 

@@ -3,11 +3,11 @@
 Nothing here needs a test framework; the suites are plain classes with ``test_`` methods, run in a subclass by pytest.
 """
 
-from trade._transport.memory import Clock, InFlightMessage, Kind, Network
 from trade.testing._losses import LossConformance, Severable
 from trade.testing._system import MemorySystem, memory_system
 from trade.testing._transports import TransportConformance
 from trade.testing.virtual import Deadlock, VirtualTime, VirtualTimeError, virtual_time
+from trade.transport.memory import Clock, InFlightMessage, Kind, Network
 
 __all__ = [
     "Clock",

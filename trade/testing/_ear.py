@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping
 from typing import Final
 
-from trade._transport.base import Channel, ChannelClosed, Message, Transport
+from trade.transport.base import Channel, ChannelClosed, Message, Transport
 
 PATIENCE_S: Final = 10.0
 """How long a test waits for something that must come; far longer than it takes."""

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from trade._transport.base import Message, Transport
 from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
+from trade.transport.base import Message, Transport
 
 
 class Severable(NamedTuple):

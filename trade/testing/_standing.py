@@ -8,8 +8,8 @@ from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
-from trade._transport.base import ChannelClosed, Message, Transport
 from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
+from trade.transport.base import ChannelClosed, Message, Transport
 
 
 class StandingConformance(ABC):

@@ -10,8 +10,8 @@ from typing import Final
 
 from trade._container.container import Container
 from trade._settings import Settings
-from trade._transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
-from trade._transport.memory.node import Node
+from trade.transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
+from trade.transport.memory.node import Node
 
 _TAKING_NOTE_S: Final = 10.0
 _LOOK_AGAIN_S: Final = 0.0005

@@ -1,4 +1,4 @@
-"""Conformance of transports: the guarantees of `_transport.base`, each with its own test."""
+"""Conformance of transports: the guarantees of `trade.transport.base`, each with its own test."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -9,9 +9,9 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 
-from trade._transport.base import Channel, ChannelClosed, Message, Transport
 from trade.testing._ear import RecordingListener, listen, meet
 from trade.testing._standing import StandingConformance
+from trade.transport.base import Channel, ChannelClosed, Message, Transport
 
 _BIG_BYTES = 8 * 1024 * 1024
 

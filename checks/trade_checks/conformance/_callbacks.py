@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trade import Resource, current_call, errors, service, where
-from trade._protocol.keys import ServiceKey
-from trade._protocol.messages import Status
+from trade.protocol.keys import ServiceKey
+from trade.protocol.messages import Status
 from trade_checks.conformance._assertions import eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

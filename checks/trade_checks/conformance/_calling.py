@@ -6,7 +6,7 @@ import threading
 from typing import Any, Final
 
 from trade import errors
-from trade._protocol.messages import CANCEL, Status
+from trade.protocol.messages import CANCEL, Status
 from trade_checks.conformance._assertions import eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

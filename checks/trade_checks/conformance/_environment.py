@@ -16,12 +16,12 @@ from typing import Any, Final
 import msgspec
 
 from trade import Container, Settings
-from trade._protocol.keys import ALIVE, Address, is_chunk, registry_key
-from trade._transport.base import Answer, ChannelClosed
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
+from trade.protocol.keys import ALIVE, Address, is_chunk, registry_key
 from trade.records import Granted, Token
+from trade.transport.base import Answer, ChannelClosed
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport, configuration
 from trade_checks.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
 from trade_checks.conformance._peer import Peer, end_group
 from trade_checks.conformance._raw_client import NEVER, PARTING_S, SYSTEM, Voice

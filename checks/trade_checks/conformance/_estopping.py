@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from trade import errors, where
-from trade._protocol.estop_messages import decode_estop_confirmed
-from trade._protocol.keys import estop_confirmed_key, estop_key
-from trade._protocol.messages import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
+from trade.protocol.estop_messages import decode_estop_confirmed
+from trade.protocol.keys import estop_confirmed_key, estop_key
+from trade.protocol.messages import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
 from trade_checks.conformance._assertions import PATIENCE_S, eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

@@ -6,7 +6,7 @@ import time
 import msgspec
 
 from trade import LockInfo, errors, where
-from trade._protocol.messages import Status, Token
+from trade.protocol.messages import Status, Token
 from trade_checks.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

@@ -1,7 +1,7 @@
 """Checks of motion: it stops on request, and with the client that started it."""
 
 from trade import errors
-from trade._protocol.messages import Status
+from trade.protocol.messages import Status
 from trade_checks.conformance._assertions import require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

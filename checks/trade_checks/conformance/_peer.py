@@ -11,9 +11,9 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._protocol.keys import Address, registry_key
-from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, decode_tally
-from trade._transport.base import Answer
+from trade.protocol.keys import Address, registry_key
+from trade.protocol.messages import Malformed, ProviderInfo, decode_provider, decode_tally
+from trade.transport.base import Answer
 from trade_checks.conformance._assertions import NotHeld, eventually, require
 from trade_checks.conformance._raw_client import SYSTEM, Place
 

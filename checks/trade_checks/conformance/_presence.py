@@ -3,8 +3,8 @@
 import signal
 from typing import Final
 
-from trade._protocol.keys import is_chunk, registry_key, tally_key
-from trade._protocol.messages import ServiceInfo, Tally, decode_tally
+from trade.protocol.keys import is_chunk, registry_key, tally_key
+from trade.protocol.messages import ServiceInfo, Tally, decode_tally
 from trade_checks.conformance._assertions import NotHeld, eventually, require
 from trade_checks.conformance._check import check
 from trade_checks.conformance._environment import Stage

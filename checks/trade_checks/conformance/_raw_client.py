@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import msgspec
 
-from trade._protocol.keys import Address, alive_key, call_key, reply_key
-from trade._protocol.messages import (
+from trade.protocol.keys import Address, alive_key, call_key, reply_key
+from trade.protocol.messages import (
     CANCEL,
     PROTOCOL,
     Behalf,
@@ -22,8 +22,8 @@ from trade._protocol.messages import (
     decode_reply,
     encode_message,
 )
-from trade._protocol.remote_errors import unpack_error
-from trade._transport.base import ChannelClosed, Publisher, Transport
+from trade.protocol.remote_errors import unpack_error
+from trade.transport.base import ChannelClosed, Publisher, Transport
 from trade_checks.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
 
 Place = tuple[str, str]

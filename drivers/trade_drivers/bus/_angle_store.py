@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from trade.errors import ConfigurationError
-from trade.keeping import Database
+from trade.storage import Database
 
 Span = tuple[float, float]
 """Where a joint is, in rad; its two ends differ while it moves."""

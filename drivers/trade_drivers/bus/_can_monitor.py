@@ -6,7 +6,7 @@ from typing import Literal
 from msgspec import Struct
 
 from trade import service
-from trade._protocol.messages import HEALTHY
+from trade.protocol.messages import HEALTHY
 
 ErrorWord = Literal["error-active", "error-warning", "error-passive", "bus-off"]
 

@@ -11,8 +11,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
-from trade import current_call
-from trade._services.decorator import effect_of
+from trade import current_call, effect_of
 from trade.errors import ConfigurationError, DeadlineExceeded, DeviceError, InvalidArgument
 from trade_drivers.clibrary._marshalling import Passing, is_never_negative, plan
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from trade._protocol.messages import HEALTHY
 from trade.errors import DeviceFault, TradeError
+from trade.protocol.messages import HEALTHY
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Moment, when
 from trade_drivers.faults._trouble import Found, Trouble, found_in

@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from trade.keeping import Database
+from trade.storage import Database
 from trade_drivers.faults._record import Fault
 
 Key = tuple[str, str]

@@ -10,10 +10,10 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
-from trade._transport.endpoints import Endpoint, loopback_interface
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, Certificate, read_policy
 from trade.toml_files import Mismatch, mismatch
+from trade.transport.endpoints import Endpoint, loopback_interface
 from trade_gateway.config._children import Child, read_children
 from trade_gateway.config._entry import FileDefaults
 from trade_gateway.config._supervised_system import as_gateway

@@ -11,9 +11,9 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 from tomlkit.exceptions import TOMLKitError
 
-from trade._protocol.keys import is_chunk
 from trade.atomic_files import replace
 from trade.errors import AccessDenied, ConfigurationError
+from trade.protocol.keys import is_chunk
 from trade.text_files import as_before, read_text
 from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
 from trade_gateway.clients._errors import NotAuthenticated

@@ -19,7 +19,7 @@ from starlette.routing import Route, WebSocketRoute
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade.listening import BoundedListener
+from trade.transport.bounded_listener import BoundedListener
 from trade_gateway.clients import ClientApi
 from trade_gateway.dashboard import pages
 from trade_gateway.http._authentication import Authenticator, Tokens

@@ -7,8 +7,8 @@ from typing import Final
 
 import msgspec
 
-from trade._protocol.messages import UNREADABLE
 from trade.atomic_files import replace
+from trade.protocol.messages import UNREADABLE
 
 _MOST_BYTES: Final = 16 << 20
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from trade import where
-from trade._protocol.messages import HEALTHY
 from trade.errors import AccessDenied, ConfigurationError
+from trade.protocol.messages import HEALTHY
 from trade.timestamps import clock
 from trade_gateway.language._names import in_words, matching, names, one_of, others, resources
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown

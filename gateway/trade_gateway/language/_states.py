@@ -8,8 +8,8 @@ from typing import Final
 import msgspec
 
 from trade import Handle, where
-from trade._protocol.messages import HEALTHY
 from trade.auditing import AuditRow, reading, records_in
+from trade.protocol.messages import HEALTHY
 from trade.timestamps import clock
 from trade_gateway.language._names import in_words, matching, others, place, resources
 from trade_gateway.language._requests import Answer, Asker, Gaps, Request, Unknown

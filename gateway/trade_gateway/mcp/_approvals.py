@@ -13,9 +13,9 @@ from anyio.to_thread import run_sync
 from msgspec import Struct
 
 from trade import Container, Handle, current_call, service
-from trade._context.sessions import client_name, client_of
-from trade._protocol.schema_types import publish
 from trade.errors import AccessDenied, ConfigurationError
+from trade.protocol.keys import client_name, client_of
+from trade.protocol.schema_types import publish
 from trade_gateway.clients import ClientAuthorizer
 from trade_gateway.clients._errors import NeedsApproval
 from trade_gateway.clients._schemas import APPROVALS

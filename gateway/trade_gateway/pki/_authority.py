@@ -25,9 +25,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
-from trade._protocol.keys import is_chunk
 from trade.atomic_files import claim, replace
 from trade.errors import ConfigurationError
+from trade.protocol.keys import is_chunk
 from trade.text_files import as_before, read_text
 from trade.toml_files import read_toml_text
 

@@ -10,8 +10,8 @@ from typing import Final
 from msgspec import Struct
 
 from trade import Container, service
-from trade._protocol.schema_types import publish
 from trade.errors import TradeError
+from trade.protocol.schema_types import publish
 from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._graph import Graph
 from trade_gateway.ros._mapping_sync import Following, Mapping

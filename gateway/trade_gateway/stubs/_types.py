@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
-from trade._protocol.schema_types import type_from_schema
+from trade.protocol.schema_types import type_from_schema
 
 UNREADABLE: Final = (TypeError, ValueError, LookupError, AttributeError, RecursionError)
 """Errors of schemas that are none: they came from other containers."""

@@ -1,6 +1,6 @@
 """Supervision of containers as child processes: ordered start, health checks, restarts, saved state."""
 
-from trade._protocol.schema_types import publish as _publish
+from trade.protocol.schema_types import publish as _publish
 from trade_gateway.config._children import Child, read_children
 from trade_gateway.supervisor._child_state import ChildInfo, News
 from trade_gateway.supervisor._described import ChildTables

@@ -12,9 +12,9 @@ from typing import Final
 import msgspec
 
 from trade import Settings
-from trade._transport.credentials import user_secret
 from trade.command_output import last_line
 from trade.starting import Started
+from trade.transport.credentials import user_secret
 from trade_gateway._usage import ABSENT
 from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import TimerLease

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import msgspec
 
-from trade.keeping import Database
+from trade.storage import Database
 
 _TABLE: Final = """
 create table if not exists state (

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from trade import Settings
-from trade._default_system import is_of_user
-from trade._protocol.remote_errors import RemoteTraceback
+from trade.default_system import is_of_user
 from trade.errors import RemoteError, TradeError, at_terminal
+from trade.protocol.remote_errors import RemoteTraceback
 from trade.stop_line import elsewhere
 
 NOT_FOUND: Final = 3

@@ -12,7 +12,7 @@ from tests.system.conftest import networks_of_ones_own
 from tests.system.member import PROVIDERS
 from tests.system.networks import Member, ip
 from trade import Container, Settings, service, where
-from trade._transport.endpoints import free_endpoint
+from trade.transport.endpoints import free_endpoint
 
 __all__ = ["Loopback", "Wifi"]
 

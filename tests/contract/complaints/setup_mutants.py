@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 
-from trade._transport.addresses import Attempts
-from trade._transport.endpoints import Endpoint
+from trade.transport.addresses import Attempts
+from trade.transport.endpoints import Endpoint
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep
 from trade_gateway.supervisor._restart_policy import Life, Transition
 

@@ -9,7 +9,7 @@ import pytest
 from tests.contract.complaints.hosts import Wifi
 from trade._security.policy import Decision, Policy
 from trade._threads.channel_workers import WorkerPool
-from trade._transport.base import ChannelClosed
+from trade.transport.base import ChannelClosed
 
 
 def the_devices_zero_is_taken_as_it_is(patch: pytest.MonkeyPatch) -> None:

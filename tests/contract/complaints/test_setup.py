@@ -14,7 +14,7 @@ from tests.unit.gateway.test_calibrate import Hand, angles, done_after
 from tests.unit.gateway.test_doctor_brltty import Host
 from tests.unit.gateway.test_life import launched, life
 from tests.unit.trade.test_addresses import GOOD, VPN, Wire, as_written
-from trade._transport.addresses import Attempts
+from trade.transport.addresses import Attempts
 from trade_drivers import Joint
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, measured
 from trade_gateway.supervisor._restart_policy import State

@@ -12,8 +12,8 @@ from tests.contract.complaints.table import complaint
 from tests.support import waiting
 from tests.support.waiting import wait_until
 from trade import Container, Handle, Settings, service, where
-from trade._transport.memory import MemoryTransport, Network
 from trade.testing import memory_system
+from trade.transport.memory import MemoryTransport, Network
 from trade_gateway.cli import app
 
 pytestmark = pytest.mark.realtime

@@ -15,11 +15,11 @@ from typing import Any
 from tests.support.lock_log import Ask, Done, Held, Log, Seen, now
 from trade import Container, Handle, Settings, where
 from trade._context.outgoing import Claim, holding
-from trade._protocol.keys import Address
-from trade._protocol.messages import Token
-from trade._transport.base import ChannelClosed
-from trade._transport.zenoh import ZenohTransport
 from trade.errors import TradeError
+from trade.protocol.keys import Address
+from trade.protocol.messages import Token
+from trade.transport.base import ChannelClosed
+from trade.transport.zenoh import ZenohTransport
 
 LEASE_S = 0.5
 _WAITS_S = (0.0, 0.3, 1.0, 3.0)

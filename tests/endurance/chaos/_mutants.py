@@ -8,10 +8,10 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from trade._protocol.messages import Token
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Permit, Resource
 from trade.errors import LockLost
+from trade.protocol.messages import Token
 
 
 def _no_fence() -> None:

@@ -11,9 +11,13 @@ from trade import Constraint, Handle, Secret, service
 from trade._calls.handle import handle_codec
 from trade._discovery.listener import _place as place_of
 from trade._locks.inherited import InheritedLock
-from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import (
+from trade._registry.predicates import fits_all, parse_predicates
+from trade._services.decorator import marked_methods
+from trade._services.signature import Signature
+from trade.errors import ConfigurationError, InvalidArgument, TradeError
+from trade.protocol.estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import (
     UNREADABLE,
     ErrorInfo,
     Malformed,
@@ -25,14 +29,10 @@ from trade._protocol.messages import (
     decode_tally,
     encode_message,
 )
-from trade._protocol.remote_errors import pack_error, unpack_error
-from trade._protocol.samples import decode_sample
-from trade._registry.predicates import fits_all, parse_predicates
-from trade._services.decorator import marked_methods
-from trade._services.signature import Signature
-from trade._transport.endpoints import Endpoint
-from trade._transport.scouting import read_hello
-from trade.errors import ConfigurationError, InvalidArgument, TradeError
+from trade.protocol.remote_errors import pack_error, unpack_error
+from trade.protocol.samples import decode_sample
+from trade.transport.endpoints import Endpoint
+from trade.transport.scouting import read_hello
 
 ME: Final = Address("anna", "kitchen", "e1")
 

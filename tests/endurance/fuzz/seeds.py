@@ -25,11 +25,11 @@ from tests.endurance.fuzz.targets import TARGETS
 from trade import where
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
-from trade._protocol.messages import EMPTY, PROTOCOL, Estop, encode_message
-from trade._protocol.remote_errors import pack_error
-from trade._protocol.samples import StreamSample
-from trade._transport.scouting import hello
 from trade.errors import LimitExceeded, LockedByOther
+from trade.protocol.messages import EMPTY, PROTOCOL, Estop, encode_message
+from trade.protocol.remote_errors import pack_error
+from trade.protocol.samples import StreamSample
+from trade.transport.scouting import hello
 from trade_drivers.vendors.dynamixel._wire import crc16 as dynamixel_crc
 from trade_drivers.vendors.feetech._wire import packet as feetech_packet
 from trade_gateway.cli.operation._archive import _MANIFEST as MANIFEST

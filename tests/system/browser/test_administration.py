@@ -15,8 +15,8 @@ from tests.support.waiting import wait_until
 from tests.system.browser.conftest import Browsers, HttpProcess, View
 from tests.system.conftest import Program
 from trade import Container, Notification, Settings, where
-from trade._transport.endpoints import free_endpoint
 from trade.errors import NoSuchService
+from trade.transport.endpoints import free_endpoint
 
 POLICY = policy_text(
     "{own}=all olga=operator vera=viewer",

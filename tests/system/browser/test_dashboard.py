@@ -14,7 +14,7 @@ from tests.support.waiting import wait_until
 from tests.system.browser.conftest import PAN, Browsers, HttpProcess, View, renderers
 from tests.system.conftest import Bench
 from trade import service
-from trade._transport.endpoints import free_endpoint
+from trade.transport.endpoints import free_endpoint
 from trade_hil_sim import events
 
 LEAST_RAD = 0.02

@@ -13,10 +13,10 @@ from trade._context import active_calls
 from trade._discovery.announcer import Announcer
 from trade._estop import broadcast, latch, store
 from trade._estop.deadman import Deadman
-from trade._protocol import estop_messages, messages
 from trade._resources import lock_table, resource
 from trade._services import local_service
 from trade._services.dispatcher import Dispatcher
+from trade.protocol import estop_messages, messages
 
 
 def _put(where: Any, name: str, instead: Any) -> Callable[[], None]:

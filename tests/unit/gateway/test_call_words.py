@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from trade import service
-from trade._protocol.messages import ServiceInfo
+from trade.protocol.messages import ServiceInfo
 from trade.testing import memory_system
 from trade_gateway._usage import UsageError
 from trade_gateway.cli.services._call import parse_arguments

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from tests.support.simulated_robots import HAND, HEAD, TAIL
 from tests.unit.drivers.test_second_reader import HOLDS, other_program
-from trade._transport.endpoints import free_endpoint
+from trade.transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.bus.can import ErrorState, Link
 from trade_drivers.plugins._ports import SeenPorts

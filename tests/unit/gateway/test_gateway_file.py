@@ -19,8 +19,8 @@ from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from trade import Container
 from trade._security.certificates import Certificate
-from trade._transport.endpoints import loopback_interface
 from trade.errors import ConfigurationError
+from trade.transport.endpoints import loopback_interface
 from trade_gateway.cli import app
 from trade_gateway.cli.robots import _gateway
 from trade_gateway.cli.robots._file_changes import Named, digest, named_by

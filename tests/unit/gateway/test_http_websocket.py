@@ -18,8 +18,8 @@ from websockets.sync.client import connect
 from tests.support.http_clients import Client, Opened, ask, heard, say, served_axis
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import progress, service
-from trade._protocol.messages import decode_call
-from trade._transport.memory.network import InFlightMessage
+from trade.protocol.messages import decode_call
+from trade.transport.memory.network import InFlightMessage
 
 pytestmark = pytest.mark.virtual_time
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from trade import Span
-from trade._telemetry.call_model import deviations, learn, sequences
+from trade.call_model import deviations, learn, sequences
 from trade.errors import ConfigurationError
 from trade_gateway.cli.watching._profile import read, statistics, write
 

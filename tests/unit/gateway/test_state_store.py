@@ -176,7 +176,7 @@ def test_a_file_that_another_process_has_locked_costs_a_save_and_no_more(
 ) -> None:
     assert opened().save("a", {"lamp": 1})
     with monkeypatch.context() as impatient:
-        impatient.setattr("trade._storage.database._WAIT_S", 1.0)
+        impatient.setattr("trade.storage._WAIT_S", 1.0)
         store = opened()
         other = sqlite3.connect(path, isolation_level=None)
         other.execute("begin immediate")

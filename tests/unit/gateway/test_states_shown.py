@@ -7,8 +7,8 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, service, where
-from trade._transport.memory import Kind
 from trade.testing import memory_system
+from trade.transport.memory import Kind
 from trade_gateway.cli.services._states import State, say_state
 from trade_gateway.language import Memory, Talk, read_lexicon
 from trade_gateway.terminal._output import Output

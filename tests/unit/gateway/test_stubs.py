@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from tests.conftest import StartContainer
 from tests.support.type_checkers import CHECKERS, checked, seeded
 from trade import Container, GroupView, Handle, Meta, service
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import Parameter, ServiceInfo, encode_message
 from trade._registry.registry import Record
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import Parameter, ServiceInfo, encode_message
 from trade.testing import memory_system
 from trade_drivers.testing import FakeJointGroup
 from trade_gateway.cli import build

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 import trade_robotfile
 from tests.support.certificates import Papers
 from tests.support.simulated_robots import HEAD
-from trade._chosen_system import chosen_settings
 from trade._security.certificates import Certificate
 from trade._security.policy_file import read_policy
+from trade.default_system import chosen_settings
 from trade.errors import ConfigurationError
 from trade.rules._file import read_rules
 from trade.text_files import as_before, as_text

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from trade import Settings
-from trade._chosen_system import chosen_file
+from trade.default_system import chosen_file
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
 

@@ -3,7 +3,7 @@
 import pytest
 
 from trade import ContainerInfo, EstopReport
-from trade._protocol.messages import PROTOCOL
+from trade.protocol.messages import PROTOCOL
 from trade_gateway.cli.motion._estop import _say
 from trade_gateway.cli.services._services import _containers_table
 from trade_gateway.terminal._output import Output

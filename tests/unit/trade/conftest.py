@@ -23,11 +23,11 @@ from tests.unit.trade.rules_fixture import Desk, Engine
 from tests.unit.trade.stream_listeners import Battery, Two
 from trade import Container, Handle, service, where
 from trade._discovery.host_folder import HostFolder
-from trade._protocol.keys import ALIVE, alive_key
-from trade._transport.credentials import user_secret
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport, configuration
+from trade.protocol.keys import ALIVE, alive_key
 from trade.testing import MemorySystem, memory_system
+from trade.transport.credentials import user_secret
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport, configuration
 
 hypothesis.settings.register_profile("deterministic", deadline=None, derandomize=True, max_examples=60)
 hypothesis.settings.load_profile("deterministic")

@@ -5,8 +5,8 @@ from typing import Any
 import msgspec
 
 from trade import Container, Handle, where
-from trade._protocol.keys import Address, alive_key, calls_to, registry_key, reply_key
-from trade._protocol.messages import (
+from trade.protocol.keys import Address, alive_key, calls_to, registry_key, reply_key
+from trade.protocol.messages import (
     PROTOCOL,
     Call,
     ProviderInfo,
@@ -16,7 +16,7 @@ from trade._protocol.messages import (
     decode_call,
     encode_message,
 )
-from trade._protocol.schema import schema_message
+from trade.protocol.schema import schema_message
 
 FUTURE = 99
 """A version of the protocol that does not exist."""

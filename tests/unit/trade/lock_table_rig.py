@@ -4,12 +4,12 @@ import concurrent.futures
 from collections.abc import Callable, Iterable, Sequence
 
 from tests.support.waiting import wait_until
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource, admit
 from trade._threads.scheduler import Scheduler
-from trade._transport.wait_clock import WaitClock
+from trade.protocol.messages import Token
+from trade.transport.wait_clock import WaitClock
 
 EPOCH = "epoch"
 LONG_S = 1e6

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from trade import Container, Handle, Sample, Stream, service, where
-from trade._transport.memory import InFlightMessage, Kind
+from trade.transport.memory import InFlightMessage, Kind
 
 PATIENCE_S = 20.0
 """How long a test waits for what must come; far above what it takes."""

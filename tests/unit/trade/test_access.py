@@ -12,14 +12,14 @@ from trade import CallModel, Container, Estop, Handle, Settings, service, where
 from trade._container.builtin_services import OwnServices
 from trade._context.call_context import CallContext, running
 from trade._estop.services import EstopServices
-from trade._protocol.keys import Address, alive_key, estop_key
-from trade._protocol.messages import PROTOCOL, Behalf, EstopOrder, encode_message
 from trade._registry.suggestions import no_such_service
 from trade._security.authorizer import FUNCTIONS, Authorizer
 from trade._services.decorator import marked_methods
-from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
+from trade.protocol.keys import Address, alive_key, estop_key
+from trade.protocol.messages import PROTOCOL, Behalf, EstopOrder, encode_message
 from trade.testing import MemorySystem
+from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

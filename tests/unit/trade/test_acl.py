@@ -23,8 +23,8 @@ from trade._security.network_crossings import crossings
 from trade._security.policy import Policy, Role
 from trade._security.policy_file import read_policy
 from trade._security.zenoh_acl import acl
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport, configuration
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport, configuration
 
 pytestmark = pytest.mark.virtual_time
 

@@ -11,8 +11,9 @@ from msgspec import Raw, Struct
 import trade
 from tests.support.waiting import wait_until
 from trade import Container, current_call, service
-from trade._protocol.keys import call_key, reply_key
-from trade._protocol.messages import (
+from trade.errors import Cancelled, NotSerialisable
+from trade.protocol.keys import call_key, reply_key
+from trade.protocol.messages import (
     EMPTY_ARGUMENTS,
     PROTOCOL,
     Call,
@@ -21,7 +22,6 @@ from trade._protocol.messages import (
     decode_reply,
     encode_message,
 )
-from trade.errors import Cancelled, NotSerialisable
 
 
 class Share(Struct):

@@ -9,9 +9,9 @@ import pytest
 
 from trade._discovery.dialer import Dialer
 from trade._threads.scheduler import Scheduler
-from trade._transport.addresses import Attempts
-from trade._transport.endpoints import Endpoint
-from trade._transport.zenoh_links import Joined, Links
+from trade.transport.addresses import Attempts
+from trade.transport.endpoints import Endpoint
+from trade.transport.zenoh_links import Joined, Links
 
 pytestmark = pytest.mark.virtual_time
 

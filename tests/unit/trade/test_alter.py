@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import trade
 from trade import Container, Handle, service, where
-from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, encode_message
 from trade.errors import ConfigurationError
+from trade.protocol.messages import Malformed, ProviderInfo, decode_provider, encode_message
 
 pytestmark = pytest.mark.virtual_time
 

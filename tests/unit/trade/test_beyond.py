@@ -9,9 +9,9 @@ from tests.unit.trade.joint_with_policy import Neck
 from trade import Container
 from trade._calls.reachability import beyond
 from trade._discovery.dialer import Dialer
-from trade._transport.addresses import Attempt
 from trade.errors import NoSuchService
 from trade.testing import MemorySystem, memory_system
+from trade.transport.addresses import Attempt
 
 pytestmark = pytest.mark.virtual_time
 LEASE_S = 2.0

@@ -10,10 +10,10 @@ import pytest
 
 from trade._calls.caller import Caller
 from trade._calls.peer import Peer, Route
-from trade._protocol.keys import Address
-from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_call, encode_message
 from trade._threads.scheduler import Scheduler
-from trade._transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
+from trade.protocol.keys import Address
+from trade.protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_call, encode_message
+from trade.transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 
 pytestmark = pytest.mark.virtual_time
 

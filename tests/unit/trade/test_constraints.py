@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, Container, Handle, service, where
-from trade._protocol.codec import Codec
-from trade._protocol.messages import ServiceInfo
 from trade._registry.constraints import Term
 from trade._services.decorator import ServiceMark
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError
+from trade.protocol.codec import Codec
+from trade.protocol.messages import ServiceInfo
 
 pytestmark = pytest.mark.virtual_time
 

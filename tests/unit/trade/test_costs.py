@@ -18,13 +18,13 @@ from tests.support.waiting import wait_until
 from trade import Container, Handle, Settings, service, where
 from trade._calls.arguments import ArgumentEncoder
 from trade._discovery.host_folder import HostFolder
-from trade._protocol.keys import TALLY, Address
-from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._registry.registry import Registry
-from trade._transport.base import Publisher
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
+from trade.protocol.keys import TALLY, Address
+from trade.protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
+from trade.transport.base import Publisher
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport, configuration
 
 CALLS = 20
 MOST_BYTES_OF_A_CALL = 16 * 1024

@@ -36,9 +36,9 @@ from trade import Container, Handle, HookEvent, Settings, service, where
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
 from trade._threads import scheduler
-from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.sharing import Border
 from trade.testing import Kind, MemorySystem, memory_system
+from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from trade import Container, Settings, service, where
-from trade._transport.credentials import user_secret
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport
 from trade.errors import CannotConnect, ConfigurationError, NoSuchService
+from trade.transport.credentials import user_secret
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport
 
 pytestmark = pytest.mark.realtime
 

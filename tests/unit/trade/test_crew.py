@@ -8,7 +8,7 @@ from statistics import median
 import pytest
 
 from trade._threads.channel_workers import MOST_THREADS, WorkerPool
-from trade._transport.base import Channel, ChannelClosed, Message
+from trade.transport.base import Channel, ChannelClosed, Message
 
 pytestmark = pytest.mark.virtual_time
 

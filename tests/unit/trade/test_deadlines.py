@@ -12,9 +12,9 @@ import pytest
 
 from trade import Container, Handle, current_call, service, where
 from trade._calls.peer import Peer, Pending
-from trade._protocol.keys import call_key, reply_key
-from trade._protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 from trade.errors import DeadlineExceeded, OutcomeUnknown
+from trade.protocol.keys import call_key, reply_key
+from trade.protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 
 COUNTING = """
 from pathlib import Path

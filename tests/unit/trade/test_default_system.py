@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Settings, service, where
-from trade._default_system import default_system, is_of_user, take_over
-from trade._transport.memory import MemoryTransport
+from trade.default_system import default_system, is_of_user, take_over
 from trade.errors import Stopped
 from trade.testing import Network
+from trade.transport.memory import MemoryTransport
 from trade_drivers.bus._angle_store import AngleStore
 
 pytestmark = pytest.mark.virtual_time
@@ -38,7 +38,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file with the host's machine id."""
     file = tmp_path / "machine-id"
     file.write_text(f"{MACHINE}\n")
-    monkeypatch.setattr("trade._default_system._MACHINE_IDS", (file,))
+    monkeypatch.setattr("trade.default_system._MACHINE_IDS", (file,))
     return file
 
 

@@ -12,8 +12,8 @@ import pytest
 from tests.support.policies import policy_text
 from trade import Container, Settings, where
 from trade._migration.delivered_code import CodeStore, hash_of, pack
-from trade._transport.memory import MemoryTransport, Network
 from trade.errors import AccessDenied, CodeRefused, ConfigurationError, NoSuchClass
+from trade.transport.memory import MemoryTransport, Network
 
 pytestmark = pytest.mark.virtual_time
 

@@ -8,13 +8,13 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, Handle, Run, current_call, service, where
-from trade._protocol.keys import reply_key
 from trade._services import dispatcher
 from trade._threads import channel_workers
-from trade._transport.base import Channel, Message
-from trade._transport.memory import MemoryTransport
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
+from trade.protocol.keys import reply_key
 from trade.testing import memory_system
+from trade.transport.base import Channel, Message
+from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

@@ -16,13 +16,13 @@ from trade import Container, Estop, EstopReport, Resource, current_call, service
 from trade._audit.events import Event
 from trade._estop.ledger import MOST_OF_ONE
 from trade._estop.worker import SHARED_S, Worker
-from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
-from trade._protocol.keys import Address, alive_key, registry_key
-from trade._protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
 from trade._threads.channel_workers import MOST_THREADS
-from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
+from trade.protocol.estop_messages import decode_estop_confirmed, decode_estop_order
+from trade.protocol.keys import Address, alive_key, registry_key
+from trade.protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
 from trade.testing import Kind, MemorySystem, memory_system
+from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

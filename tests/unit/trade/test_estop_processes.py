@@ -10,9 +10,9 @@ import pytest
 
 from trade import Container, Estop, where
 from trade._estop.ledger import MOST_OF_ONE
-from trade._protocol.keys import estop_key
-from trade._protocol.messages import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Stopped, TradeError
+from trade.protocol.keys import estop_key
+from trade.protocol.messages import PROTOCOL, EstopOrder, encode_message
 
 pytestmark = pytest.mark.realtime
 

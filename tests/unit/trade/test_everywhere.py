@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from trade import Container, HookEvent, LogReader, errors, service, where
-from trade._transport.memory import InFlightMessage, Kind
 from trade.testing import MemorySystem, memory_system
+from trade.transport.memory import InFlightMessage, Kind
 
 pytestmark = pytest.mark.virtual_time
 

@@ -11,9 +11,9 @@ import msgspec
 import pytest
 
 from trade import Container, Secret, errors, service, where
-from trade._protocol.messages import ErrorInfo
-from trade._protocol.remote_errors import RemoteTraceback, pack_error, unpack_error
 from trade.errors import CallerError, DeadlineExceeded, InvalidResult, LimitExceeded, RemoteError, TradeError
+from trade.protocol.messages import ErrorInfo
+from trade.protocol.remote_errors import RemoteTraceback, pack_error, unpack_error
 
 pytestmark = pytest.mark.virtual_time
 

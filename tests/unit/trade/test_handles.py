@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._protocol.keys import ServiceKey
 from trade._registry import registry
 from trade.errors import ConfigurationError, ServiceGone
+from trade.protocol.keys import ServiceKey
 
 pytestmark = pytest.mark.virtual_time
 

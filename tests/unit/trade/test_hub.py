@@ -14,10 +14,10 @@ from tests.support.policies import policy_text
 from tests.support.waiting import wait_until
 from tests.unit.trade.conftest import StartProgram
 from trade import Container, Resource, Settings, permit, service, where
-from trade._discovery.hub_file import HubFile
-from trade._transport.zenoh import ZenohTransport
-from trade._transport.zenoh_links import Links
 from trade.errors import CannotConnect, ConfigurationError, LockedByOther, NoSuchService
+from trade.hub_file import HubFile
+from trade.transport.zenoh import ZenohTransport
+from trade.transport.zenoh_links import Links
 
 StartContainer = Callable[..., Container]
 

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, where
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import HEALTHY, ProviderInfo, ServiceInfo
 from trade._registry.constraints import Term
 from trade._registry.index import Index
 from trade._registry.registry import Record, Registry
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import HEALTHY, ProviderInfo, ServiceInfo
 
 
 def record(number: int, **reported: Any) -> Record:

@@ -23,18 +23,18 @@ from tests.unit.trade.conftest import Gate
 from trade import Container, Handle, Resource, current_call, errors, service, where
 from trade._calls import local_path
 from trade._paths import runtime_folder
-from trade._protocol.keys import ALIVE, Address, alive_key, call_key
-from trade._protocol.messages import PROTOCOL, decode_call, decode_reply
 from trade._resources.lock_table import LockTable
 from trade._security.certificates import Certificate
 from trade._services import local_server
 from trade._services.dispatcher import Dispatcher
 from trade._services.local_server import Keys, LocalChannel, LocalReplier, LocalServer
-from trade._transport import local_connection, local_greeting
-from trade._transport.base import ChannelClosed, Message
-from trade._transport.host_socket import _short, dial_on_host
-from trade._transport.local_connection import ConnectionEnded, LocalConnection
-from trade._transport.local_greeting import Greeting, Passport
+from trade.protocol.keys import ALIVE, Address, alive_key, call_key
+from trade.protocol.messages import PROTOCOL, decode_call, decode_reply
+from trade.transport import local_connection, local_greeting
+from trade.transport.base import ChannelClosed, Message
+from trade.transport.host_socket import _short, dial_on_host
+from trade.transport.local_connection import ConnectionEnded, LocalConnection
+from trade.transport.local_greeting import Greeting, Passport
 
 _HEADER = struct.Struct("<IH")
 needs_pidfd = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux reports the end of a process")

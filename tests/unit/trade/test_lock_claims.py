@@ -13,9 +13,9 @@ from tests.unit.trade.lock_table_rig import Table
 from trade import Handle, service, where
 from trade._locks import api
 from trade._locks.remote_locks import RemoteLocks, SharedResource
-from trade._protocol.keys import Address
 from trade._resources.grants import LockRequest
 from trade.errors import IncompleteGroup, LockLost, NotLocked
+from trade.protocol.keys import Address
 
 pytestmark = pytest.mark.virtual_time
 

@@ -8,8 +8,8 @@ import pytest
 from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
 from trade import Handle, errors, where
-from trade._protocol.keys import Address
 from trade._resources.resource import Latch
+from trade.protocol.keys import Address
 
 pytestmark = pytest.mark.virtual_time
 

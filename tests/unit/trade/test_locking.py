@@ -14,8 +14,8 @@ from tests.support.two_joint_robot import WHOLE, Joint, Robot
 from tests.support.waiting import wait_until
 from trade import Container, Handle, errors, permit, service, where
 from trade._locks import api
-from trade._protocol.keys import ServiceKey
 from trade._resources.grants import LockRequest
+from trade.protocol.keys import ServiceKey
 from trade.testing import memory_system
 
 pytestmark = pytest.mark.virtual_time

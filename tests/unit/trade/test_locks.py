@@ -11,12 +11,12 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.trade.lamp_provider import Lamp, found
 from tests.unit.trade.lock_table_rig import EPOCH, Table
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import _STOPPING, LockTable
 from trade._resources.resource import Holder, Permit, Resource
 from trade._threads.scheduler import MOST_THREADS, Callback, ScheduledTask, Scheduler
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
+from trade.protocol.messages import Token
 from trade.testing import memory_system
 
 

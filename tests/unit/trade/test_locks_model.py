@@ -11,10 +11,10 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from tests.support.waiting import wait_until
 from tests.unit.trade.lock_table_rig import COUPLED, NAMES, Table
-from trade._protocol.messages import Token
 from trade._resources.grants import Granted
 from trade._resources.resource import Permit
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped
+from trade.protocol.messages import Token
 
 pytestmark = pytest.mark.virtual_time
 

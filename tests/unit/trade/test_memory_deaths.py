@@ -10,10 +10,10 @@ import pytest
 
 from tests.unit.trade.lamp_provider import Lamp, Pair, found, labels
 from trade import Container, where
-from trade._transport.base import ChannelClosed
-from trade._transport.memory import InFlightMessage
 from trade.errors import ConfigurationError, ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import MemorySystem, memory_system
+from trade.transport.base import ChannelClosed
+from trade.transport.memory import InFlightMessage
 
 pytestmark = pytest.mark.virtual_time
 

@@ -15,11 +15,11 @@ import pytest
 from tests.unit.trade.lamp_provider import Lamp, Pair, found, labels
 from trade import Container, errors, where
 from trade._discovery.announcer import Announcer
-from trade._protocol.keys import Address
-from trade._protocol.messages import ProviderInfo, ServiceInfo
-from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import ContainerLost, ServiceGone
+from trade.protocol.keys import Address
+from trade.protocol.messages import ProviderInfo, ServiceInfo
 from trade.testing import Kind, MemorySystem, memory_system
+from trade.transport.memory import InFlightMessage, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

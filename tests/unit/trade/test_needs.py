@@ -8,8 +8,8 @@ import pytest
 
 from tests.unit.trade.forged_messages import FORGED, PROVIDER
 from trade import Container, Handle, service, where
-from trade._protocol.keys import alive_key, registry_key
-from trade._protocol.messages import encode_message
+from trade.protocol.keys import alive_key, registry_key
+from trade.protocol.messages import encode_message
 from trade.testing import memory_system
 
 

@@ -13,8 +13,8 @@ import pytest
 
 from tests.support.waiting import wait_until
 from trade import Container, Handle, service, where
-from trade._transport import wait_clock
 from trade.errors import ConfigurationError, DeviceSilent, NoSuchNotification
+from trade.transport import wait_clock
 
 SOON_S = 0.02
 

@@ -11,8 +11,8 @@ from msgspec import structs
 from trade import Container, Handle, service, where
 from trade._context import active_calls
 from trade._context.active_calls import ActiveCall, CallDeduplicator
-from trade._protocol.keys import Address, call_key, reply_key
-from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
+from trade.protocol.keys import Address, call_key, reply_key
+from trade.protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 
 SECOND_NS = 10**9
 LATER = 2**62

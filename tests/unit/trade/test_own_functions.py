@@ -5,7 +5,7 @@ from msgspec import structs
 
 from tests.support.waiting import wait_until
 from trade import Container, Resource, service, where
-from trade._protocol.messages import NO_SCHEMA, ProviderInfo
+from trade.protocol.messages import NO_SCHEMA, ProviderInfo
 from trade.testing import memory_system
 
 pytestmark = pytest.mark.virtual_time

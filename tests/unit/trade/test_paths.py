@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from trade._paths import runtime_folder, runtime_folders
-from trade._transport.credentials import user_secret
-from trade._transport.host_socket import host_sockets, listen_on_host
 from trade.errors import ConfigurationError
+from trade.transport.credentials import user_secret
+from trade.transport.host_socket import host_sockets, listen_on_host
 
 pytestmark = pytest.mark.virtual_time
 

@@ -9,9 +9,9 @@ import jupyddl
 import pytest
 
 from trade import Container, Handle, pddl_domain, service, where
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Record
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import ServiceInfo
 from trade.testing import memory_system
 
 pytestmark = pytest.mark.virtual_time

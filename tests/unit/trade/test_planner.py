@@ -10,8 +10,8 @@ from examples import planner as example
 from examples.planner import NoPlan, Planner, Step
 from tests.support.waiting import PATIENCE_S, wait_until
 from trade import Container, errors, service
-from trade._transport.endpoints import free_endpoint
 from trade.testing import MemorySystem
+from trade.transport.endpoints import free_endpoint
 
 pytestmark = pytest.mark.virtual_time
 

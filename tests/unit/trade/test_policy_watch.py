@@ -8,9 +8,9 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.trade.joint_with_policy import POLICY, Neck, find, policy, rewritten
 from trade import Container, Settings
-from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem
+from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

@@ -13,8 +13,8 @@ import pytest
 from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from trade import Container, Settings
-from trade._transport.endpoints import Endpoint, free_endpoint
-from trade._transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
+from trade.transport.endpoints import Endpoint, free_endpoint
+from trade.transport.port_guard import MOST_STRANGERS, MOST_WITH_TLS, PortGuard
 
 PER_S, FLOOD_S = 50, 8
 SOON_S = 10.0

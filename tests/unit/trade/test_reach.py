@@ -153,7 +153,7 @@ def test_settings_come_from_arguments_then_the_environment_then_defaults() -> No
 
 
 def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
-    from trade._transport.endpoints import free_endpoint
+    from trade.transport.endpoints import free_endpoint
 
     class Echo:
         @service(effect="read")
@@ -188,7 +188,7 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch, listen: list[str]
 ) -> None:
     from trade._discovery import join
-    from trade._transport.endpoints import Endpoint, free_endpoint
+    from trade.transport.endpoints import Endpoint, free_endpoint
 
     taken = next(
         connection.laddr.port
@@ -202,7 +202,7 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
 
 
 def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
-    from trade._transport.endpoints import free_endpoint
+    from trade.transport.endpoints import free_endpoint
 
     endpoint = free_endpoint()
     with Container(Settings.read(container="client", connect=[endpoint])) as client:

@@ -9,8 +9,8 @@ import pytest
 
 import trade
 from trade import Container, Handle, where
-from trade._transport.endpoints import Endpoint, free_endpoint
 from trade.errors import CannotConnect, ConfigurationError, LinkStays, NoSuchService
+from trade.transport.endpoints import Endpoint, free_endpoint
 
 pytestmark = pytest.mark.realtime
 
@@ -80,7 +80,7 @@ def test_switching_twice_is_switching_once(apart: tuple[Container, Container]) -
 
 
 def test_containers_of_other_systems_are_not_linked(start_container: Any) -> None:
-    from trade._transport.zenoh import ZenohTransport
+    from trade.transport.zenoh import ZenohTransport
 
     listens = [free_endpoint(), free_endpoint()]
     one = start_container("a", listen=[listens[0]], connect=[listens[0]])

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import ProviderInfo, ServiceInfo
 from trade._registry.constraints import where
 from trade._registry.registry import Change, Registry
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import ProviderInfo, ServiceInfo
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")

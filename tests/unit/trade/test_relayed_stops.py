@@ -10,10 +10,10 @@ import pytest
 from tests.unit.trade.joint_with_policy import Neck
 from tests.unit.trade.test_audit import rows
 from trade import Container, Settings, current_call, service, where
-from trade._protocol.keys import ESTOP_PROVIDER
-from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, Stopped
+from trade.protocol.keys import ESTOP_PROVIDER
 from trade.testing import InFlightMessage, MemorySystem, memory_system
+from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 LEASE_S = 2.0

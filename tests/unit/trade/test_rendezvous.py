@@ -13,8 +13,8 @@ import pytest
 
 from trade import Container, where
 from trade._discovery.host_folder import HostFolder
-from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
+from trade.transport.endpoints import free_endpoint
 
 pytestmark = pytest.mark.virtual_time
 

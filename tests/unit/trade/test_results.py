@@ -16,9 +16,9 @@ import pytest
 
 from trade import Container, where
 from trade._calls.target import result_decoder
-from trade._protocol.messages import ServiceInfo
-from trade._protocol.schema import schema_message
-from trade._protocol.schema_types import type_from_schema
+from trade.protocol.messages import ServiceInfo
+from trade.protocol.schema import schema_message
+from trade.protocol.schema_types import type_from_schema
 
 pytestmark = pytest.mark.virtual_time
 

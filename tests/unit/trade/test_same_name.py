@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, service, where
-from trade._protocol.messages import decode_reply
-from trade._transport import endpoints
-from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
+from trade.protocol.messages import decode_reply
+from trade.transport import endpoints
+from trade.transport.endpoints import free_endpoint
 
 
 class Echo:

@@ -14,10 +14,10 @@ import pytest
 import zenoh
 
 from tests.support.waiting import wait_until
-from trade._transport.endpoints import free_endpoint, loopback_interface
-from trade._transport.interfaces import Own, is_near, own_addresses
-from trade._transport.scouting import Beacon, hello, read_hello, scout
-from trade._transport.zenoh import ZenohTransport, configuration
+from trade.transport.endpoints import free_endpoint, loopback_interface
+from trade.transport.interfaces import Own, is_near, own_addresses
+from trade.transport.scouting import Beacon, hello, read_hello, scout
+from trade.transport.zenoh import ZenohTransport, configuration
 
 ID = "de88bef20f15d9afd64d6f625e211ef4"
 CAPTURED = bytes.fromhex(
@@ -110,7 +110,7 @@ def test_a_change_of_the_addresses_that_others_dial_is_logged(
     leaving: ExitStack, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, everywhere: bool
 ) -> None:
     known = [HERE, Own("10.9.0.5", 24, 2)]
-    monkeypatch.setattr("trade._transport.zenoh_links.own_addresses", lambda: list(known))
+    monkeypatch.setattr("trade.transport.zenoh_links.own_addresses", lambda: list(known))
     own = free_endpoint()
     links = opened(leaving, own.replace("127.0.0.1", "0.0.0.0") if everywhere else own).links
     links.watch_addresses()

@@ -30,12 +30,12 @@ from tests.unit.trade.test_local_path import (
     taken,
 )
 from trade import Container, Handle, Resource, current_call, service, where
-from trade._protocol.messages import LARGE, MOST_BYTES, PROTOCOL
-from trade._transport import local_greeting
-from trade._transport.local_connection import LocalConnection
-from trade._transport.local_greeting import Greeting
-from trade._transport.shared_segment import SharedSegment
 from trade.errors import TooLarge
+from trade.protocol.messages import LARGE, MOST_BYTES, PROTOCOL
+from trade.transport import local_greeting
+from trade.transport.local_connection import LocalConnection
+from trade.transport.local_greeting import Greeting
+from trade.transport.shared_segment import SharedSegment
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memfd_create")
 

@@ -12,10 +12,10 @@ from tests.support.waiting import wait_until
 from trade import Container, service, where
 from trade._calls import picking
 from trade._migration import source as _departing
-from trade._transport.endpoints import free_endpoint
 from trade.errors import NoSuchService, ServiceGone
 from trade.rules import Firing, Rules, read_rules, rehearse
 from trade.rules import _engine as rules_module
+from trade.transport.endpoints import free_endpoint
 
 pytestmark = pytest.mark.virtual_time
 

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from trade import Container, where
-from trade._transport.credentials import user_secret
+from trade.transport.credentials import user_secret
 
 pytestmark = pytest.mark.realtime
 

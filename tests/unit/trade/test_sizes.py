@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from trade import Container, service, where
-from trade._protocol.messages import MOST_BYTES
 from trade.errors import TooLarge
+from trade.protocol.messages import MOST_BYTES
 
 pytestmark = pytest.mark.virtual_time
 

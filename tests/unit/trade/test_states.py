@@ -12,10 +12,10 @@ from tests.support.certificates import Papers
 from tests.support.waiting import wait_until
 from tests.unit.trade.rules_fixture import NOTE, Desk, Engine
 from trade import Container, HookEvent, LinkInfo, NetworkInfo, StateEvent, service, where
-from trade._protocol.keys import DOMAIN
-from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
+from trade.protocol.keys import DOMAIN
 from trade.testing import MemorySystem
+from trade.transport.endpoints import free_endpoint
 
 pytestmark = pytest.mark.virtual_time
 

@@ -17,14 +17,14 @@ from trade import Container, Settings, service, where
 from trade._audit.events import Event
 from trade._estop.broadcast import EstopReport, all_of
 from trade._paths import runtime_folder
-from trade._protocol.messages import Malformed
-from trade._transport.endpoints import Endpoint
-from trade._transport.host_socket import listen_on_host
+from trade.protocol.messages import Malformed
 from trade.stop_line import StopLines, StopReport
 from trade.stop_line.group_stop import merge_reports
 from trade.stop_line.listener import MOST_STRANGERS
 from trade.stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
 from trade.stop_line.places import Place, line_port, places
+from trade.transport.endpoints import Endpoint
+from trade.transport.host_socket import listen_on_host
 
 StartContainer = Callable[..., Container]
 

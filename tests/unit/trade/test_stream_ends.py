@@ -11,11 +11,11 @@ import pytest
 from tests.support.waiting import wait_until
 from tests.unit.trade.stream_listeners import FAST_HZ, PATIENCE_S, Battery, Display, Two
 from trade import Container, where
-from trade._protocol.samples import stream_key
 from trade._streams.source import RateRequest, Source
-from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone, SessionEnded, SourceLost
+from trade.protocol.samples import stream_key
 from trade.testing import MemorySystem
+from trade.transport.memory import MemoryTransport
 
 
 def test_an_error_of_the_service_is_raised_and_the_stream_continues(two: Two) -> None:

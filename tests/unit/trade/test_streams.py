@@ -9,11 +9,11 @@ import pytest
 
 from tests.unit.trade.stream_listeners import FAST_HZ, PATIENCE_S, Battery, Two, is_sample, numbers, some
 from trade import Handle, Stream, where
-from trade._protocol.messages import EMPTY, PROTOCOL
-from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
 from trade._streams.rate import Pace
 from trade._streams.source import RateRequest, Source
 from trade.errors import ConfigurationError
+from trade.protocol.messages import EMPTY, PROTOCOL
+from trade.protocol.samples import STEPS_HZ, StreamSample, stream_key
 from trade.testing import MemorySystem
 
 pytestmark = pytest.mark.virtual_time

@@ -25,9 +25,9 @@ from trade import Container, Settings, service, where
 from trade._container import certificate_end
 from trade._security.certificates import Certificate
 from trade._threads.scheduler import Scheduler
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import AccessDenied, CannotConnect, ConfigurationError, ContainerLost, NoSuchService
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import ZenohTransport, configuration
 
 pytestmark = pytest.mark.realtime
 

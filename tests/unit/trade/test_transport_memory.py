@@ -9,10 +9,10 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade._transport.base import Channel, ChannelClosed, Message
-from trade._transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
-from trade._transport.memory.keys import meet
 from trade.testing import LossConformance, Severable, TransportConformance
+from trade.transport.base import Channel, ChannelClosed, Message
+from trade.transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
+from trade.transport.memory.keys import meet
 
 
 class TestMemory(TransportConformance):

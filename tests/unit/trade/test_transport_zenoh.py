@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from trade._transport.base import Channel, ChannelClosed, Presence, Questions
-from trade._transport.endpoints import free_endpoint
-from trade._transport.zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 from trade.testing._ear import meet
+from trade.transport.base import Channel, ChannelClosed, Presence, Questions
+from trade.transport.endpoints import free_endpoint
+from trade.transport.zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 
 
 class TestZenoh(TransportConformance):

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
 from trade import Container, Handle, service, where
-from trade._protocol.messages import NO_SCHEMA, Parameter, ServiceInfo
-from trade._protocol.schema import fits, schema_message
+from trade.protocol.messages import NO_SCHEMA, Parameter, ServiceInfo
+from trade.protocol.schema import fits, schema_message
 
 pytestmark = pytest.mark.virtual_time
 

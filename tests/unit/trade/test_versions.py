@@ -10,7 +10,8 @@ import pytest
 from msgspec import msgpack
 
 from trade import Container, service, where
-from trade._protocol.keys import (
+from trade.errors import NoSuchService, Stopped
+from trade.protocol.keys import (
     ALIVE,
     ESTOPS,
     Address,
@@ -20,11 +21,10 @@ from trade._protocol.keys import (
     registry_key,
     tally_key,
 )
-from trade._protocol.messages import PROTOCOL, encode_message
-from trade._transport.base import ChannelClosed
-from trade._transport.memory import MemoryTransport
-from trade.errors import NoSuchService, Stopped
+from trade.protocol.messages import PROTOCOL, encode_message
 from trade.testing import MemorySystem, memory_system
+from trade.transport.base import ChannelClosed
+from trade.transport.memory import MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 

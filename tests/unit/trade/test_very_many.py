@@ -7,8 +7,8 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade._discovery.announcer import Announcer
-from trade._protocol.keys import Address
-from trade._protocol.messages import ProviderInfo, ServiceInfo
+from trade.protocol.keys import Address
+from trade.protocol.messages import ProviderInfo, ServiceInfo
 
 HOST = Address("other", "host", "e1")
 

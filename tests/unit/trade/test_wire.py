@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from tests.unit.trade.forged_messages import FORGED, FUTURE, PROVIDER, TEXT, FakeCallee
 from trade import Container, Secret, service, where
 from trade._discovery.announcer import Announcer
-from trade._protocol import messages
-from trade._protocol.keys import (
+from trade.protocol import messages
+from trade.protocol.keys import (
     Address,
     alive_key,
     as_chunk,
@@ -25,7 +25,7 @@ from trade._protocol.keys import (
     reply_key,
     tally_key,
 )
-from trade._protocol.messages import (
+from trade.protocol.messages import (
     EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,

@@ -11,9 +11,9 @@ import pytest
 import trade
 import trade_drivers
 import trade_gateway
-from trade._protocol.schema_types import imported, name_of
 from trade._services.decorator import effect_of
 from trade._services.description import _types_in
+from trade.protocol.schema_types import imported, name_of
 
 pytest.importorskip("mcp")
 

@@ -10,9 +10,9 @@ from tests.unit.trade.forged_messages import FUTURE, FakeCallee
 from trade import Container
 from trade._calls.handle import handle_codec
 from trade._calls.target import result_decoder
-from trade._protocol.messages import PROTOCOL, Reply, ServiceInfo, Status, encode_message
-from trade._protocol.schema import schema_message
 from trade.errors import InvalidResult, RemoteError
+from trade.protocol.messages import PROTOCOL, Reply, ServiceInfo, Status, encode_message
+from trade.protocol.schema import schema_message
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import msgspec
 import pytest
 
 from tests.unit.trade.wire_vectors import DROPPED, FILE, MESSAGES, kind_of, text
-from trade._protocol import estop_messages, messages
-from trade._protocol.samples import decode_sample
+from trade.protocol import estop_messages, messages
+from trade.protocol.samples import decode_sample
 
 READERS: dict[str, Callable[[bytes], Any]] = {
     "Call": messages.decode_call,

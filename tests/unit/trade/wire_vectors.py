@@ -10,8 +10,10 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw, msgpack
 
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import (
+from trade._resources.grants import Granted, LockInfo, LockRequest
+from trade._resources.resource import Holder
+from trade.protocol.keys import Address, ServiceKey
+from trade.protocol.messages import (
     PROTOCOL,
     Behalf,
     Call,
@@ -28,9 +30,7 @@ from trade._protocol.messages import (
     Tally,
     Token,
 )
-from trade._protocol.samples import StreamSample
-from trade._resources.grants import Granted, LockInfo, LockRequest
-from trade._resources.resource import Holder
+from trade.protocol.samples import StreamSample
 
 FILE: Final = Path(__file__).parents[3] / "docs" / "wire-vectors.json"
 AT: Final = 1767225600.5

@@ -10,14 +10,14 @@ from typing import ClassVar
 from trade._container.container import Container
 from trade._settings import Settings
 from trade._threads import fork_guard
-from trade._transport.base import Transport
-from trade._transport.memory import MemoryTransport, Network
 from trade.testing.virtual._descriptors import Descriptors
 from trade.testing.virtual._loop import Policy
 from trade.testing.virtual._modules import replaced
 from trade.testing.virtual._outside import Watch
 from trade.testing.virtual._scheduler import Deadlock, Scheduler, VirtualTimeError
 from trade.testing.virtual._threads import thread_methods
+from trade.transport.base import Transport
+from trade.transport.memory import MemoryTransport, Network
 
 __all__ = ["Deadlock", "VirtualTime", "VirtualTimeError", "virtual_time"]
 

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from trade import Container
-from trade._discovery.hub_file import HubFile
+from trade.hub_file import HubFile
 from trade_drivers import AnyDriver, load_driver
 from trade_gateway.process._real_time import PRIORITY, refusal
 

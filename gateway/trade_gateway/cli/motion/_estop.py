@@ -6,8 +6,8 @@ import typer
 from rich.markup import escape
 
 from trade import Container, EstopReport, Reachability
-from trade._estop.controller import new_estop_id
 from trade.errors import NoSuchEstop
+from trade.protocol.estop_messages import new_estop_id
 from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError
 from trade_gateway.terminal._options import Json

@@ -7,7 +7,6 @@ import typer
 from rich.markup import escape
 
 from trade import Constraint, Container, LockInfo
-from trade._locks.api import RESUME_WAIT_S
 from trade.timestamps import clock
 from trade_gateway._usage import asked_for
 from trade_gateway.terminal._completion import groups, locked_groups
@@ -18,6 +17,8 @@ from trade_gateway.terminal._system_choice import visitor_among_others
 _GROUP_HELP: Final = "A group, with the groups beneath it: rosie.head."
 _GROUPS_HELP: Final = "Groups, each with the groups beneath it: rosie.head."
 Locked = Annotated[str, typer.Argument(autocompletion=locked_groups, help=_GROUP_HELP)]
+_WAIT_S: Final = 2.0
+"""How long each of several groups is waited for, as `Container.resume` waits for one."""
 
 
 def locks(context: typer.Context, as_json: Json = False) -> None:
@@ -112,7 +113,7 @@ def resume(
     with visitor_among_others(context) as container:
         wanted = [asked_for(f"group {group!r}", group=group, name=None) for group in groups]
         for one in wanted if len(wanted) > 1 else ():
-            container.await_services(one, partial(_has_services, container, one), RESUME_WAIT_S)
+            container.await_services(one, partial(_has_services, container, one), _WAIT_S)
         resumed = container.resume(reduce(Constraint.__or__, wanted))
         still = container.estops()
     for estop in still:

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Final
 import msgspec
 import typer
 
-from trade._protocol.keys import is_chunk
-from trade._protocol.messages import ServiceInfo
-from trade._protocol.schema import read_schema
+from trade.protocol.keys import is_chunk
+from trade.protocol.messages import ServiceInfo
+from trade.protocol.schema import read_schema
 from trade.stop_line import StopLines
 from trade_gateway._usage import UsageError, find
 from trade_gateway.terminal._calls import run_to_end

@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
-from trade._calls.pddl import domain_of
-from trade._protocol.messages import PROTOCOL
+from trade.pddl import domain_of
+from trade.protocol.messages import PROTOCOL
 from trade_gateway._usage import UsageError, asked_for
 from trade_gateway.cli.services._states import State, say_state
 from trade_gateway.clients._load_table import loads, loads_table

@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from trade import Settings
-from trade._chosen_system import CHOSEN, chosen_file, chosen_settings
 from trade.atomic_files import replace
+from trade.default_system import CHOSEN, chosen_file, chosen_settings
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.terminal._options import Json

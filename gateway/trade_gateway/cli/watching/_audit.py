@@ -15,9 +15,9 @@ import msgspec
 import typer
 from rich.markup import escape
 
-from trade._context.sessions import client_of
 from trade.auditing import AuditRow, ChainCheck, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
+from trade.protocol.keys import client_of
 from trade_gateway._usage import UsageError
 from trade_gateway.terminal._options import FirstByDefault, Json
 from trade_gateway.terminal._output import Output, complain

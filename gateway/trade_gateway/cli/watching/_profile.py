@@ -11,8 +11,8 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import CallDeviation, CallModel, Span
-from trade._telemetry.call_model import deviations, learn
 from trade.atomic_files import replace
+from trade.call_model import deviations, learn
 from trade.errors import ConfigurationError
 from trade.text_files import read_text
 from trade_gateway._usage import UsageError

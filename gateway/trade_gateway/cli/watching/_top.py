@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from trade import Container, Handle, LoadInfo, where
-from trade._protocol.messages import HEALTHY
+from trade.protocol.messages import HEALTHY
 from trade.timestamps import clock
 from trade_gateway.clients._load_table import loads_table
 from trade_gateway.terminal._options import Json

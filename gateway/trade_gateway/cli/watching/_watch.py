@@ -13,8 +13,8 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import Constraint, Container, Estop, Handle, LockInfo, where
-from trade._protocol.messages import HEALTHY
 from trade.errors import TradeError
+from trade.protocol.messages import HEALTHY
 from trade.timestamps import clock
 from trade_gateway._usage import asked_for
 from trade_gateway.terminal._options import Json

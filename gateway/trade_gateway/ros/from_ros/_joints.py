@@ -9,8 +9,8 @@ import msgspec
 from msgspec import Struct
 
 from trade import Meta, Resource, current_call, service
-from trade._protocol.schema_types import publish
 from trade.errors import InvalidArgument
+from trade.protocol.schema_types import publish
 from trade_drivers import Trajectory
 from trade_gateway.ros._file import FromJoints
 from trade_gateway.ros._goals import ACTION, goal_of

@@ -1,5 +1,0 @@
-"""Files that keep data beyond the life of a process, for programs that need such files."""
-
-from trade._storage.database import Database
-
-__all__ = ["Database"]
