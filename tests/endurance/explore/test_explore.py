@@ -54,7 +54,7 @@ def _no_lease_ends(patch: pytest.MonkeyPatch) -> None:
 
 
 def _gateway_forgets_locks(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(remote_locks, "_by_lender", lambda _: {})
+    patch.setattr(remote_locks, "_by_system", lambda _: {})
 
 
 def _gateway_drops_estops(patch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from msgspec import Meta, Struct
 from tests.support.simulated_robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import parse
+from trade_robotfile import RobotFileError
 
 EYE = '[camera.eye]\ndriver = "snapshot"\nurl = "http://eye/"\n'
 OVEN = '[robot]\nname = "kitchen"\n\n[sensor."oven.temperature"]\ndriver = "acme"\nport = "/dev/ttyOVEN"\nprobes = 2\n'
@@ -50,7 +51,7 @@ WRONG_OPTIONS = [
 @pytest.mark.parametrize(("before", "after", "says"), WRONG_OPTIONS, ids=[case[1] or "port" for case in WRONG_OPTIONS])
 def test_a_wrong_option_is_named_with_file_key_and_value(before: str, after: str, says: str) -> None:
     [sensor] = parse(OVEN.replace(before, after), "oven.toml").sensors
-    with pytest.raises(ConfigurationError, match=says):
+    with pytest.raises(RobotFileError, match=says):
         sensor.options_as(Options)
 
 
